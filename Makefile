@@ -1,0 +1,69 @@
+# What a contributor uses daily. Needs nothing but Python 3.11 or later; everything goes into .venv.
+
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+VENV := .venv
+BIN := $(VENV)/bin
+REQUIREMENTS := pyproject.toml constraints.txt
+DEMO_OUT := demo-out
+
+# The first interpreter that runs and is recent enough; override with `make PYTHON=...`.
+PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
+	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done)
+
+# Quiet, but downloads of many megabytes show that something goes on.
+INSTALL = $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
+SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
+
+.PHONY: help demo test bench check lint format types arrows clean
+
+help: ## this list
+	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
+
+demo: $(VENV)/.installed-plots ## train a small scene, find poses in it, draw the result in demo-out/
+	@$(BIN)/bidnerf demo --out $(DEMO_OUT)
+
+test: $(VENV)/.installed-dev ## all tests; ARGS="-k se3" for some
+	@$(BIN)/python -m pytest $(ARGS)
+
+bench: $(VENV)/.installed-dev ## the micro-benchmarks among the tests, with timings
+	@$(BIN)/python -m pytest --benchmark-enable --benchmark-only $(ARGS)
+
+check: lint types arrows ## everything that is checked without running the code
+
+lint: $(VENV)/.installed-dev ## style
+	@$(BIN)/ruff format --check --quiet --output-format concise || { echo "not formatted: run 'make format'"; exit 1; }
+	@$(BIN)/ruff check --quiet && echo "style: ok"
+
+types: $(VENV)/.installed-dev ## static types
+	@$(BIN)/mypy
+
+arrows: $(VENV)/.installed-dev ## which module may import which
+	@$(BIN)/lint-imports --no-logo
+
+format: $(VENV)/.installed-dev ## put the code into shape
+	@$(BIN)/ruff check --fix --quiet || true
+	@$(BIN)/ruff format
+
+clean: ## remove what these targets made
+	rm -rf $(VENV) $(DEMO_OUT) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/pip:
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or later is needed, and none was found" >&2; exit 1; }
+	@echo "creating $(VENV) with $$($(PYTHON) --version)"
+	@rm -rf $(VENV) && $(PYTHON) -m venv $(VENV)
+
+# A stamp says that the environment matches the requirements; it is written last, so an interrupted install is repeated.
+$(VENV)/.installed-plots: $(REQUIREMENTS) | $(BIN)/pip
+	@echo "installing bidnerf and what it needs (minutes, the first time)"
+	@$(INSTALL) -e '.[plots]' | $(SHOW_LONG)
+	@touch $@
+
+$(VENV)/.installed-dev: $(REQUIREMENTS) | $(BIN)/pip
+	@echo "installing bidnerf, what it needs and what its tests need (minutes, the first time)"
+	@$(INSTALL) -e '.[dev]' | $(SHOW_LONG)
+	@touch $@ $(VENV)/.installed-plots

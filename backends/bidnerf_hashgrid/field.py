@@ -1,0 +1,113 @@
+"""The radiance field of Instant-NGP (Mueller et al. 2022, section 5.4): hash encoding, two small MLPs, occupancy grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
+from bidnerf_hashgrid.occupancy import OccupancyGrid
+
+LARGEST_LOG_DENSITY = 12.0
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Size of the field."""
+
+    encoding: HashEncodingConfig = field(
+        default_factory=lambda: HashEncodingConfig(levels=8, log2_table_size=18, finest_resolution=256)
+    )
+    width: int = 64  # of the hidden layers
+    geometry_features: int = 15
+    grid_resolution: int = 128  # cells of the occupancy grid along the longest side of the scene
+    coarse_levels: int = 4  # levels of the encoding that the coarse field keeps
+
+
+class HashGridField(nn.Module):
+    """Density and colour of points of a scene's box. ``levels`` are the field with its fine levels masked, and itself."""
+
+    lower: Float[Tensor, "3"]
+
+    def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
+        super().__init__()
+        self.config = config
+        self.bounds = bounds
+        self.side = max(bounds.size)
+        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
+        self.register_buffer("lower", torch.tensor([m - self.side / 2 for m in middle]), persistent=False)
+        self.encoding = HashEncoding(config.encoding)
+        self.geometry = nn.Sequential(
+            nn.Linear(self.encoding.width, config.width),
+            nn.ReLU(),
+            nn.Linear(config.width, 1 + config.geometry_features),
+        )
+        self.colour = nn.Sequential(
+            nn.Linear(config.geometry_features + 9, config.width),
+            nn.ReLU(),
+            nn.Linear(config.width, config.width),
+            nn.ReLU(),
+            nn.Linear(config.width, 3),
+            nn.Sigmoid(),
+        )
+        self.sampler = OccupancyGrid(bounds, config.grid_resolution)
+        self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
+
+    @property
+    def levels(self) -> tuple[CoarseField, HashGridField]:
+        return CoarseField(self), self
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        return self.query_levels(positions, directions, None)
+
+    def query_levels(
+        self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], active: int | None
+    ) -> FieldValues:
+        """As ``query``, with the first ``active`` levels of the encoding only."""
+        shape = positions.shape[:-1]
+        features = self.geometry(self.encode(positions.reshape(-1, 3), active))
+        # Per side of the scene, so that an untrained field is equally thin whatever the unit of length.
+        density = features[:, 0].clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
+        seen = torch.cat([features[:, 1:], spherical_harmonics(directions.reshape(-1, 3))], dim=-1)
+        return FieldValues(density.reshape(shape), self.colour(seen).reshape(*shape, 3))
+
+    def encode(self, positions: Float[Tensor, "p 3"], active: int | None) -> Float[Tensor, "p f"]:
+        encoded: Tensor = self.encoding((positions - self.lower) / self.side, active)
+        return encoded
+
+
+@dataclass(frozen=True)
+class CoarseField:
+    """A hash-grid field seen through its coarse levels only: blurred, cheaper, with wider gradients."""
+
+    fine: HashGridField
+
+    @property
+    def sampler(self) -> OccupancyGrid:
+        return self.fine.coarse_sampler
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        return self.fine.query_levels(positions, directions, self.fine.config.coarse_levels)
+
+
+def spherical_harmonics(directions: Float[Tensor, "p 3"]) -> Float[Tensor, "p 9"]:
+    """Real spherical harmonics of degrees 0 to 2 at unit directions."""
+    x, y, z = directions.unbind(-1)
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479),
+            0.48860251 * y,
+            0.48860251 * z,
+            0.48860251 * x,
+            1.09254843 * x * y,
+            1.09254843 * y * z,
+            0.31539157 * (3 * z * z - 1),
+            1.09254843 * x * z,
+            0.54627422 * (x * x - y * y),
+        ],
+        dim=-1,
+    )

@@ -1,0 +1,129 @@
+"""Occupancy grid: where a field holds matter that can be seen, and the sampler that asks only there."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor, nn
+
+from bidnerf_core.field import Rays, RaySamples, SceneBounds
+
+BLOCK = 8
+"""Steps along a ray that are skipped together where nothing is near."""
+
+
+class OccupancyGrid(nn.Module):
+    """A cube of cells around the scene; a ``RaySampler`` of equal steps, valid in occupied cells only.
+
+    A cell counts as occupied while some training ray gave weight to it: matter that no ray sees, such as the inside of a
+    solid, costs nothing. ``peak`` is the largest rendering weight seen in a cell, fading with each step that visits it;
+    a cell that no ray visits keeps its state. Occupied cells are those above a threshold and their neighbours, so
+    surfaces can move back.
+    """
+
+    lower: Float[Tensor, "3"]
+    peak: Float[Tensor, "n n n"]
+    samples_per_ray: Float[Tensor, ""]  # running mean over training rays
+    occupied: Bool[Tensor, "n n n"]
+    near_occupied: Bool[Tensor, "n n n"]
+
+    def __init__(self, bounds: SceneBounds, resolution: int, steps_per_cell: int = 2) -> None:
+        super().__init__()
+        self.resolution = resolution
+        self.side = max(bounds.size)
+        self.step = self.side / (resolution * steps_per_cell)
+        self._reach = -(-BLOCK // (2 * steps_per_cell))  # cells from the middle of a block to its ends
+        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
+        self.register_buffer("lower", torch.tensor([m - self.side / 2 for m in middle]), persistent=False)
+        shape = (resolution,) * 3
+        self.register_buffer("peak", torch.ones(shape))
+        self.register_buffer("samples_per_ray", torch.full((), float(resolution)))
+        self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool))
+        self.register_buffer("near_occupied", torch.ones(shape, dtype=torch.bool), persistent=False)
+        self.register_load_state_dict_post_hook(lambda module, _: module._refresh())
+
+    @torch.no_grad()
+    def restrict(self, allowed: Bool[Tensor, "n n n"]) -> None:
+        """Empty the cells that are known to hold nothing."""
+        self.peak *= allowed
+        self.prune(0.0)
+
+    @torch.no_grad()
+    def observe(self, positions: Float[Tensor, "p 3"], weights: Float[Tensor, "p"], fade: float) -> None:
+        """Take note of the weights that one batch of rays gave to sampled positions."""
+        cells = self._cells(positions)
+        seen = torch.zeros_like(self.peak).view(-1).scatter_reduce_(0, cells, weights.to(self.peak), "amax")
+        flat = self.peak.view(-1)
+        flat[cells] = torch.maximum(flat[cells] * fade, seen[cells])
+
+    @torch.no_grad()
+    def prune(self, threshold: float) -> None:
+        """Decide anew which cells are occupied."""
+        self.occupied.copy_(_dilated(self.peak > threshold, 1))
+        self._refresh()
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        shape = rays.near.shape
+        origins, directions = rays.origins.detach().reshape(-1, 3), rays.directions.detach().reshape(-1, 3)
+        near, far = rays.near.reshape(-1), rays.far.reshape(-1)
+        offset = torch.full_like(near, 0.5)
+        if jitter is not None:
+            offset = torch.rand(near.shape, generator=jitter, device=jitter.device).to(near)
+        ray, start = self._busy_blocks(origins, directions, near, far)
+        steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
+        distance = start[:, None] + steps + (offset[ray] * self.step)[:, None]
+        positions = origins[ray][:, None] + distance[..., None] * directions[ray][:, None]
+        kept = self.occupied.view(-1)[self._cells(positions)] & (distance < far[ray][:, None])
+        return self._padded(distance[kept], ray[:, None].expand_as(kept)[kept], near, far, shape)
+
+    def _busy_blocks(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+        """Ray index and start of each run of ``BLOCK`` steps that passes near an occupied cell, in order."""
+        length = BLOCK * self.step
+        count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
+        starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
+        inside = starts < far[:, None]
+        ray, block = inside.nonzero(as_tuple=True)
+        start = starts[ray, block]
+        middle = origins[ray] + (start + length / 2)[:, None] * directions[ray]
+        busy = self.near_occupied.view(-1)[self._cells(middle)]
+        return ray[busy], start[busy]
+
+    def _padded(self, distance: Tensor, ray: Tensor, near: Tensor, far: Tensor, shape: torch.Size) -> RaySamples:
+        """Samples gathered to the front of their ray's row; rows are as long as the longest."""
+        counts = torch.bincount(ray, minlength=len(near))
+        width = int(counts.amax()) if len(near) else 0
+        slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
+        middles = far[:, None].expand(-1, width).clone()
+        middles[ray, slot] = distance
+        valid = torch.arange(width, device=ray.device) < counts[:, None]
+        half = self.step / 2
+        starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
+        ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)
+        return RaySamples(
+            starts.reshape(*shape, width), ends.reshape(*shape, width), valid.reshape(*shape, width)
+        )
+
+    def _cells(self, positions: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
+        scaled = (positions - self.lower.to(positions)) * (self.resolution / self.side)
+        x, y, z = scaled.long().clamp_(0, self.resolution - 1).unbind(-1)
+        return (x * self.resolution + y) * self.resolution + z
+
+    def centres(self) -> Float[Tensor, "n n n 3"]:
+        axis = (torch.arange(self.resolution, device=self.lower.device) + 0.5) * (self.side / self.resolution)
+        return self.lower + torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+
+    def _refresh(self) -> None:
+        self.near_occupied.copy_(_dilated(self.occupied, self._reach))
+
+
+def _dilated(cells: Bool[Tensor, "n n n"], reach: int) -> Bool[Tensor, "n n n"]:
+    """Occupied cells and all within ``reach`` of them along each axis: a cube is the product of three lines."""
+    grown = cells.clone()
+    for axis in range(3):
+        for _ in range(reach):
+            line = grown.clone()
+            count = cells.shape[axis] - 1
+            grown.narrow(axis, 1, count).logical_or_(line.narrow(axis, 0, count))
+            grown.narrow(axis, 0, count).logical_or_(line.narrow(axis, 1, count))
+    return grown

@@ -1,0 +1,87 @@
+"""How a hash-grid field is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Generator, Tensor
+
+from bidnerf_core.carving import occupied_cells
+from bidnerf_core.frames import View
+from bidnerf_core.rendering import Rendering, render
+from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit
+from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
+from bidnerf_hashgrid.occupancy import OccupancyGrid
+
+
+@dataclass(frozen=True)
+class HashGridConfig(FieldConfig):
+    """Size of the field and its training. The defaults suit a few minutes on a small CPU."""
+
+    steps: int = 2000
+    samples_per_step: int = 65536  # the number of rays follows from it
+    learning_rate: float = 1e-2
+    coarse_every: int = 4  # one step in so many trains the coarse field
+    depth_weight: float = 0.1
+    seed: int = 0
+    rays_at_most: int = 16384  # per step
+    prune_from: int = 200  # step from which empty cells are left out
+    prune_every: int = 16
+    prune_fade: float = 0.85  # a cell's largest weight fades by this each time that rays visit it
+    prune_threshold: float = 0.01  # rendering weight
+    carve: bool = True  # start from the cells that the views' depth and silhouettes leave
+
+
+
+def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
+    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    if config.carve and report.resume() is None:
+        for grid in (field.sampler, field.coarse_sampler):
+            grid.restrict(_room_for_matter(grid, views))
+    bank = RayBank(views, field.bounds)
+    groups = [
+        {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
+        {"params": [*field.geometry.parameters(), *field.colour.parameters()], "lr": config.learning_rate / 4},
+    ]
+
+    def outcome(step: int, generator: Generator) -> StepOutcome:
+        coarse = config.coarse_every > 0 and step % config.coarse_every == config.coarse_every - 1
+        level: CoarseField | HashGridField = field.levels[0] if coarse else field
+        grid = level.sampler
+        count = min(config.rays_at_most, int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1))))
+        batch = bank.draw(count, generator)
+        rendering = render(level, batch.rays, batch.background, generator)
+        _tend(grid, batch, rendering, step, config)
+        loss, mse = _loss(rendering, batch, field.side, config.depth_weight)
+        return StepOutcome(loss, mse, float(grid.samples_per_ray))
+
+    fit(field, groups, outcome, config.steps, report, seed=config.seed)
+
+
+def _room_for_matter(grid: OccupancyGrid, views: Sequence[View]) -> Tensor:
+    upper = grid.lower + grid.side
+    shape = (grid.resolution,) * 3
+    return occupied_cells(views, tuple(grid.lower.tolist()), tuple(upper.tolist()), shape)
+
+
+def _tend(grid: OccupancyGrid, batch: RayBatch, rendering: Rendering, step: int, config: HashGridConfig) -> None:
+    """Keep the occupancy grid abreast of what the rays saw."""
+    valid = rendering.samples.valid
+    positions = batch.rays.at(rendering.samples.middles)[valid]
+    grid.observe(positions.detach(), rendering.weights.detach()[valid], config.prune_fade)
+    grid.samples_per_ray.lerp_(valid.sum() / len(valid), 0.1 if step > 10 else 1.0)
+    if step >= config.prune_from and step % config.prune_every in (0, config.coarse_every - 1):
+        grid.prune(config.prune_threshold)
+
+
+def _loss(rendering: Rendering, batch: RayBatch, side: float, depth_weight: float) -> tuple[Tensor, float]:
+    """Squared error of colour, and the mean distance of each ray's weight from where its depth was measured."""
+    error = (rendering.rgb - batch.rgb) ** 2
+    measured = batch.distance > 0
+    away = (rendering.weights * (rendering.samples.middles - batch.distance[:, None]).abs()).sum(-1)
+    missing = (1 - rendering.opacity) * batch.distance
+    off = torch.where(measured, away + missing, 0).sum() / measured.sum().clamp(min=1) / side
+    mse = float(error.detach().mean())
+    return error.mean() + depth_weight * off, mse

@@ -1,0 +1,42 @@
+"""bidnerf: the 6-DoF pose of RGB-D images against a radiance field, whatever field that is."""
+
+from __future__ import annotations
+
+import os
+
+# Threads of OpenMP that wait should sleep. On cores that other work shares, spinning was measured to make training
+# more than ten times slower. It must be said before torch is loaded, and a user's own setting goes first.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds, levels
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization import Localization, localize
+from bidnerf_core.registry import list_backends, load_backend
+from bidnerf_core.rendering import render, render_image
+from bidnerf_core.se3 import SE3
+from bidnerf_core.storage import Map, load_map
+
+__all__ = [
+    "SE3",
+    "FieldValues",
+    "Frame",
+    "InputError",
+    "Intrinsics",
+    "Localization",
+    "Map",
+    "RadianceField",
+    "RaySampler",
+    "RaySamples",
+    "Rays",
+    "SceneBounds",
+    "View",
+    "levels",
+    "list_backends",
+    "load_backend",
+    "load_map",
+    "localize",
+    "render",
+    "render_image",
+]

@@ -1,0 +1,84 @@
+"""Grids of cells, emptied where views see through them. A cell counts as the sphere around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.carving.free_space import FreeSpace
+from bidnerf_core.frames import View
+from bidnerf_core.se3 import SE3
+
+Corner: TypeAlias = tuple[float, float, float]
+
+BLOCK = 8
+"""Cells along the side of a block. Blocks out of a view's sight cost that view next to nothing."""
+BLOCKS_AT_ONCE = 128
+"""What is looked at in one go: it stays in the cache, and memory stays bounded."""
+
+
+def occupied_cells(
+    views: Sequence[View],
+    lower: Corner,
+    upper: Corner,
+    shape: tuple[int, int, int] = (128, 128, 128),
+    tolerance: float = 0.02,
+    footprint: int = 8,
+) -> Bool[Tensor, "nx ny nz"]:
+    """The cells of the box ``lower``..``upper`` (metres, world) that may hold matter.
+
+    A cell is emptied when two views (one, if there is only one) see all of it as free: as background (alpha 0), or nearer
+    than the measured depth by more than the part ``tolerance`` of it. Pixels that measured nothing free nothing, nor does
+    a view in which the cell's radius is over ``footprint`` pixels.
+    """
+    grid = _Grid(lower, upper, shape)
+    votes = torch.zeros(grid.blocks.shape[1], BLOCK**3, dtype=torch.uint8)
+    needed = min(2, len(views))
+    undecided = torch.ones(len(votes), dtype=torch.bool)
+    for view in views:
+        space = FreeSpace.seen_by(view, tolerance, footprint)
+        firsts, within = grid.middles(view.T_ref_camera)
+        seen = space.may_free(firsts + within.mean(dim=1, keepdim=True), grid.block_radius)
+        for rows in (seen & undecided).nonzero()[:, 0].split(BLOCKS_AT_ONCE):
+            points = (firsts[:, rows, None] + within[:, None, :]).flatten(1)
+            votes[rows] += space.frees(points, grid.cell_radius).unflatten(0, (-1, BLOCK**3))
+            undecided[rows] = (votes[rows] < needed).any(dim=1)
+    return grid.assembled(votes < needed)
+
+
+class _Grid:
+    """A box of cells, in cubic blocks that together may reach over it."""
+
+    def __init__(self, lower: Corner, upper: Corner, shape: tuple[int, int, int]) -> None:
+        self.shape = shape
+        self.counts = [-(-count // BLOCK) for count in shape]
+        self.lower = torch.tensor(lower, dtype=torch.float64)
+        self.size = (torch.tensor(upper, dtype=torch.float64) - self.lower) / torch.tensor(shape)  # of a cell
+        self.blocks = _indices(self.counts)
+        self.cell_radius = torch.linalg.vector_norm(self.size).item() / 2
+        self.block_radius = self.cell_radius * BLOCK
+
+    def middles(self, T_world_camera: SE3) -> tuple[Float[Tensor, "3 b"], Float[Tensor, "3 c"]]:
+        """Middles of each block's first cell in the camera's frame, and what to add for each cell of a block (metres)."""
+        T_camera_world = T_world_camera.to(
+            torch.float64
+        ).inverse()  # float64: the world's origin may be far away
+        first = T_camera_world.apply(self.lower + self.size / 2)[:, None]
+        step = T_camera_world.rotation * self.size
+        within = step @ _indices([BLOCK] * 3).double()
+        return (first + step @ (self.blocks * BLOCK).double()).float(), within.float()
+
+    def assembled(self, values: Bool[Tensor, "b c"]) -> Bool[Tensor, "nx ny nz"]:
+        """Blocks put in their places, and cut off at the end of the box."""
+        whole = values.reshape(*self.counts, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5)
+        nx, ny, nz = self.shape
+        return whole.reshape([count * BLOCK for count in self.counts])[:nx, :ny, :nz].contiguous()
+
+
+def _indices(counts: Sequence[int]) -> Int[Tensor, "3 n"]:
+    axes = [torch.arange(count) for count in counts]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij")).flatten(1)

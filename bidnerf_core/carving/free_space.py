@@ -1,0 +1,114 @@
+"""What a view sees through: how far each of its pixels is free of matter, and which spheres lie wholly in that freedom.
+
+It errs on the side of matter: a pixel counts as the worst of its neighbours, and what was not measured as matter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame, View
+
+LONGEST_SIDE = 400
+"""Images are shrunk (by whole factors) to at most this many pixels: cells are coarse, and time is bounded."""
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """How deep a view sees nothing. Level k holds the least such depth (planar z) within k pixels of each pixel."""
+
+    intrinsics: Intrinsics  # of the shrunken image
+    levels: Float[Tensor, "k h w"]  # metres; 0: no statement
+    reach: float  # metres: the largest depth of all
+    edges: Float[
+        Tensor, "4 3"
+    ]  # inward normals of planes through the camera's centre that hold all of the view
+
+    @staticmethod
+    def seen_by(view: View, tolerance: float = 0.02, footprint: int = 8) -> FreeSpace:
+        free = _free_depth(view.frame, tolerance)
+        factor = math.ceil(max(free.shape) / LONGEST_SIDE)
+        levels = [_shrunk(free, factor)]
+        for _ in range(footprint):  # what lies beyond the image's edge is unknown
+            levels.append(-functional.max_pool2d(-functional.pad(levels[-1], (1, 1, 1, 1))[None], 3, 1)[0])
+        camera = _shrunk_camera(view.frame.intrinsics, factor, levels[0])
+        return FreeSpace(camera, torch.stack(levels), free.amax().item(), _edges(view.frame.intrinsics))
+
+    def may_free(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
+        """Whether any of the sphere around each point is in sight, and not behind everything."""
+        in_sight = (self.edges @ points > -radius).all(dim=0)
+        return in_sight & (points[2] > -radius) & (points[2] - radius < self.reach)
+
+    def frees(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
+        """Whether all of the sphere of ``radius`` metres around each point (camera frame, metres) is seen as free."""
+        deepest = points[2] + radius
+        columns, rows, pixels = self._footprint(points, radius)
+        count, height, width = self.levels.shape
+        known = (points[2] > radius) & (deepest < self.reach) & (pixels < count)
+        known &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        place = (
+            pixels * height + rows
+        ) * width + columns  # whole floats, exact: there are less than 2^24 of them
+        least = self.levels.flatten()[torch.where(known, place, 0).long()]
+        return known & (deepest < least)
+
+    def _footprint(self, points: Float[Tensor, "3 n"], radius: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Column, row and radius of each sphere's image in whole pixels; the radius is infinite off the lens."""
+        camera = self.intrinsics
+        inverse = 1 / points[2]
+        x, y = points[0] * inverse, points[1] * inverse
+        squared = x * x + y * y  # of the tangent of the angle to the axis
+        slope = radius * inverse  # tangent of the sphere's angular radius, next line
+        slope = slope * (1 + squared - slope * slope).rsqrt()
+        product = squared.sqrt() * slope
+        wide = (
+            slope * (1 + squared) / (1 - product)
+        )  # tan(a + b) - tan(a): the far side of the sphere's image
+        pixels = (wide * max(camera.fx, camera.fy)).ceil()
+        pixels = torch.where(product < 1, pixels, torch.inf)  # NaN, too, is no statement
+        if not camera.distortion:
+            return (x * camera.fx + camera.cx).floor(), (y * camera.fy + camera.cy).floor(), pixels
+        u, v = camera.project(points.T).floor().unbind(-1)
+        # lenses stretch a little; beyond the image their polynomials fold back into it
+        return u, v, torch.where((self.edges @ points > 0).all(dim=0), (pixels * 1.25).ceil(), torch.inf)
+
+
+def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
+    """Planar z up to which each pixel is free: unlimited over background, 0 where nothing is known."""
+    free = torch.zeros(frame.rgb.shape[:2])
+    if frame.depth is not None:
+        free = frame.depth.float() * (1 - tolerance)
+    if frame.alpha is not None:  # a pixel on an edge shows two depths and measures one
+        free = torch.where(frame.alpha >= 1, free, torch.where(frame.alpha <= 0, torch.inf, 0.0))
+    return free
+
+
+def _shrunk(free: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "h2 w2"]:
+    """The least of each block of pixels; one that reaches over the edge is unknown."""
+    height, width = free.shape
+    padded = functional.pad(free, (0, -width % factor, 0, -height % factor))
+    return -functional.max_pool2d(-padded[None], factor)[0]
+
+
+def _shrunk_camera(camera: Intrinsics, factor: int, free: Float[Tensor, "h w"]) -> Intrinsics:
+    fx, fy, cx, cy = (value / factor for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return Intrinsics(fx, fy, cx, cy, free.shape[1], free.shape[0], camera.distortion)
+
+
+def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:
+    """Planes about the smallest upright rectangle of directions that holds the image's border, however it is bent."""
+    w, h = camera.width, camera.height
+    along = torch.linspace(0, 1, 33, dtype=torch.float64)
+    still = torch.zeros_like(along)
+    sides = [(along * w, still), (along * w, still + h), (still, along * h), (still + w, along * h)]
+    border = camera.unproject(torch.cat([torch.stack(side, dim=-1) for side in sides]))
+    (left, top, _), (right, bottom, _) = border.amin(dim=0).tolist(), border.amax(dim=0).tolist()
+    normals = torch.tensor([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]])
+    return functional.normalize(normals, dim=-1).float()

@@ -1,0 +1,57 @@
+"""``bidnerf info``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from bidnerf_core.cli.common import parse, print_json
+from bidnerf_core.field import levels
+from bidnerf_core.plain import to_plain
+from bidnerf_core.storage import load_map
+
+
+def run(arguments: list[str]) -> None:
+    parse("info", info, arguments)
+
+
+def info(map: tyro.conf.Positional[Path], json: Annotated[bool, tyro.conf.arg(help="print one JSON object")] = False) -> None:
+    """Describe the map in folder MAP."""
+    facts = describe(map)
+    if json:
+        print_json(facts)
+        return
+    for key, value in facts.items():
+        print(f"{key + ':':<12} {_shown(value)}")
+
+
+def describe(folder: Path) -> dict[str, Any]:
+    """What a user may want to know; the map is loaded whole, so that a damaged one is told here."""
+    stored = load_map(folder)
+    info = stored.info
+    parameters = sum(p.numel() for p in stored.field.parameters())  # type: ignore[attr-defined]
+    return {
+        "map": str(folder),
+        "backend": info.backend,
+        "data": info.data,
+        "cameras": len(info.cameras),
+        "step": info.step,
+        "complete": info.complete,
+        "seconds": round(info.seconds, 1),
+        "levels": len(levels(stored.field)),
+        "parameters": parameters,
+        "bytes": sum(file.stat().st_size for file in folder.iterdir() if file.is_file()),
+        "bounds": to_plain(info.bounds),
+        "config": info.config,
+        "bidnerf": info.bidnerf,
+    }
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_shown(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return "(" + ", ".join(_shown(item) for item in value) + ")"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

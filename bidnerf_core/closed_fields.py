@@ -1,0 +1,84 @@
+"""Radiance fields in closed form, known everywhere and in any precision: what tests hold others against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import FieldValues, Rays, RaySampler
+from bidnerf_core.primitives import Sphere
+from bidnerf_core.sampling import Stratified
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianBlobs:
+    """A sum of isotropic Gaussian clouds with smoothly changing colour; infinitely differentiable.
+
+    It computes in the precision of the positions. ``moved`` puts the whole scene elsewhere, so that a test can check
+    that a moved world gives a moved answer.
+    """
+
+    centres: Float[Tensor, "k 3"]  # metres, frame of the field
+    widths: Float[Tensor, " k"]  # standard deviations, metres
+    densities: Float[Tensor, " k"]  # at each centre, per metre
+    waves: Float[Tensor, "3 3"]  # radians per metre of each colour's change (rows: red, green, blue)
+    T_world_field: SE3
+    sampler: RaySampler
+
+    @staticmethod
+    def random(count: int = 5, seed: int = 0, samples: int = 64, density: float = 12.0) -> GaussianBlobs:
+        """Blobs within the cube from -1 to 1, none like another (float64)."""
+        if count < 1:
+            raise InputError(f"{count} blobs, expected at least 1")
+        generator = torch.Generator().manual_seed(seed)
+        centres = torch.rand((count, 3), generator=generator, dtype=torch.float64) * 1.3 - 0.65
+        widths = 0.12 + 0.13 * torch.rand(count, generator=generator, dtype=torch.float64)
+        densities = density * (0.5 + torch.rand(count, generator=generator, dtype=torch.float64))
+        waves = 3 * torch.randn((3, 3), generator=generator, dtype=torch.float64)
+        return GaussianBlobs(centres, widths, densities, waves, SE3.identity(), Stratified(samples))
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        local = self.T_world_field.to(positions).inverse().apply(positions)
+        squared = (local[..., None, :] - self.centres.to(local)).square().sum(-1)
+        clouds = self.densities.to(local) * torch.exp(-0.5 * squared / self.widths.to(local).square())
+        return FieldValues(clouds.sum(-1), 0.5 + 0.45 * torch.sin(local @ self.waves.to(local).T + 0.7))
+
+    def moved(self, T_new_world: SE3) -> GaussianBlobs:
+        """The field that has at ``T_new_world.apply(p)`` what this one has at ``p``."""
+        return replace(self, T_world_field=T_new_world.to(self.T_world_field.rotation) @ self.T_world_field)
+
+
+@dataclass(frozen=True, eq=False)
+class HomogeneousBall:
+    """Constant density and colour within a sphere: what a ray loses there is known, 1 - exp(-density * chord)."""
+
+    radius: float  # metres
+    density: float  # per metre
+    rgb: tuple[float, float, float] = (0.8, 0.3, 0.2)
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres, world
+    sampler: RaySampler = field(default_factory=lambda: Stratified(256))
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        distance = torch.linalg.vector_norm(positions - positions.new_tensor(self.centre), dim=-1)
+        density = torch.where(distance <= self.radius, positions.new_tensor(self.density), 0)
+        return FieldValues(density, positions.new_tensor(self.rgb).expand(positions.shape))
+
+    def chord(self, rays: Rays) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
+        """Distances at which each ray enters and leaves the ball in [near, far]; equal where it misses."""
+        origins, directions = torch.broadcast_tensors(rays.origins, rays.directions)
+        starts = (origins - origins.new_tensor(self.centre)).reshape(-1, 3).T
+        enter, leave = Sphere(self.radius).interval(starts, directions.reshape(-1, 3).T)
+        enter = torch.maximum(enter.reshape(rays.near.shape), rays.near)
+        enter = torch.where(enter.isfinite(), enter, rays.near)
+        leave = torch.minimum(leave.reshape(rays.near.shape), rays.far)
+        return enter, torch.maximum(enter, leave)
+
+    def opacity(self, rays: Rays) -> Float[Tensor, "*r"]:
+        """Exact (Beer-Lambert)."""
+        enter, leave = self.chord(rays)
+        return -torch.expm1(-self.density * (leave - enter))

@@ -1,0 +1,100 @@
+"""What every reader of a dataset offers, and the rules that all of them share: names, splits, backgrounds."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol, TypeAlias, runtime_checkable
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+
+Background: TypeAlias = str | Sequence[float]
+"""What a user may write: "white", "black" or an rgb triple in [0, 1]."""
+
+ReadingProgress: TypeAlias = Callable[[int, int], None]
+"""Told (frames read, frames asked for) after each frame."""
+
+NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+@runtime_checkable
+class Dataset(Protocol):
+    """Posed images in splits. Poses are ``T_world_camera`` with OpenCV axes, float64; depth is planar z in metres.
+
+    A frame's name is the stem of its image file. Where several files of a split share a stem, folders are put in front,
+    as few as tell them apart ("left_0001", "right_0001"); the bare stem is then refused as ambiguous.
+    """
+
+    @property
+    def path(self) -> Path: ...
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """At least one, "train" first where there is one."""
+        ...
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The colour (rgb in [0, 1]) that images with an alpha channel are laid over."""
+        ...
+
+    def frame_names(self, split: str) -> list[str]:
+        """Names in the order of the file. Raises ``InputError`` for an unknown split."""
+        ...
+
+    def views(
+        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+    ) -> list[View]:
+        """Read the frames ``names``, in that order, or all of the split; no other image is touched.
+
+        Raises ``InputError`` for an unknown split or frame, and for a file that is missing or not usable.
+        """
+        ...
+
+
+def background_colour(background: Background) -> tuple[float, float, float]:
+    """The rgb triple that ``background`` stands for."""
+    expected = 'expected "white", "black" or three numbers in [0, 1]'
+    if isinstance(background, str):
+        if background not in NAMED_BACKGROUNDS:
+            raise InputError(f"background is {background!r}, {expected}")
+        return NAMED_BACKGROUNDS[background]
+    values = tuple(float(value) for value in background)
+    if len(values) != 3 or not all(math.isfinite(value) and 0 <= value <= 1 for value in values):
+        raise InputError(f"background is {values}, {expected}")
+    return values[0], values[1], values[2]
+
+
+def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], where: str) -> list[int]:
+    """Where the ``asked`` frames are among ``names``; ``where`` opens the message of an ``InputError``."""
+    index = {name: place for place, name in enumerate(names)}
+    for name in asked:
+        if name not in index:
+            raise InputError(f"{where}: {_not_there(name, names, stems)}")
+    return [index[name] for name in asked]
+
+
+def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
+    """A name for each path (folders, then stem): its stem, behind as many folders as it takes to be the only one."""
+    names = [path[-1] for path in paths]
+    for depth in range(2, max(map(len, paths), default=0) + 1):
+        count = Counter(names)
+        names = ["_".join(p[-depth:]) if count[n] > 1 else n for n, p in zip(names, paths, strict=True)]
+    name, times = Counter(names).most_common(1)[0] if names else ("", 0)
+    if times > 1:  # a/b.png beside a_b.png
+        raise InputError(f"{times} images would be called {name!r}, expected names that differ")
+    return names
+
+
+def _not_there(name: str, names: Sequence[str], stems: Sequence[str]) -> str:
+    meant = [other for other, stem in zip(names, stems, strict=True) if stem == name]
+    if meant:
+        listed = ", ".join(meant[:4]) + (", ..." if len(meant) > 4 else "")
+        return f"frame {name!r} is ambiguous, expected one of {listed}"
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
+    hint = f", did you mean {near[0]!r}?" if near else ""
+    return f"no frame {name!r} among its {len(names)} frames{hint}"

@@ -1,0 +1,153 @@
+"""Folders with ``transforms.json``: the dialects of NeRF's Blender scenes and of nerfstudio (and instant-ngp).
+
+Either ``transforms_train.json``, ``transforms_val.json``, ``transforms_test.json`` (those that are there), or one
+``transforms.json`` whose lists ``train_filenames``, ``val_filenames``, ``test_filenames`` tell the splits apart. Without
+such lists every eighth frame (the first, the ninth ...) is held out as "test" and the others are "train", as is usual for
+captures; a single frame is both.
+
+Read of a file or, with precedence, of a frame: ``camera_angle_x [camera_angle_y]`` or ``fl_x [fl_y]``, ``cx cy w h``,
+``k1 k2 p1 p2 k3``, ``camera_model``, ``depth_unit_scale_factor`` (metres a unit, default 0.001; as in nerfstudio it holds
+for ``.npy`` depth as well); of a frame only: ``file_path`` (its extension may be missing), ``transform_matrix``,
+``depth_file_path`` (planar z). ``applied_transform`` and ``applied_scale`` tell what was already done to the poses: they are
+not undone, so the world is the one of the file. Other keys are not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+from bidnerf_core.datasets.dataset import (
+    Background,
+    Dataset,
+    ReadingProgress,
+    background_colour,
+    positions,
+    unique_names,
+)
+from bidnerf_core.datasets.images import over, read_depth, read_image
+from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+
+TRIED_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
+
+
+class TransformsReader:
+    """Recognises the folder by its files."""
+
+    expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"
+
+    def recognises(self, path: Path) -> bool:
+        return any((path / name).is_file() for name in ("transforms.json", *map(file_of, SPLITS)))
+
+    def open(self, path: Path, background: Background | None) -> Dataset:
+        return TransformsDataset(path, read_splits(path), background)
+
+
+class TransformsDataset:
+    """Views of a folder with ``transforms.json``; see ``Dataset``."""
+
+    def __init__(
+        self, path: Path, frames: dict[str, list[FrameRecord]], background: Background | None = None
+    ) -> None:
+        self._path = path
+        self._frames = frames
+        self._names = {
+            split: unique_names([frame.parts for frame in group]) for split, group in frames.items()
+        }
+        self._background = None if background is None else background_colour(background)
+        self._first: tuple[str, int, int] | None = (
+            None  # file, width, height of the first image of unknown size
+        )
+
+    @property
+    def path(self) -> Path:
+        return self._path
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return tuple(self._frames)
+
+    @cached_property
+    def background(self) -> tuple[float, float, float]:
+        """The one that was asked for, else white where the first image of a split has an alpha channel, else black."""
+        if self._background is not None:
+            return self._background
+        return background_colour("white" if any(map(self._has_alpha, self.splits)) else "black")
+
+    def frame_names(self, split: str) -> list[str]:
+        self._known(split)
+        return list(self._names[split])
+
+    def views(
+        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+    ) -> list[View]:
+        self._known(split)
+        frames, known = self._frames[split], self._names[split]
+        asked = known if names is None else names
+        where = f"{self._path}: split {split!r}"
+        places = positions(known, [frame.stem for frame in frames], asked, where)
+        views = []
+        for done, place in enumerate(places, start=1):
+            views.append(self._view(frames[place], known[place]))
+            if progress is not None:
+                progress(done, len(places))
+        return views
+
+    def _known(self, split: str) -> None:
+        if split not in self._frames:
+            raise InputError(f"{self._path}: no split {split!r}, expected one of {', '.join(self.splits)}")
+
+    def _view(self, frame: FrameRecord, name: str) -> View:
+        path = self._image_file(frame)
+        colour, alpha = read_image(path)
+        height, width = colour.shape[:2]
+        self._check_size(frame, path, width, height)
+        depth = None
+        if frame.depth_path is not None:
+            depth = read_depth(self._depth_file(frame), frame.depth_unit)
+            if depth.shape != colour.shape[:2]:
+                found = f"{depth.shape[1]}x{depth.shape[0]}"
+                raise frame.record.error(
+                    f"{frame.depth_path} is {found}, expected {width}x{height} as its image"
+                )
+        rgb = over(colour, alpha, self.background)
+        return View(
+            Frame(name, rgb, frame.camera.intrinsics(width, height), depth, alpha), frame.T_world_camera
+        )
+
+    def _image_file(self, frame: FrameRecord) -> Path:
+        tried = [Path(f"{self._path / frame.file_path}{suffix}") for suffix in TRIED_SUFFIXES]
+        for path in tried:
+            if path.is_file():
+                return path
+        suffixes = ", ".join(suffix for suffix in TRIED_SUFFIXES if suffix)
+        raise frame.record.error(
+            f"no image {tried[0]}, expected that file (also tried with {suffixes} added)"
+        )
+
+    def _depth_file(self, frame: FrameRecord) -> Path:
+        path = self._path / str(frame.depth_path)
+        if not path.is_file():
+            raise frame.record.error(f"no depth image {path}, expected that file (depth_file_path)")
+        return path
+
+    def _check_size(self, frame: FrameRecord, path: Path, width: int, height: int) -> None:
+        """Against the camera's size or, where it has none, against the first such image: one lens, one size."""
+        camera = frame.camera
+        expected, whose = (camera.width or width, camera.height or height), "w and h say"
+        if camera.width is None and camera.height is None:
+            self._first = self._first or (path.name, width, height)
+            expected, whose = self._first[1:], f"{self._first[0]} is"
+        if (width, height) != expected:
+            raise frame.record.error(
+                f"{path.name} is {width}x{height}, expected {expected[0]}x{expected[1]} as {whose}"
+            )
+
+    def _has_alpha(self, split: str) -> bool:
+        try:
+            return read_image(self._image_file(self._frames[split][0]))[1] is not None
+        except InputError:  # whoever asks for that frame will hear of it; others may do without
+            return False

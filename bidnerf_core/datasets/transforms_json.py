@@ -1,0 +1,109 @@
+"""What ``transforms*.json`` says of each frame and of the splits; no image is read here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from bidnerf_core.datasets.cameras import CameraRecord, camera_record, pose
+from bidnerf_core.datasets.records import Record, read_record
+from bidnerf_core.errors import InputError
+from bidnerf_core.se3 import SE3
+
+SPLITS = ("train", "val", "test")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+HOLD_OUT_EVERY = 8
+METRES_PER_DEPTH_UNIT = 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecord:
+    """One entry of ``frames``: all that the JSON says of it."""
+
+    record: Record
+    file_path: PurePosixPath  # as in the file, without a leading "./"
+    camera: CameraRecord
+    T_world_camera: SE3
+    depth_path: str | None
+    depth_unit: float  # metres
+
+    @property
+    def stem(self) -> str:
+        known = self.file_path.suffix.lower() in IMAGE_SUFFIXES
+        return self.file_path.stem if known else self.file_path.name  # "r_0.5" may well have no extension
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Folders, then the stem."""
+        return (*self.file_path.parts[:-1], self.stem)
+
+
+def read_splits(path: Path) -> dict[str, list[FrameRecord]]:
+    """The frames of each split of the folder ``path``. Raises ``InputError`` for a description that is not usable."""
+    files = {split: path / file_of(split) for split in SPLITS if (path / file_of(split)).is_file()}
+    if files:
+        return {split: read_frames(read_record(file)) for split, file in files.items()}
+    record = read_record(path / "transforms.json")
+    return split_frames(record, read_frames(record))
+
+
+def read_frames(file: Record) -> list[FrameRecord]:
+    """Every entry of ``frames``, each named once."""
+    entries = file.items("frames")
+    if not entries:
+        found = "no frames" if entries is None else "frames is empty"
+        raise file.error(f"{found}, expected a list of objects with file_path and transform_matrix")
+    frames = [_frame(file, number, entry) for number, entry in enumerate(entries)]
+    seen: dict[tuple[str, ...], int] = {}
+    for number, frame in enumerate(frames):
+        first = seen.setdefault(frame.parts, number)
+        if first != number:
+            raise frame.record.error(f"the image of frame {first} again, expected each image once")
+    return frames
+
+
+def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[FrameRecord]]:
+    """The splits of one ``transforms.json``: by its lists of file names, else by holding out every eighth frame."""
+    lists = {split: file.items(f"{split}_filenames") for split in SPLITS}
+    if not any(lists.values()):
+        others = [frame for number, frame in enumerate(frames) if number % HOLD_OUT_EVERY]
+        return {"train": others or frames, "test": frames[::HOLD_OUT_EVERY]}
+    by_path = {frame.file_path: frame for frame in frames}
+    splits = {}
+    for split, listed in lists.items():
+        if listed:
+            splits[split] = [_listed(file, by_path, f"{split}_filenames", entry) for entry in listed]
+    return splits
+
+
+def _listed(file: Record, by_path: dict[PurePosixPath, FrameRecord], key: str, entry: object) -> FrameRecord:
+    found = by_path.get(PurePosixPath(entry)) if isinstance(entry, str) else None
+    if found is None:
+        raise file.error(f"{key} lists {entry!r}, expected the file_path of one of its {len(by_path)} frames")
+    return found
+
+
+def _frame(file: Record, number: int, entry: object) -> FrameRecord:
+    where = f"{file.where}: frame {number}"
+    if not isinstance(entry, dict):
+        raise InputError(f"{where}: is not an object, expected one with file_path and transform_matrix")
+    own = Record(where, entry)
+    path = own.text("file_path")
+    if not path:
+        raise own.error("no file_path, expected the name of its image")
+    record = Record(f"{where} ({path})", entry, file)
+    unit = record.number("depth_unit_scale_factor")
+    if unit is not None and unit <= 0:
+        raise record.error(f"depth_unit_scale_factor is {unit:g}, expected a positive number of metres")
+    return FrameRecord(
+        record,
+        PurePosixPath(path),
+        camera_record(record),
+        pose(Record(record.where, entry)),
+        own.text("depth_file_path"),
+        METRES_PER_DEPTH_UNIT if unit is None else unit,
+    )
+
+
+def file_of(split: str) -> str:
+    return f"transforms_{split}.json"

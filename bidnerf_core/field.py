@@ -1,0 +1,113 @@
+"""The contract between the core and any radiance field.
+
+Shapes: *r rays, *p points, s samples on a ray. Units: metres (or scene units) in the world frame; density per metre.
+Directions are always unit, so distance along the ray is the only length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Generator, Tensor
+
+from bidnerf_core.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Half-lines and the part of each that may hold matter. ``far <= near`` marks a ray that misses the scene."""
+
+    origins: Float[Tensor, "*r 3"]
+    directions: Float[Tensor, "*r 3"]  # unit
+    near: Float[Tensor, "*r"]  # distance along the ray, not z
+    far: Float[Tensor, "*r"]
+
+    def at(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s 3"]:
+        return self.origins[..., None, :] + distance[..., None] * self.directions[..., None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class RaySamples:
+    """Disjoint intervals of each ray, nearest first, each queried at its middle. Only valid ones are ever queried."""
+
+    starts: Float[Tensor, "*r s"]
+    ends: Float[Tensor, "*r s"]
+    valid: Bool[Tensor, "*r s"]
+
+    @property
+    def middles(self) -> Float[Tensor, "*r s"]:
+        return (self.starts + self.ends) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class FieldValues:
+    """What a field says of points seen from directions."""
+
+    density: Float[Tensor, "*p"]  # >= 0, per metre
+    rgb: Float[Tensor, "*p 3"]  # in [0, 1]
+
+
+@runtime_checkable
+class RaySampler(Protocol):
+    """Chooses where on each ray a field is asked. Deterministic without ``jitter``."""
+
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples: ...
+
+
+@runtime_checkable
+class RadianceField(Protocol):
+    """A differentiable scene. Only reverse-mode derivatives are asked of it."""
+
+    @property
+    def sampler(self) -> RaySampler: ...
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        """Density and colour at ``positions`` (metres, world) seen along unit ``directions``; zero points are asked too."""
+        ...
+
+
+def levels(field: RadianceField) -> tuple[RadianceField, ...]:
+    """The field's levels of detail, coarsest first; a field that offers none is its own only level."""
+    return tuple(getattr(field, "levels", None) or (field,))
+
+
+@dataclass(frozen=True)
+class SceneBounds:
+    """What may be assumed of a scene before anything is trained. Plain numbers: it is stored as JSON."""
+
+    lower: tuple[float, float, float]  # metres, world: corners of the box that holds all matter
+    upper: tuple[float, float, float]
+    near: float  # metres along a ray: nothing of interest is nearer ...
+    far: float  # ... or farther
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour seen where a ray meets nothing
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
+            raise InputError(f"scene bounds: lower corner {self.lower} is not below upper corner {self.upper}")
+        if not 0 <= self.near < self.far:
+            raise InputError(f"scene bounds: expected 0 <= near < far, got near {self.near}, far {self.far}")
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        a, b = self.lower, self.upper
+        return (b[0] - a[0], b[1] - a[1], b[2] - a[2])
+
+    def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
+        """Rays limited to the box and to [near, far] (slab method). The limits carry no gradient: they only say where to look."""
+        with torch.no_grad():
+            lower, upper = (origins.new_tensor(corner) for corner in (self.lower, self.upper))
+            tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
+            slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
+            first, second = (lower - origins) * slope, (upper - origins) * slope
+            near = torch.minimum(first, second).amax(-1).clamp(min=self.near)
+            far = torch.maximum(first, second).amin(-1).clamp(max=self.far)
+        return Rays(origins, directions, near, torch.maximum(near, far))
+
+
+def widened(rays: Rays, factor: float) -> Rays:
+    """The sampled interval ``factor`` times as long about its middle, never behind the camera (the paper's "wide")."""
+    middle, half = (rays.near + rays.far) / 2, (rays.far - rays.near) / 2 * factor
+    return replace(rays, near=(middle - half).clamp(min=0), far=middle + half)

@@ -1,0 +1,44 @@
+"""Images with their camera, and images with their place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.errors import InputError
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One RGB or RGB-D image. Depth is planar z in metres, 0 where nothing was measured."""
+
+    name: str
+    rgb: Float[Tensor, "h w 3"]  # in [0, 1], already over the background where there was an alpha channel
+    intrinsics: Intrinsics
+    depth: Float[Tensor, "h w"] | None = None
+    alpha: Float[Tensor, "h w"] | None = None  # 1 where the scene covers the pixel, 0 where the background shows
+
+    def __post_init__(self) -> None:
+        expected = (self.intrinsics.height, self.intrinsics.width)
+        for what, image in (("rgb", self.rgb), ("depth", self.depth), ("alpha", self.alpha)):
+            if image is not None and tuple(image.shape[:2]) != expected:
+                found = f"{image.shape[1]}x{image.shape[0]}"
+                raise InputError(
+                    f"frame {self.name}: {what} is {found}, its camera expects {expected[1]}x{expected[0]}"
+                )
+
+    @property
+    def has_depth(self) -> bool:
+        return self.depth is not None and bool((self.depth > 0).any())
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame and where its camera is in some reference frame: the world, or the last camera of a rig."""
+
+    frame: Frame
+    T_ref_camera: SE3

@@ -1,0 +1,8 @@
+"""Finding poses: ``localize`` and its parts."""
+
+from bidnerf_core.localization.adam import BidConfig
+from bidnerf_core.localization.methods import METHODS, Method, find_method, localize
+from bidnerf_core.localization.problem import Problem, rig, single
+from bidnerf_core.localization.result import Localization
+
+__all__ = ["METHODS", "BidConfig", "Localization", "Method", "Problem", "find_method", "localize", "rig", "single"]

@@ -1,0 +1,93 @@
+"""The paper's localizer: first-order descent on rendered colour and depth (BID-NeRF, Alg. 1)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+from torch import Generator, Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import widened
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.result import Localization
+from bidnerf_core.pixels import draw, uniform
+from bidnerf_core.rendering import render
+from bidnerf_core.residuals import objective
+from bidnerf_core.se3 import SE3
+
+WINDOW = 20
+"""Steps over which the noisy loss is averaged before it is trusted."""
+
+
+@dataclass(frozen=True)
+class BidConfig:
+    """Settings of method ``bid``."""
+
+    rays: int = 2048  # in all, shared out equally among the views
+    max_steps: int = 400
+    learning_rate: float = 0.02  # metres and radians a step
+    decay: float = 0.4  # factor on the learning rate ...
+    decay_steps: int = 100  # ... after so many steps
+    depth_weight: float = 1.0  # lambda_d
+    huber_delta: float = 0.1
+    level: int | None = 0  # of the field: 0 is the coarsest, null the field itself
+    wide: float = 1.0  # sampled interval over [near, far]; the paper's "wide" is 2
+    stop_loss: float = 0.0  # epsilon of Alg. 1: stop once the mean loss of 20 steps is below it; 0 never stops early
+    converged_loss: float = 0.01  # mean loss of the last 20 steps under which the answer is called converged
+
+
+def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
+    """Descend from ``problem.start``; pixels are drawn anew at each step, from ``seed``.
+
+    Alg. 1 of the paper, with its loop test the right way round. Each step writes the pose as T exp(delta) about the
+    current T, takes the gradient by delta at 0, and moves by what Adam makes of it.
+    """
+    began = time.perf_counter()
+    generator = torch.Generator().manual_seed(seed)
+    delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([delta], lr=config.learning_rate, betas=(0.9, 0.999))
+    T, poses, losses = problem.start, [problem.start], []
+    reason = f"reached {config.max_steps} steps"
+    for step in range(config.max_steps):
+        optimizer.param_groups[0]["lr"] = config.learning_rate * config.decay ** (step / config.decay_steps)
+        loss = _loss(problem, T.retract(delta), config, generator)
+        losses.append(float(loss.detach()))
+        if loss.requires_grad:
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        T = T.retract(delta.detach()).normalized()
+        poses.append(T)
+        with torch.no_grad():
+            delta.zero_()
+        if step + 1 >= WINDOW and _recent(losses) < config.stop_loss:
+            reason = f"mean loss of {WINDOW} steps fell below {config.stop_loss:g}"
+            break
+    return Localization(
+        T_world_camera=T,
+        converged=_recent(losses) < config.converged_loss,
+        reason=reason,
+        steps=len(losses),
+        seconds=time.perf_counter() - began,
+        loss=_recent(losses),
+        method="bid",
+        poses=SE3.stack(poses),
+        losses=torch.tensor(losses, dtype=torch.float64),
+    )
+
+
+def _loss(problem: Problem, T_world_last: SE3, config: BidConfig, generator: Generator) -> Tensor:
+    """Eq. 6 on freshly drawn pixels."""
+    pixels = draw(problem.views, config.rays, uniform, generator)
+    rays = pixels.rays(T_world_last, problem.bounds)
+    if config.wide != 1:
+        rays = widened(rays, config.wide)
+    rendering = render(problem.level(config.level), rays, problem.bounds.background)
+    return objective(rendering, pixels, config.huber_delta, config.depth_weight)
+
+
+def _recent(losses: list[float]) -> float:
+    last = losses[-WINDOW:]
+    return sum(last) / len(last) if last else float("nan")

@@ -1,0 +1,48 @@
+"""Methods by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization.adam import BidConfig, bid
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.result import Localization
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to find a pose, and the frozen dataclass of its settings."""
+
+    run: Callable[[Problem, Any, int], Localization]
+    config_type: type
+    summary: str
+
+
+METHODS = {"bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)")}
+
+AUTO = "bid"
+"""What ``auto`` stands for."""
+
+
+def find_method(name: str) -> Method:
+    chosen = METHODS.get(AUTO if name == "auto" else name)
+    if chosen is None:
+        raise InputError(f"method {name!r} is unknown, expected auto or one of {', '.join(sorted(METHODS))}")
+    return chosen
+
+
+def localize(problem: Problem, method: str = "auto", config: Any = None, seed: int = 0) -> Localization:
+    """Find the pose of ``problem``'s last camera.
+
+    ``config`` is an instance of the method's config type, by default with all defaults. The same seed gives the same
+    answer on the same machine. Raises ``InputError`` for an unknown method.
+    """
+    chosen = find_method(method)
+    settings = chosen.config_type() if config is None else config
+    if not isinstance(settings, chosen.config_type):
+        expected, found = chosen.config_type.__name__, type(settings).__name__
+        raise InputError(f"method {method!r} takes a {expected}, got a {found}")
+    return chosen.run(problem, settings, seed)

@@ -1,0 +1,60 @@
+"""What is to be localized."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """K images with known relative poses in a map; the pose sought is that of the last one's camera.
+
+    ``views[i].T_ref_camera`` is T_K_i, camera i in the frame of the last camera K, so the last view's is the identity.
+    """
+
+    field: RadianceField
+    bounds: SceneBounds
+    views: tuple[View, ...]
+    start: SE3  # T_world_K
+
+    def __post_init__(self) -> None:
+        if not self.views:
+            raise InputError("nothing to localize: expected at least one view")
+        for what, pose in (("start", self.start), *((v.frame.name, v.T_ref_camera) for v in self.views)):
+            if not bool(pose.is_rigid().all()):
+                raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
+
+    @property
+    def has_depth(self) -> bool:
+        return any(view.frame.has_depth for view in self.views)
+
+    def level(self, number: int | None) -> RadianceField:
+        """A level of the field, counted from the coarsest, negative from the finest; ``None`` is the field itself."""
+        if number is None:
+            return self.field
+        offered = levels(self.field)
+        if not -len(offered) <= number < len(offered):
+            raise InputError(f"level {number} does not exist: the field offers {len(offered)}, from 0")
+        return offered[number]
+
+
+def single(field: RadianceField, bounds: SceneBounds, frame: Frame, start: SE3) -> Problem:
+    """One image."""
+    return Problem(field, bounds, (View(frame, SE3.identity()),), start.to(torch.float64))
+
+
+def rig(field: RadianceField, bounds: SceneBounds, views: Sequence[View], start: SE3) -> Problem:
+    """Views whose poses are known in any common frame; ``start`` is for the last of them."""
+    if not views:
+        raise InputError("nothing to localize: expected at least one view")
+    T_last_ref = views[-1].T_ref_camera.to(torch.float64).inverse()
+    relative = tuple(View(v.frame, (T_last_ref @ v.T_ref_camera.to(torch.float64)).normalized()) for v in views)
+    return Problem(field, bounds, relative, start.to(torch.float64))

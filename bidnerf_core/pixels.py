@@ -1,0 +1,78 @@
+"""Which pixels are looked at, and what they say.
+
+A ``PixelDrawer`` picks pixels of a frame; ``observe`` turns them into rays of the view's reference frame with the colour
+and distance that were measured there. This is where planar depth becomes distance along the ray, once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Generator, Tensor
+
+from bidnerf_core.field import Rays, SceneBounds
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Measurements along half-lines of a reference frame."""
+
+    origins: Float[Tensor, "*p 3"]  # metres, reference frame
+    directions: Float[Tensor, "*p 3"]  # unit, reference frame
+    rgb: Float[Tensor, "*p 3"]
+    distance: Float[Tensor, "*p"]  # metres along the ray; 0 where nothing was measured
+
+    def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
+        """The half-lines where ``T_world_ref`` puts them, limited to the scene; differentiable in the transform."""
+        T = T_world_ref.to(self.origins)
+        return bounds.rays(T.apply(self.origins), T.rotate(self.directions))
+
+
+@runtime_checkable
+class PixelDrawer(Protocol):
+    """Picks ``count`` pixels (column, row) of a frame."""
+
+    def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]: ...
+
+
+def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
+    """Every pixel as likely as any other."""
+    columns = torch.randint(frame.intrinsics.width, (count,), generator=generator)
+    rows = torch.randint(frame.intrinsics.height, (count,), generator=generator)
+    return torch.stack([columns, rows], dim=-1)
+
+
+def all_pixels(frame: Frame) -> Int[Tensor, "n 2"]:
+    return frame.intrinsics.pixel_centres().long().reshape(-1, 2)  # centres lie at +0.5: truncation gives the index
+
+
+def observe(view: View, pixels: Int[Tensor, "n 2"], dtype: torch.dtype = torch.float32) -> Pixels:
+    """What ``view`` measured at ``pixels``, as half-lines of its reference frame."""
+    frame, (columns, rows) = view.frame, pixels.unbind(-1)
+    ray = frame.intrinsics.unproject(pixels.double() + 0.5)  # z = 1
+    length = torch.linalg.vector_norm(ray, dim=-1)
+    depth = torch.zeros_like(length) if frame.depth is None else frame.depth[rows, columns].double()
+    directions = view.T_ref_camera.to(torch.float64).rotate(ray / length[:, None])
+    origins = view.T_ref_camera.to(torch.float64).translation.expand_as(directions)
+    rgb = frame.rgb[rows, columns]
+    return Pixels(origins.to(dtype), directions.to(dtype), rgb.to(dtype), (depth * length).to(dtype))
+
+
+def draw(
+    views: Sequence[View], count: int, drawer: PixelDrawer, generator: Generator, dtype: torch.dtype = torch.float32
+) -> Pixels:
+    """``count`` pixels shared out equally among the views; every tensor has leading axes (views, pixels a view)."""
+    share = max(1, count // len(views))
+    parts = [observe(view, drawer(view.frame, share, generator), dtype) for view in views]
+    return Pixels(
+        torch.stack([p.origins for p in parts]),
+        torch.stack([p.directions for p in parts]),
+        torch.stack([p.rgb for p in parts]),
+        torch.stack([p.distance for p in parts]),
+    )

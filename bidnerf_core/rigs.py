@@ -1,0 +1,78 @@
+"""Camera poses that show a scene well. World axes: z up; camera axes are OpenCV's (z forward, y down)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import SceneBounds
+from bidnerf_core.se3 import SE3
+
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+"""Successive multiples of it (rad) fill a circle evenly, however many there are."""
+
+
+def look_at(
+    eye: Sequence[float] | Float[Tensor, "3"],
+    target: Sequence[float] | Float[Tensor, "3"],
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> SE3:
+    """``T_world_camera`` (float64) of a camera at ``eye`` with ``target`` in its middle and ``up`` upwards."""
+    position = torch.as_tensor(eye, dtype=torch.float64)
+    forward = torch.as_tensor(target, dtype=torch.float64) - position
+    if not torch.linalg.vector_norm(forward) > 0:
+        raise InputError(f"look_at: the camera's place {position.tolist()} and its target are the same")
+    forward = torch.nn.functional.normalize(forward, dim=0)
+    right = torch.linalg.cross(forward, torch.as_tensor(up, dtype=torch.float64))
+    if torch.linalg.vector_norm(right) < 1e-6:  # straight up or down: any right will do
+        right = torch.linalg.cross(forward, forward.new_tensor([0.0, 1.0, 0.0]))
+    right = torch.nn.functional.normalize(right, dim=0)
+    return SE3(torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-1), position)
+
+
+def orbit(
+    radius: float,
+    count: int,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    elevation: tuple[float, float] = (5.0, 80.0),
+    seed: int = 0,
+) -> list[SE3]:
+    """``T_world_camera`` on a sphere (metres) about ``centre`` and looking at it, evenly spread (Fibonacci).
+
+    ``elevation``: lowest and highest, degrees above the horizon; (-90, 90) is the whole sphere. ``seed`` turns the
+    spiral, so that two seeds share no place.
+    """
+    turn, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).tolist()
+    low, high = (math.sin(math.radians(e)) for e in elevation)
+    poses: list[SE3] = []
+    for i in range(count):
+        z = low + (high - low) * (i + shift) / count
+        azimuth, flat = i * GOLDEN_ANGLE + 2 * math.pi * turn, math.sqrt(max(0.0, 1 - z * z))
+        offset = (flat * math.cos(azimuth), flat * math.sin(azimuth), z)
+        poses.append(look_at([c + radius * o for c, o in zip(centre, offset, strict=True)], centre))
+    return poses
+
+
+def look_around(bounds: SceneBounds, count: int, seed: int = 0, spread: float = 0.5) -> list[SE3]:
+    """``T_world_camera`` inside a room, at head height, in all compass directions and a little up or down.
+
+    Each camera stands about ``spread`` of the way from the middle to the wall behind it, to see much of the room.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (bounds.lower, bounds.upper))
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    poses: list[SE3] = []
+    turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float64).item()
+    for chance in torch.rand((count, 4), generator=generator, dtype=torch.float64):
+        azimuth = turn + len(poses) * GOLDEN_ANGLE
+        forward = middle.new_tensor([math.cos(azimuth), math.sin(azimuth), 0.0])
+        sideways = (chance[:3] - 0.5) * middle.new_tensor([0.4, 0.4, 0.3])
+        eye = middle + half * (sideways - spread * forward + middle.new_tensor([0.0, 0.0, 0.15]))
+        tilt = middle.new_tensor([0.0, 0.0, 0.15 - 0.6 * chance[3].item()])
+        poses.append(look_at(eye, eye + forward + tilt))
+    return poses

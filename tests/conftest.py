@@ -1,0 +1,58 @@
+"""What all tests share: shape checks, threads, recorded data, and reproducible property tests."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from jaxtyping import install_import_hook
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the library does, which is imported after torch here
+
+# Before the first import of the project: only modules that are imported afterwards are checked.
+install_import_hook(["bidnerf_core", "bidnerf_hashgrid"], "shape_checks.checked")
+
+import pytest
+import torch
+from hypothesis import HealthCheck, settings
+
+THREADS = "BIDNERF_TEST_THREADS"
+DATA = "BIDNERF_DATA"
+
+# Small tensors: a second thread costs more than it does, and results would depend on the number of cores.
+torch.set_num_threads(int(os.environ.get(THREADS, "1")))
+
+settings.register_profile(
+    "bidnerf",
+    derandomize=True,
+    deadline=None,  # a busy machine is no fault of the code
+    database=None,
+    max_examples=50,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+settings.load_profile("bidnerf")
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of recorded scenes."""
+    folder = os.environ.get(DATA)
+    if not folder:
+        pytest.skip(f"{DATA} is not set")
+    if not Path(folder).is_dir():
+        pytest.fail(f"{DATA} is {folder}, which is not a folder")
+    return Path(folder)
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> Iterator[None]:
+    """Each test starts from the same global random state, alone or after others."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        yield
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)

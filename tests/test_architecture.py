@@ -1,0 +1,74 @@
+"""The shape of the code: who imports whom, what is annotated, how long a file may be."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = [ROOT / "bidnerf_core", *sorted(f.parent for f in (ROOT / "backends").glob("*/__init__.py"))]
+FILES = sorted(file for package in PACKAGES for file in package.rglob("*.py"))
+LONGEST = 300
+
+every_file = pytest.mark.parametrize("file", FILES, ids=[str(f.relative_to(ROOT)) for f in FILES])
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def test_imports_follow_the_arrows() -> None:
+    """The contracts under [tool.importlinter] in pyproject.toml."""
+    program = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    command = [sys.executable, "-c", program, "--no-cache", "--no-logo"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
+def test_every_import_package_is_typed(package: Path) -> None:
+    assert (package / "py.typed").is_file()
+
+
+@every_file
+def test_files_are_short_and_say_what_they_are(file: Path) -> None:
+    text = file.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= LONGEST
+    assert ast.get_docstring(ast.parse(text)), "a module starts with a docstring"
+
+
+@every_file
+def test_public_functions_are_annotated(file: Path) -> None:
+    """Also where mypy would infer a type: annotations are what the run-time checks of the tests read."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    assert [name for function in _public(tree) for name in _bare(function)] == []
+
+
+@every_file
+def test_only_the_registry_imports_by_name(file: Path) -> None:
+    """The core reaches a backend through ``load_backend`` alone; the command line finds its own commands so."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    names = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    names |= {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
+    found = names & {"import_module", "__import__", "entry_points"}
+    assert not found or file in (ROOT / "bidnerf_core/registry.py", ROOT / "bidnerf_core/cli/__init__.py")
+
+
+def _public(tree: ast.Module | ast.ClassDef) -> Iterator[Function]:
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield from _public(node)
+        if isinstance(node, Function) and (node.name == "__init__" or not node.name.startswith("_")):
+            yield node
+
+
+def _bare(function: Function) -> Iterator[str]:
+    a = function.args
+    for argument in (*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))):
+        if argument.annotation is None and argument.arg not in ("self", "cls"):
+            yield f"{function.name}({argument.arg})"
+    if function.returns is None:
+        yield f"{function.name} -> ?"

@@ -1,0 +1,347 @@
+"""Closed-form scenes: their depth is exact, their frames agree with each other, their pictures are the right way up."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.optimize import brentq
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.closed_form import ClosedFormScene
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import SceneBounds
+from bidnerf_core.primitives import Box, Cylinder, Primitive, Shape, Sphere
+from bidnerf_core.scenes import demo_object, demo_room, look_around, look_at, orbit, views
+from bidnerf_core.se3 import SE3
+from bidnerf_core.textures import blotches, checker, stripes
+
+CAMERA = Intrinsics(70.0, 75.0, 31.0, 24.5, 64, 48)
+PAINT = checker((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.5)
+SHAPES = [Sphere(0.7), Box((0.3, 0.6, 0.5)), Cylinder(0.5, 0.4), Cylinder(0.8, 0.01)]
+SCENES = [demo_object(), demo_room()]
+
+
+def implicit(shape: Shape, points: Tensor) -> Tensor:
+    """Negative inside, positive outside."""
+    if isinstance(shape, Sphere):
+        return points.norm(dim=-1) - shape.radius
+    if isinstance(shape, Box):
+        return (points.abs() - points.new_tensor(shape.half)).amax(-1)
+    assert isinstance(shape, Cylinder)
+    return torch.maximum(points[..., :2].norm(dim=-1) - shape.radius, points[..., 2].abs() - shape.half)
+
+
+def random_rays(count: int, generator: torch.Generator, reach: float = 1.5) -> tuple[Tensor, Tensor]:
+    """(n 3) each, float64; origins in and around a shape of size one, a third of the directions along an axis."""
+    origins = (torch.rand((count, 3), generator=generator, dtype=torch.float64) * 2 - 1) * reach
+    directions = torch.randn((count, 3), generator=generator, dtype=torch.float64)
+    axis = torch.eye(3, dtype=torch.float64)[torch.arange(count) % 3] * directions.sign()
+    directions = torch.where((torch.arange(count) % 9 < 3)[:, None], axis, directions)
+    return origins, torch.nn.functional.normalize(directions, dim=-1)
+
+
+def placed(shape: Shape, generator: torch.Generator) -> Primitive:
+    return Primitive(shape, SE3.exp(torch.randn(6, generator=generator, dtype=torch.float64) * 0.5), PAINT)
+
+
+def views_of(scene: ClosedFormScene, count: int = 4) -> list[SE3]:
+    inside = scene.name == "demo_room"
+    return look_around(scene.bounds, count) if inside else orbit(3.2, count, elevation=(-40, 80))
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_distance_is_the_first_crossing_of_the_implicit_surface(
+    shape: Shape, generator: torch.Generator
+) -> None:
+    primitive = placed(shape, generator)
+    origins, directions = random_rays(300, generator)
+    distance = primitive.distance(origins.T, directions.T)
+    steps = torch.linspace(0, 6, 6001, dtype=torch.float64)
+
+    def level(ray: int, along: Tensor) -> Tensor:
+        points = origins[ray] + along[..., None] * directions[ray]
+        return implicit(shape, primitive.T_world_shape.inverse().apply(points))
+
+    compared = 0
+    for ray in range(len(origins)):
+        values = level(ray, steps)
+        if values.abs().min() < 2e-3 and not values.min() < -2e-3:
+            continue  # grazes: marching may step over it
+        crossings = (values[:-1].sign() != values[1:].sign()).nonzero()
+        if len(crossings) == 0:
+            assert distance[ray] == math.inf
+            continue
+        i = int(crossings[0])
+        ends = steps[i : i + 2].tolist()
+        root = brentq(
+            lambda t, r=ray: float(level(r, torch.tensor(t, dtype=torch.float64))), *ends, xtol=1e-13
+        )
+        assert float(distance[ray]) == pytest.approx(root, abs=1e-9)
+        compared += 1
+    assert compared > 20
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_distance_is_never_negative_or_nan(
+    shape: Shape, dtype: torch.dtype, generator: torch.Generator
+) -> None:
+    for primitive in (placed(shape, generator), Primitive(shape, SE3.identity(), PAINT)):
+        origins, directions = (x.to(dtype).T for x in random_rays(5000, generator))
+        for starts in (origins, 1e4 * origins, torch.zeros_like(origins)):
+            distance = primitive.distance(starts, directions)
+            assert (distance >= 0).all()  # false for NaN
+        assert (
+            distance.isfinite().all() == (primitive.T_world_shape.translation == 0).all()
+        )  # left from within
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_normals_are_the_gradient_of_the_implicit_function(shape: Shape, generator: torch.Generator) -> None:
+    origins, directions = random_rays(500, generator)
+    distance = Primitive(shape, SE3.identity(), PAINT).distance(origins.T, directions.T)
+    hit = distance.isfinite()
+    points = (origins + distance[:, None].nan_to_num(posinf=0) * directions)[hit].requires_grad_()
+    (gradient,) = torch.autograd.grad(implicit(shape, points).sum(), points)
+    torch.testing.assert_close(shape.normals(points.detach()), gradient, atol=1e-9, rtol=0)
+
+
+def test_impossible_shapes_are_refused() -> None:
+    for make in (lambda: Sphere(0.0), lambda: Box((1.0, -1.0, 1.0)), lambda: Cylinder(1.0, float("nan"))):
+        with pytest.raises(InputError, match="expected positive"):
+            make()
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
+def test_hits_are_lit_paint_with_normals_towards_the_eye(
+    scene: ClosedFormScene, generator: torch.Generator
+) -> None:
+    origins, directions = random_rays(4000, generator, reach=1.4)
+    hits = scene.intersect(origins, directions)
+    met = hits.distance.isfinite()
+    assert met.any()
+    assert ((hits.rgb >= 0) & (hits.rgb <= 1)).all()
+    torch.testing.assert_close(hits.normal.norm(dim=-1), met.double())
+    assert ((hits.normal * directions).sum(-1)[met] <= 1e-9).all()
+    if not met.all():
+        assert (hits.rgb[~met] == hits.rgb.new_tensor(scene.bounds.background)).all()
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
+def test_one_origin_for_all_is_the_same_as_one_for_each(
+    scene: ClosedFormScene, generator: torch.Generator
+) -> None:
+    _, directions = random_rays(600, generator)
+    origin = torch.tensor([0.3, -1.4, 1.2], dtype=torch.float64)
+    shared = scene.intersect(origin, directions.reshape(20, 30, 3))
+    each = scene.intersect(origin.expand(20, 30, 3), directions.reshape(20, 30, 3))
+    torch.testing.assert_close(shared.distance, each.distance, atol=0, rtol=0)
+    torch.testing.assert_close(shared.rgb, each.rgb, atol=1e-12, rtol=0)
+
+
+def test_no_rays_and_no_primitives() -> None:
+    scene = demo_object()
+    assert scene.intersect(torch.zeros(3), torch.zeros((0, 3))).rgb.shape == (0, 3)
+    frame = replace(scene, primitives=[]).render(CAMERA, orbit(3.0, 1)[0])
+    assert not frame.has_depth
+    assert (frame.rgb == 1).all()
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
+def test_all_matter_lies_within_the_bounds(scene: ClosedFormScene) -> None:
+    for T in views_of(scene, 6):
+        rays = T.rotate(
+            torch.nn.functional.normalize(CAMERA.unproject(CAMERA.pixel_centres(torch.float64)), dim=-1)
+        )
+        distance = scene.intersect(T.translation, rays).distance
+        limits = scene.bounds.rays(T.translation.expand_as(rays), rays)
+        met = distance.isfinite()
+        assert ((distance >= limits.near) & (distance <= limits.far))[met].all()
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
+@pytest.mark.parametrize("distortion", [(), (-0.1, 0.02, 1e-3, -1e-3)], ids=["pinhole", "distorted"])
+def test_depth_is_planar_and_exact_at_the_pixel_centre(
+    scene: ClosedFormScene, distortion: tuple[float, ...]
+) -> None:
+    camera, T = replace(CAMERA, distortion=distortion), views_of(scene)[1]
+    frame = scene.render(camera, T)
+    assert frame.depth is not None
+    points = camera.unproject(camera.pixel_centres(torch.float64)) * frame.depth[..., None].double()
+    away = T.apply(points) - T.translation
+    seen = frame.depth > 0
+    hits = scene.intersect(T.translation, torch.nn.functional.normalize(away[seen], dim=-1))
+    assert seen.any()
+    assert (
+        torch.quantile((hits.distance - away[seen].norm(dim=-1)).abs(), 0.99) < 1e-6
+    )  # silhouettes are ill-conditioned
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
+def test_what_two_views_both_see_has_the_same_place_and_colour(scene: ClosedFormScene) -> None:
+    T1 = views_of(scene, 12)[3]
+    T2 = T1.retract(torch.tensor([0.15, -0.05, 0.1, 0.02, -0.05, 0.1], dtype=torch.float64))
+    one, two = (view.frame for view in views(scene, CAMERA, [T1, T2]))
+    assert one.depth is not None
+    assert two.depth is not None
+    points = T1.apply(CAMERA.unproject(CAMERA.pixel_centres(torch.float64)) * one.depth[..., None].double())
+    points, rgb = points[one.depth > 0], one.rgb[one.depth > 0]
+    there = T2.inverse().apply(points)
+    pixel = CAMERA.project(there).floor()
+    inside = ((pixel >= 0) & (pixel < pixel.new_tensor([CAMERA.width, CAMERA.height]))).all(-1)
+    column, row = pixel[inside].long().unbind(-1)
+    difference = two.depth[row, column].double() - there[inside][:, 2]
+    visible = (difference.abs() < 0.03) & (two.depth[row, column] > 0)
+    assert inside.float().mean() > 0.4
+    assert visible.float().mean() > 0.85
+    assert (rgb[inside] - two.rgb[row, column])[visible].abs().mean() < 0.05
+    # From the second camera, something is met at each point or before it.
+    ray = points[inside] - T2.translation
+    length = ray.norm(dim=-1)
+    assert (
+        scene.intersect(T2.translation, ray / length[:, None]).distance <= length + 1e-5
+    ).float().mean() > 0.99
+
+
+def test_moving_world_and_camera_leaves_the_depth_as_it_was() -> None:
+    scene, T = demo_object(), orbit(3.0, 3)[1]
+    move = SE3.exp(torch.tensor([0.4, -2.0, 1.0, 0.3, 1.0, -0.7], dtype=torch.float64))
+    parts = [replace(p, T_world_shape=move @ p.T_world_shape) for p in scene.primitives]
+    one, two = scene.render(CAMERA, T), replace(scene, primitives=parts).render(CAMERA, move @ T)
+    torch.testing.assert_close(one.depth, two.depth, atol=1e-6, rtol=0)
+    torch.testing.assert_close(one.alpha, two.alpha, atol=0.26, rtol=0)
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
+def test_twice_the_samples_change_little(scene: ClosedFormScene) -> None:
+    """Textures are band-limited: what is left of aliasing is at contours."""
+    camera = CAMERA.scaled(2.5)
+    for T in views_of(scene):
+        usual, fine = scene.render(camera, T).rgb, scene.render(camera, T, supersample=4).rgb
+        assert (usual - fine).square().mean().sqrt() < 0.02
+
+
+def test_coverage_is_soft_at_contours_and_whole_in_rooms() -> None:
+    T = orbit(3.0, 4)[2]
+    frame = demo_object().render(CAMERA, T, name="seen")
+    assert frame.name == "seen"
+    assert frame.alpha is not None
+    assert {0.0, 0.25, 0.5, 0.75, 1.0} == set(frame.alpha.unique().tolist())
+    assert (frame.rgb[frame.alpha == 0] == 1).all()
+    room = demo_room()
+    for view in views(room, CAMERA, look_around(room.bounds, 3)):
+        assert view.frame.alpha is not None
+        assert view.frame.alpha.min() == 1
+        assert view.frame.depth is not None
+        assert view.frame.depth.min() > 0.1
+    with pytest.raises(InputError, match="supersample"):
+        demo_object().render(CAMERA, T, supersample=0)
+
+
+SYMMETRIES = [
+    torch.diag(torch.tensor(signs, dtype=torch.float64))
+    for signs in ((1, 1, -1), (1, -1, 1), (-1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1), (-1, -1, -1))
+] + [torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)]
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda s: s.name)
+def test_no_symmetry_maps_a_scene_onto_itself(scene: ClosedFormScene) -> None:
+    """Rays and their images under a symmetry about the middle of the scene meet other colours, or other depths."""
+    middle = (torch.tensor(scene.bounds.lower) + torch.tensor(scene.bounds.upper)).double() / 2
+    for T in views_of(scene, 3):
+        rays = T.rotate(
+            torch.nn.functional.normalize(CAMERA.unproject(CAMERA.pixel_centres(torch.float64)), dim=-1)
+        )
+        seen = scene.intersect(T.translation, rays)
+        for symmetry in SYMMETRIES:
+            other = scene.intersect(symmetry @ (T.translation - middle) + middle, rays @ symmetry.T)
+            either = seen.distance.isfinite() | other.distance.isfinite()
+            assert (seen.rgb - other.rgb)[either].abs().mean() > 0.06
+
+
+def test_pictures_are_upright_and_not_mirrored() -> None:
+    """Seen from -y: +x lies to the right, +z above; the lorry's nose (+x) is at the right."""
+    T = look_at((0.0, -4.0, 0.6), (0.0, 0.0, 0.0))
+    assert bool(T.is_rigid(1e-12))
+    (u0, v0), (u1, _), (_, v1) = CAMERA.project(
+        T.inverse().apply(torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [0, 0, 0.5]]).double())
+    )
+    assert u1 > u0
+    assert v1 < v0
+    frame = demo_object().render(CAMERA, T)
+    assert frame.alpha is not None
+    red = (frame.rgb[..., 0] > 0.5) & (frame.rgb[..., 2] < 0.35) & (frame.rgb[..., 1] < 0.5)  # the cab
+    columns = red.nonzero()[:, 1].double()
+    assert columns.mean() > u0
+    floor = demo_room().render(CAMERA, look_at((-1.0, 0.0, 1.4), (1.5, 0.0, 1.0)))
+    assert floor.depth is not None
+    assert floor.depth[-1].mean() < floor.depth[24].mean()
+
+
+def test_orbit_looks_at_its_centre_from_its_radius() -> None:
+    centre = (0.3, -1.0, 2.0)
+    for T in orbit(2.5, 40, centre=centre, elevation=(-90, 90), seed=3):
+        assert bool(T.is_rigid(1e-12))
+        middle = T.inverse().apply(torch.tensor(centre, dtype=torch.float64))
+        torch.testing.assert_close(middle, middle.new_tensor([0, 0, 2.5]), atol=1e-12, rtol=0)
+        torch.testing.assert_close(CAMERA.project(middle), middle.new_tensor([CAMERA.cx, CAMERA.cy]))
+
+
+def test_orbit_is_even_and_reproducible() -> None:
+    def places(count: int, seed: int, **kwargs: tuple[float, float]) -> Tensor:
+        return torch.stack([T.translation for T in orbit(1.0, count, seed=seed, **kwargs)])
+
+    assert torch.equal(places(30, 1), places(30, 1))
+    assert torch.cdist(places(30, 1), places(30, 2)).min() > 1e-3
+    elevation = torch.rad2deg(places(100, 0)[:, 2].asin())
+    assert elevation.min() >= 5
+    assert elevation.max() <= 80
+    nearest = torch.cdist(places(200, 0, elevation=(-90, 90)), places(200, 0, elevation=(-90, 90)))
+    nearest = nearest.fill_diagonal_(9).amin(-1)
+    assert nearest.min() > 0.5 * nearest.max()
+    assert orbit(1.0, 0) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_look_around_stands_clear_of_the_furniture(seed: int) -> None:
+    room = demo_room()
+    poses = look_around(room.bounds, 12, seed)
+    everywhere = orbit(1.0, 200, elevation=(-90, 90))
+    directions = torch.stack([T.translation for T in everywhere])
+    for T in poses:
+        assert bool(T.is_rigid(1e-12))
+        assert T.rotation[2, 1] < -0.8  # y of the image points down
+        assert room.intersect(T.translation, directions).distance.min() > 0.15
+    azimuth = torch.stack([torch.atan2(T.rotation[1, 2], T.rotation[0, 2]) for T in poses]).sort().values
+    assert azimuth.diff().max() < 2 * math.pi / 5
+
+
+def test_look_at_straight_down_and_at_itself() -> None:
+    for eye in ((0.0, 0.0, 3.0), (0.0, 0.0, -3.0)):
+        T = look_at(eye, (0.0, 0.0, 0.0))
+        assert bool(T.is_rigid(1e-12))
+    with pytest.raises(InputError, match="the same"):
+        look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
+
+
+def test_textures_stay_in_range_and_vary(generator: torch.Generator) -> None:
+    points = torch.rand((2000, 3), generator=generator, dtype=torch.float64) * 4 - 2
+    for texture in (
+        PAINT,
+        stripes((1, 1, 1), (0, 0, 0), (1, 2, 0), 0.3),
+        blotches((1, 1, 0), (0, 0, 1), 0.5, 3),
+    ):
+        rgb = texture(points, points)
+        assert rgb.dtype == points.dtype
+        assert ((rgb >= 0) & (rgb <= 1)).all()
+        assert rgb.std(dim=0).max() > 0.2
+
+
+def test_bounds_of_scenes_have_room_for_a_camera() -> None:
+    for scene in SCENES:
+        assert isinstance(scene.bounds, SceneBounds)
+        assert math.hypot(*scene.bounds.size) <= scene.bounds.far
