@@ -39,7 +39,9 @@ class Intrinsics:
         if not all(math.isfinite(x) for x in (self.cx, self.cy, *self.distortion)):
             raise InputError("principal point or distortion is not finite")
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
-            raise InputError(f"distortion has {len(self.distortion)} coefficients, expected 0, 4, 5, 8, 12 or 14")
+            raise InputError(
+                f"distortion has {len(self.distortion)} coefficients, expected 0, 4, 5, 8, 12 or 14"
+            )
 
     def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
         return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=dtype)
@@ -47,7 +49,9 @@ class Intrinsics:
     def unproject(self, pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p 3"]:
         """Points on the plane z = 1 that are seen at ``pixels`` (u, v); not unit vectors."""
         if self.distortion:
-            flat = undistort_points(pixels.reshape(-1, 2).double(), self.matrix(), self._coefficients(), num_iters=20)
+            flat = undistort_points(
+                pixels.reshape(-1, 2).double(), self.matrix(), self._coefficients(), num_iters=20
+            )
             pixels = flat.to(pixels.dtype).reshape(pixels.shape)
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
@@ -66,7 +70,9 @@ class Intrinsics:
 
     def pixel_centres(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "h w 2"]:
         v, u = torch.meshgrid(
-            torch.arange(self.height, dtype=dtype) + 0.5, torch.arange(self.width, dtype=dtype) + 0.5, indexing="ij"
+            torch.arange(self.height, dtype=dtype) + 0.5,
+            torch.arange(self.width, dtype=dtype) + 0.5,
+            indexing="ij",
         )
         return torch.stack([u, v], dim=-1)
 

@@ -86,7 +86,9 @@ class SceneBounds:
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
-            raise InputError(f"scene bounds: lower corner {self.lower} is not below upper corner {self.upper}")
+            raise InputError(
+                f"scene bounds: lower corner {self.lower} is not below upper corner {self.upper}"
+            )
         if not 0 <= self.near < self.far:
             raise InputError(f"scene bounds: expected 0 <= near < far, got near {self.near}, far {self.far}")
 

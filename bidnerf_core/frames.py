@@ -17,10 +17,12 @@ class Frame:
     """One RGB or RGB-D image. Depth is planar z in metres, 0 where nothing was measured."""
 
     name: str
-    rgb: Float[Tensor, "h w 3"]  # in [0, 1], already over the background where there was an alpha channel
+    # rgb is in [0, 1], already over the background where there was an alpha channel; alpha is 1 where the scene covers
+    # the pixel and 0 where the background shows. All have the size of the camera's image, which is checked here.
+    rgb: Float[Tensor, "h w 3"]
     intrinsics: Intrinsics
-    depth: Float[Tensor, "h w"] | None = None
-    alpha: Float[Tensor, "h w"] | None = None  # 1 where the scene covers the pixel, 0 where the background shows
+    depth: Float[Tensor, "dh dw"] | None = None
+    alpha: Float[Tensor, "ah aw"] | None = None
 
     def __post_init__(self) -> None:
         expected = (self.intrinsics.height, self.intrinsics.width)

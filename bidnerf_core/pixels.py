@@ -49,7 +49,8 @@ def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"
 
 
 def all_pixels(frame: Frame) -> Int[Tensor, "n 2"]:
-    return frame.intrinsics.pixel_centres().long().reshape(-1, 2)  # centres lie at +0.5: truncation gives the index
+    """Row by row. Centres lie at +0.5, so that truncation gives the index."""
+    return frame.intrinsics.pixel_centres().long().reshape(-1, 2)
 
 
 def observe(view: View, pixels: Int[Tensor, "n 2"], dtype: torch.dtype = torch.float32) -> Pixels:
@@ -65,7 +66,11 @@ def observe(view: View, pixels: Int[Tensor, "n 2"], dtype: torch.dtype = torch.f
 
 
 def draw(
-    views: Sequence[View], count: int, drawer: PixelDrawer, generator: Generator, dtype: torch.dtype = torch.float32
+    views: Sequence[View],
+    count: int,
+    drawer: PixelDrawer,
+    generator: Generator,
+    dtype: torch.dtype = torch.float32,
 ) -> Pixels:
     """``count`` pixels shared out equally among the views; every tensor has leading axes (views, pixels a view)."""
     share = max(1, count // len(views))

@@ -49,7 +49,9 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
 
 def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:
     """``w_i = exp(-sum_{j<i} sigma_j dt_j) (1 - exp(-sigma_i dt_i))`` (eq. 3)."""
-    absorbed = torch.where(samples.valid, density * (samples.ends - samples.starts), torch.zeros_like(density))
+    absorbed = torch.where(
+        samples.valid, density * (samples.ends - samples.starts), torch.zeros_like(density)
+    )
     before = torch.cumsum(absorbed, dim=-1) - absorbed
     return torch.exp(-before) * -torch.expm1(-absorbed)
 
@@ -83,7 +85,9 @@ def render_image(
     for directions in (ray / length[:, None]).to(device).split(chunk):
         turned = T.rotate(directions)
         rendering = render(field, bounds.rays(T.translation.expand_as(turned), turned), bounds.background)
-        parts.append(torch.cat([rendering.rgb, rendering.distance[:, None], rendering.opacity[:, None]], -1).cpu())
+        parts.append(
+            torch.cat([rendering.rgb, rendering.distance[:, None], rendering.opacity[:, None]], -1).cpu()
+        )
     rgb, distance, opacity = torch.cat(parts).split([3, 1, 1], dim=-1)
     hit = torch.where(opacity > 0.5, distance / opacity.clamp(min=0.5), 0)[:, 0] / length
     shape = (intrinsics.height, intrinsics.width)

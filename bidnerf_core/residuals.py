@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.pixels import Pixels
@@ -26,15 +26,13 @@ def huber(residual: Float[Tensor, "*p"], delta: float) -> Float[Tensor, "*p"]:
     return torch.where(size <= delta, 0.5 * size**2, delta * (size - 0.5 * delta))
 
 
-def masked_mean(values: Float[Tensor, "*k p"], mask: Tensor) -> Float[Tensor, "*k"]:
+def masked_mean(values: Float[Tensor, "*k p"], mask: Bool[Tensor, "*k p"]) -> Float[Tensor, "*k"]:
     """Mean over the last axis where ``mask`` holds; 0 where it holds nowhere."""
     kept = torch.where(mask, values, 0)
     return kept.sum(-1) / mask.sum(-1).clamp(min=1)
 
 
-def objective(
-    rendering: Rendering, pixels: Pixels, delta: float, depth_weight: float
-) -> Float[Tensor, ""]:
+def objective(rendering: Rendering, pixels: Pixels, delta: float, depth_weight: float) -> Float[Tensor, ""]:
     """``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6), for pixels of shape (views, pixels).
 
     The colour term sums rho over the three channels; the depth term is a mean over the rays where depth was measured.

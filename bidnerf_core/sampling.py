@@ -23,7 +23,9 @@ class Stratified:
         borders = torch.linspace(0, 1, self.count + 1, dtype=near.dtype, device=near.device)
         borders = borders.expand(*rays.near.shape, -1)
         if jitter is not None:
-            shift = torch.rand((*rays.near.shape, self.count - 1), generator=jitter, device=jitter.device) - 0.5
+            shift = (
+                torch.rand((*rays.near.shape, self.count - 1), generator=jitter, device=jitter.device) - 0.5
+            )
             inner = borders[..., 1:-1] + shift.to(near) / self.count
             borders = torch.cat([borders[..., :1], inner, borders[..., -1:]], dim=-1)
         distances = near + (far - near) * borders
@@ -61,7 +63,10 @@ def inverse_transform(
     places = (torch.arange(count, dtype=cdf.dtype, device=cdf.device) + 0.5) / count
     places = places.expand(*cdf.shape[:-1], count).contiguous()
     if jitter is not None:
-        places = places + (torch.rand(places.shape, generator=jitter, device=jitter.device).to(places) - 0.5) / count
+        places = (
+            places
+            + (torch.rand(places.shape, generator=jitter, device=jitter.device).to(places) - 0.5) / count
+        )
     index = torch.searchsorted(cdf, places).clamp(max=cdf.shape[-1] - 1)
     below = torch.cat([torch.zeros_like(cdf[..., :1]), cdf], dim=-1).gather(-1, index)
     width = (cdf.gather(-1, index) - below).clamp(min=torch.finfo(cdf.dtype).tiny)

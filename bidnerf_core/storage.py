@@ -78,14 +78,16 @@ class Map:
 
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
     return tuple(
-        StoredCamera(v.frame.name, v.frame.intrinsics, tuple(tuple(r) for r in v.T_ref_camera.matrix().tolist()))
+        StoredCamera(
+            v.frame.name, v.frame.intrinsics, tuple(tuple(r) for r in v.T_ref_camera.matrix().tolist())
+        )
         for v in views
     )
 
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
     """An untrained field and its config, as ``info`` describes them."""
-    config = from_plain(backend.config_type, info.config, f"{where}: config")
+    config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
     return backend.build(config, info.bounds), config
 
 
@@ -99,7 +101,9 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
         _write(folder / info.training, tensors_to_bytes(_packed(state.optimizer)))
     _write(folder / DESCRIPTION, json.dumps(to_plain(info), indent=1, allow_nan=False).encode())
     for other in folder.glob("*-*.safetensors"):
-        if other.name not in (info.weights, info.training) and other.name.startswith(("weights-", "training-")):
+        if other.name not in (info.weights, info.training) and other.name.startswith(
+            ("weights-", "training-")
+        ):
             other.unlink()
     return info
 
@@ -116,7 +120,7 @@ def load_info(folder: Path) -> MapInfo:
     except ValueError as error:
         raise InputError(f"{path}: not JSON ({error}), expected the description of a map") from error
     if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise InputError(f"{path}: not the description of a map, expected \"format\": \"{FORMAT}\"")
+        raise InputError(f'{path}: not the description of a map, expected "format": "{FORMAT}"')
     if found.get("version") != VERSION:
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; train the map anew")
     info = from_plain(MapInfo, {k: v for k, v in found.items() if k != "config"} | {"config": {}}, str(path))
@@ -128,7 +132,9 @@ def load_map(folder: Path, device: torch.device | str = "cpu") -> Map:
     info = load_info(folder)
     field, _ = build_field(load_backend(info.backend), info, str(folder / DESCRIPTION))
     if not isinstance(field, nn.Module):
-        raise InputError(f"{folder}: backend {info.backend!r} built a {type(field).__name__}, expected an nn.Module")
+        raise InputError(
+            f"{folder}: backend {info.backend!r} built a {type(field).__name__}, expected an nn.Module"
+        )
     _fill(field, read_tensors(folder / info.weights), folder / info.weights)
     field.requires_grad_(False).eval().to(device)
     return Map(info, field)
@@ -145,7 +151,9 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     try:
         return tensors_from_bytes(path.read_bytes())
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file, but {DESCRIPTION} names it; the map is incomplete") from error
+        raise InputError(
+            f"{path}: no such file, but {DESCRIPTION} names it; the map is incomplete"
+        ) from error
     except SafetensorError as error:
         raise InputError(f"{path}: not readable ({error}), expected a safetensors file") from error
 
@@ -161,7 +169,9 @@ def _fill(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
             raise InputError(f"{path}: tensor {name!r} has shape {found}, expected {wanted}")
     surplus = sorted(tensors.keys() - expected.keys())
     if surplus:
-        raise InputError(f"{path}: tensor {surplus[0]!r} is not part of the field that {DESCRIPTION} describes")
+        raise InputError(
+            f"{path}: tensor {surplus[0]!r} is not part of the field that {DESCRIPTION} describes"
+        )
     field.load_state_dict(tensors)
 
 

@@ -196,7 +196,9 @@ def _parameters(optimizer: torch.optim.Optimizer) -> Iterator[Tensor]:
     return (parameter for group in optimizer.param_groups for parameter in group["params"])
 
 
-def _state(step: int, field: nn.Module, optimizer: torch.optim.Optimizer, generator: Generator) -> TrainingState:
+def _state(
+    step: int, field: nn.Module, optimizer: torch.optim.Optimizer, generator: Generator
+) -> TrainingState:
     moments = {"generator": generator.get_state()}
     for number, parameter in enumerate(_parameters(optimizer)):
         for name, value in optimizer.state.get(parameter, {}).items():

@@ -30,7 +30,7 @@ def disc(column: float, size: int = 40) -> torch.Tensor:
     """An orange disc on white (h w 3), its middle at ``column``."""
     v, u = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
     inside = ((u - column) ** 2 + (v - size / 2) ** 2 < 100)[..., None]
-    return torch.where(inside, torch.tensor([0.9, 0.5, 0.1]), torch.ones(3))
+    return torch.where(inside, torch.tensor([0.88, 0.52, 0.12]), torch.ones(3))
 
 
 def test_as_picture_takes_what_there_is() -> None:
@@ -148,7 +148,8 @@ def test_impossible_animations_are_refused(tmp_path: Path, fps: float) -> None:
 
 
 def errors(*values: float) -> PoseError:
-    return PoseError(torch.tensor(values), 10 * torch.tensor(values))
+    far = torch.tensor(values, dtype=torch.float64)
+    return PoseError(far, 10 * far)
 
 
 def test_convergence_plot_draws_without_a_window_or_global_state(tmp_path: Path) -> None:

@@ -59,6 +59,8 @@ def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
         raise ValueError("levels and features must be at least 1")
     if not 1 <= config.base_resolution <= config.finest_resolution:
         raise ValueError("resolutions must satisfy 1 <= base_resolution <= finest_resolution")
+    if config.interpolation not in ("linear", "smooth"):
+        raise ValueError(f"interpolation must be linear or smooth, got {config.interpolation!r}")
     growth = math.log(config.finest_resolution / config.base_resolution) / max(config.levels - 1, 1)
     levels = []
     for index in range(config.levels):
@@ -67,15 +69,8 @@ def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
         side, table_size = resolution + 1, 2**config.log2_table_size
         hashed = side**3 > table_size
         strides = PRIMES if hashed else (1, side, side**2)
-        levels.append(
-            _Level(
-                resolution,
-                table_size if hashed else side**3,
-                strides,
-                hashed,
-                config.interpolation == "smooth",
-            )
-        )
+        entries = table_size if hashed else side**3
+        levels.append(_Level(resolution, entries, strides, hashed, config.interpolation == "smooth"))
     return tuple(levels)
 
 
@@ -124,7 +119,7 @@ def _as_floats(values: Shaped[Tensor, "*shape n"]) -> Float[Tensor, "*shape w"]:
 def _interpolate(corners: Float[Tensor, "2 2 2 w"], weights: Float[Tensor, "3 w"]) -> Float[Tensor, " w"]:
     x, y, z = weights.unbind()
     for weight in (z, y, x):
-        corners = torch.lerp(*corners.unbind(), weight)
+        corners = torch.lerp(corners[0], corners[1], weight)
     return corners
 
 
@@ -136,7 +131,7 @@ def _interpolate_with_slopes(
     slopes: list[Tensor] = []
     for weight in (z, y, x):
         lower, upper = corners.unbind()
-        slopes = [upper - lower, *(torch.lerp(*slope.unbind(), weight) for slope in slopes)]
+        slopes = [upper - lower, *(torch.lerp(slope[0], slope[1], weight) for slope in slopes)]
         corners = torch.addcmul(lower, slopes[0], weight)
     return corners, slopes
 
@@ -188,10 +183,10 @@ def _table_gradient(
     points: Float[Tensor, "3 n"], gradient: Float[Tensor, "c w"], level: _Level, features: int
 ) -> Float[Tensor, "t f"]:
     unit = _unit(features)
-    # scatter_add_ takes int64 only, and is still twice as fast as index_add_ with int32.
     table = points.new_zeros(level.entries, features)
     for chunk in _chunks(points):
         wide = slice(chunk.start * unit, chunk.stop * unit)
+        # scatter_add_ takes int64 only, and is still twice as fast as index_add_ with int32.
         terms, fraction = _vertices(points[:, chunk], level, torch.int64)
         weights = _weights(fraction, level, unit)
         index = _corner_indices(terms, level)
@@ -235,9 +230,8 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, gradient: Float[Tensor, "n width"]) -> tuple[Tensor | None, ...]:
         points, *slopes = ctx.saved_tensors
         unit = _unit(ctx.features)
-        rows = _as_floats(_as_units(gradient.contiguous(), unit).t().contiguous()).unflatten(
-            0, (-1, ctx.features // unit)
-        )
+        rows = _as_floats(_as_units(gradient.contiguous(), unit).t().contiguous())
+        rows = rows.unflatten(0, (-1, ctx.features // unit))
         to_points: Tensor | None = None
         if ctx.needs_input_grad[0]:
             to_points = torch.zeros_like(slopes[0][0])
@@ -279,15 +273,11 @@ class HashEncoding(nn.Module):
         self, positions: Float[Tensor, "n 3"], active_levels: int | None = None
     ) -> Float[Tensor, "n {self.width}"]:
         """Encode positions; levels from ``active_levels`` on are not evaluated and come back as zeros."""
-        active = (
-            self.config.levels if active_levels is None else max(0, min(active_levels, self.config.levels))
-        )
-        if active == 0:
+        levels = self.levels if active_levels is None else self.levels[: max(active_levels, 0)]
+        if not levels:
             return self.tables[0].new_zeros(len(positions), self.width)
         points = positions.to(self.tables[0].dtype).clamp(0, 1).t().contiguous()
         want_slopes = torch.is_grad_enabled() and points.requires_grad
-        tables = list(self.tables)[:active]
-        encoded: Tensor = _Encode.apply(
-            points, self.levels[:active], self.config.levels, want_slopes, *tables
-        )
+        tables = list(self.tables)[: len(levels)]
+        encoded: Tensor = _Encode.apply(points, levels, self.config.levels, want_slopes, *tables)
         return encoded

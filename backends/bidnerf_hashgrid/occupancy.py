@@ -77,7 +77,9 @@ class OccupancyGrid(nn.Module):
         kept = self.occupied.view(-1)[self._cells(positions)] & (distance < far[ray][:, None])
         return self._padded(distance[kept], ray[:, None].expand_as(kept)[kept], near, far, shape)
 
-    def _busy_blocks(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+    def _busy_blocks(
+        self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Ray index and start of each run of ``BLOCK`` steps that passes near an occupied cell, in order."""
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
@@ -89,7 +91,9 @@ class OccupancyGrid(nn.Module):
         busy = self.near_occupied.view(-1)[self._cells(middle)]
         return ray[busy], start[busy]
 
-    def _padded(self, distance: Tensor, ray: Tensor, near: Tensor, far: Tensor, shape: torch.Size) -> RaySamples:
+    def _padded(
+        self, distance: Tensor, ray: Tensor, near: Tensor, far: Tensor, shape: torch.Size
+    ) -> RaySamples:
         """Samples gathered to the front of their ray's row; rows are as long as the longest."""
         counts = torch.bincount(ray, minlength=len(near))
         width = int(counts.amax()) if len(near) else 0

@@ -34,7 +34,6 @@ class HashGridConfig(FieldConfig):
     carve: bool = True  # start from the cells that the views' depth and silhouettes leave
 
 
-
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
     if config.carve and report.resume() is None:
@@ -43,14 +42,19 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
     bank = RayBank(views, field.bounds)
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
-        {"params": [*field.geometry.parameters(), *field.colour.parameters()], "lr": config.learning_rate / 4},
+        {
+            "params": [*field.geometry.parameters(), *field.colour.parameters()],
+            "lr": config.learning_rate / 4,
+        },
     ]
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
         coarse = config.coarse_every > 0 and step % config.coarse_every == config.coarse_every - 1
         level: CoarseField | HashGridField = field.levels[0] if coarse else field
         grid = level.sampler
-        count = min(config.rays_at_most, int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1))))
+        count = min(
+            config.rays_at_most, int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1)))
+        )
         batch = bank.draw(count, generator)
         rendering = render(level, batch.rays, batch.background, generator)
         _tend(grid, batch, rendering, step, config)
@@ -66,7 +70,9 @@ def _room_for_matter(grid: OccupancyGrid, views: Sequence[View]) -> Tensor:
     return occupied_cells(views, tuple(grid.lower.tolist()), tuple(upper.tolist()), shape)
 
 
-def _tend(grid: OccupancyGrid, batch: RayBatch, rendering: Rendering, step: int, config: HashGridConfig) -> None:
+def _tend(
+    grid: OccupancyGrid, batch: RayBatch, rendering: Rendering, step: int, config: HashGridConfig
+) -> None:
     """Keep the occupancy grid abreast of what the rays saw."""
     valid = rendering.samples.valid
     positions = batch.rays.at(rendering.samples.middles)[valid]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TypeAlias
 
@@ -25,7 +24,9 @@ FAR_MARGIN = 1.1  # a camera may stand a little farther off than any of the view
 LEAST_NEAR = 0.01  # of far, where cameras stand in the box and nothing was measured
 HULL = (64, 64, 64)
 CARVING_ROUNDS = 3  # each in the box that the one before found
-WITNESSES = 0.1  # the part of the views that must see something at a cell: peripheries are seen by few
+WITNESSES = (
+    0.25  # of the most views that see something at one cell: fewer than that is periphery, hardly carved
+)
 LEAST_SPREAD = 0.01  # mean squared sine of the angles between optical axes and their mean: about 6 degrees
 INWARD = 0.8  # the part of the cameras that must have the point in sight that all look at
 ROOM = 4.0
@@ -84,14 +85,14 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
 
 def _carved_box(box: Box, views: Sequence[View]) -> Box:
     """The box around those cells that no two views see through and that enough views see something at."""
-    enough = max(min(2, len(views)), math.ceil(len(views) * WITNESSES))
     for _ in range(CARVING_ROUNDS):
         lower, upper = box
         cell = (upper - lower) / torch.tensor(HULL)
         kept = occupied_cells(views, _corner(lower), _corner(upper), HULL).nonzero()
-        kept = kept[_witnesses(views, lower + (kept + 0.5) * cell) >= enough]
         if len(kept) == 0:
             return box
+        witnesses = _witnesses(views, lower + (kept + 0.5) * cell)
+        kept = kept[witnesses >= WITNESSES * witnesses.amax()]
         box = _grown(lower + kept.amin(dim=0) * cell, lower + (kept.amax(dim=0) + 1) * cell)
     return box
 

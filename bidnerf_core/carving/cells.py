@@ -37,7 +37,7 @@ def occupied_cells(
     """
     grid = _Grid(lower, upper, shape)
     votes = torch.zeros(grid.blocks.shape[1], BLOCK**3, dtype=torch.uint8)
-    needed = min(2, len(views))
+    needed = 1 if len(views) < 2 else 2
     undecided = torch.ones(len(votes), dtype=torch.bool)
     for view in views:
         space = FreeSpace.seen_by(view, tolerance, footprint)

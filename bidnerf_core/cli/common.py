@@ -24,7 +24,10 @@ console = Console(stderr=True, highlight=False, soft_wrap=True)
 def parse(command: str, function: Callable[..., T], arguments: list[str]) -> T:
     """Call ``function`` with what the arguments say; wrong usage ends the program with status 2."""
     return tyro.cli(
-        function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+        function,
+        args=arguments,
+        prog=f"bidnerf {command}",
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
     )
 
 
@@ -46,7 +49,9 @@ def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None)
         return dataset.views(split, names)
     with console.status("") as status:
         return dataset.views(
-            split, names, lambda done, count: status.update(f"reading {dataset.path.name}/{split}: {done}/{count}")
+            split,
+            names,
+            lambda done, count: status.update(f"reading {dataset.path.name}/{split}: {done}/{count}"),
         )
 
 

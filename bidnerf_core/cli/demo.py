@@ -108,7 +108,9 @@ def _draw(stored: Map, trials: Sequence[Trial], out: Path) -> None:
     first = trials[0]
     shown = _moments(first.found.steps)
     with console.status("drawing the animation"):
-        pictures = [blend(first.view.frame.rgb, _rendered(stored, first, first.found.poses[i])) for i in shown]
+        pictures = [
+            blend(first.view.frame.rgb, _rendered(stored, first, first.found.poses[i])) for i in shown
+        ]
     save_gif(out / "localization.gif", pictures)
     drawn = ["overlay-*.png", "localization.gif"]
     try:

@@ -17,7 +17,10 @@ def run(arguments: list[str]) -> None:
     parse("info", info, arguments)
 
 
-def info(map: tyro.conf.Positional[Path], json: Annotated[bool, tyro.conf.arg(help="print one JSON object")] = False) -> None:
+def info(
+    map: tyro.conf.Positional[Path],
+    json: Annotated[bool, tyro.conf.arg(help="print one JSON object")] = False,
+) -> None:
     """Describe the map in folder MAP."""
     facts = describe(map)
     if json:

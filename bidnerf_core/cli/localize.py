@@ -53,7 +53,9 @@ def run(arguments: list[str]) -> None:
         frame: tuple[str, ...],
         split: str = "test",
         method: str = "auto",
-        start: Annotated[Path | None, tyro.conf.arg(help="JSON file with a 4x4 T_world_camera to start from")] = None,
+        start: Annotated[
+            Path | None, tyro.conf.arg(help="JSON file with a 4x4 T_world_camera to start from")
+        ] = None,
         perturb: Annotated[
             tuple[float, float] | None,
             tyro.conf.arg(metavar="T R", help="start from the true pose moved by T metres and R degrees"),

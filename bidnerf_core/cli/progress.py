@@ -10,7 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType, TracebackType
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from bidnerf_core.cli.common import console, say
 from bidnerf_core.storage import MapInfo, load_state, save_map

@@ -33,7 +33,9 @@ def render(
     out: Path,
     split: str = "test",
     frame: Annotated[tuple[str, ...], tyro.conf.arg(help="names of frames; default: all of the split")] = (),
-    level: Annotated[int | None, tyro.conf.arg(help="level of detail, 0 the coarsest; default: the field itself")] = None,
+    level: Annotated[
+        int | None, tyro.conf.arg(help="level of detail, 0 the coarsest; default: the field itself")
+    ] = None,
     overwrite: Annotated[bool, tyro.conf.arg(help="replace images in --out")] = False,
 ) -> None:
     """Render the map in folder MAP from the poses of the dataset in folder DATA.
@@ -56,7 +58,9 @@ def render(
             image = render_image(field, view.frame.intrinsics, view.T_ref_camera, stored.bounds)
             write_images(out, view.frame.name, image)
             rows.append((view.frame.name, *_scores(image, view.frame)))
-            print("{}  PSNR {:.2f} dB  depth error {} m".format(rows[-1][0], rows[-1][1], _metres(rows[-1][2])))
+            print(
+                f"{rows[-1][0]}  PSNR {rows[-1][1]:.2f} dB  depth error {_metres(rows[-1][2])} m"
+            )
     errors = torch.cat([row[3] for row in rows])
     median = float(errors.median()) if len(errors) else None
     print(f"mean of {len(rows)}: PSNR {statistics.fmean(row[1] for row in rows):.2f} dB", end="")
@@ -83,4 +87,3 @@ def _scores(image: RenderedImage, frame: Frame) -> tuple[float, float | None, to
 
 def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f}"
-

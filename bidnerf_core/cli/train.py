@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,10 +15,10 @@ from bidnerf_core.cli.progress import StoredTraining
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
-from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.plain import to_plain
 from bidnerf_core.registry import load_backend
 from bidnerf_core.storage import MapInfo, build_field, load_info, stored_cameras
-from bidnerf_core.training import Report, TrainingStopped
+from bidnerf_core.training import TrainingStopped
 
 DEFAULT_BACKEND = "hashgrid"
 
@@ -35,7 +34,9 @@ def run(arguments: list[str]) -> None:
         out: Path,
         backend: Annotated[str, tyro.conf.arg(help="name from 'bidnerf backends'")] = DEFAULT_BACKEND,
         split: str = "train",
-        background: Annotated[str | None, tyro.conf.arg(help="white or black, under images with alpha")] = None,
+        background: Annotated[
+            str | None, tyro.conf.arg(help="white or black, under images with alpha")
+        ] = None,
         resume: Annotated[bool, tyro.conf.arg(help="go on with an interrupted training in --out")] = False,
         overwrite: Annotated[bool, tyro.conf.arg(help="replace the map in --out")] = False,
         config: Any = kind(),
@@ -79,7 +80,9 @@ def _resume(data: Path, out: Path, split: str, background: str | None) -> None:
     dataset = open_dataset(data, background)
     views = read_views(dataset, split)
     if tuple(view.frame.name for view in views) != tuple(camera.name for camera in info.cameras):
-        raise InputError(f"{data}: its frames are not those that {out} was trained on; expected {info.data!r} again")
+        raise InputError(
+            f"{data}: its frames are not those that {out} was trained on; expected {info.data!r} again"
+        )
     say(f"{out}: going on from step {info.step}")
     _run(load_backend(info.backend), info, out, views)
 
@@ -93,4 +96,3 @@ def _run(backend: Backend, info: MapInfo, out: Path, views: Sequence[View]) -> N
             say(f"{out}: stopped after step {stopped.step}; go on with --resume")
             raise KeyboardInterrupt from stopped
     say(f"{out}: map of {info.data}, {sum(f.stat().st_size for f in out.iterdir()) / 2**20:.1f} MiB")
-

@@ -5,4 +5,14 @@ from bidnerf_core.localization.methods import METHODS, Method, find_method, loca
 from bidnerf_core.localization.problem import Problem, rig, single
 from bidnerf_core.localization.result import Localization
 
-__all__ = ["METHODS", "BidConfig", "Localization", "Method", "Problem", "find_method", "localize", "rig", "single"]
+__all__ = [
+    "METHODS",
+    "BidConfig",
+    "Localization",
+    "Method",
+    "Problem",
+    "find_method",
+    "localize",
+    "rig",
+    "single",
+]

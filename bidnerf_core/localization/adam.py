@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.field import widened
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
@@ -34,7 +33,9 @@ class BidConfig:
     huber_delta: float = 0.1
     level: int | None = 0  # of the field: 0 is the coarsest, null the field itself
     wide: float = 1.0  # sampled interval over [near, far]; the paper's "wide" is 2
-    stop_loss: float = 0.0  # epsilon of Alg. 1: stop once the mean loss of 20 steps is below it; 0 never stops early
+    stop_loss: float = (
+        0.0  # epsilon of Alg. 1: stop once the mean loss of 20 steps is below it; 0 never stops early
+    )
     converged_loss: float = 0.01  # mean loss of the last 20 steps under which the answer is called converged
 
 

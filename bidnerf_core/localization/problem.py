@@ -56,5 +56,7 @@ def rig(field: RadianceField, bounds: SceneBounds, views: Sequence[View], start:
     if not views:
         raise InputError("nothing to localize: expected at least one view")
     T_last_ref = views[-1].T_ref_camera.to(torch.float64).inverse()
-    relative = tuple(View(v.frame, (T_last_ref @ v.T_ref_camera.to(torch.float64)).normalized()) for v in views)
+    relative = tuple(
+        View(v.frame, (T_last_ref @ v.T_ref_camera.to(torch.float64)).normalized()) for v in views
+    )
     return Problem(field, bounds, relative, start.to(torch.float64))

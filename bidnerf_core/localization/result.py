@@ -23,4 +23,6 @@ class Localization:
     method: str
     poses: SE3  # (steps + 1): the start, then the pose after each step
     losses: Float[Tensor, "s"]  # after the start and before each step
-    covariance: Float[Tensor, "6 6"] | None = None  # of a right update: translation in metres, rotation in radians
+    covariance: Float[Tensor, "6 6"] | None = (
+        None  # of a right update: translation in metres, rotation in radians
+    )
