@@ -81,3 +81,14 @@ def draw(
         torch.stack([p.rgb for p in parts]),
         torch.stack([p.distance for p in parts]),
     )
+
+
+def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"] | None:
+    """The median by axis of the points that ``views`` measured, in their reference frame; None where there are none."""
+    points = []
+    for view in views:
+        pixels = observe(view, all_pixels(view.frame)[::stride], torch.float64)
+        measured = pixels.distance > 0
+        points.append((pixels.origins + pixels.distance[:, None] * pixels.directions)[measured])
+    together = torch.cat(points)
+    return together.median(0).values if len(together) else None

@@ -57,6 +57,8 @@ def _converted(kind: Any, value: Any, where: str) -> Any:
             return value
     elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
+    elif origin is dict and isinstance(value, dict):
+        return value
     elif kind is Any or (isinstance(kind, type) and type(value) is kind):
         return value
     raise InputError(f"{where}: found {value!r}, expected {getattr(kind, '__name__', kind)}")

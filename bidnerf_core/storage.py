@@ -123,8 +123,7 @@ def load_info(folder: Path) -> MapInfo:
         raise InputError(f'{path}: not the description of a map, expected "format": "{FORMAT}"')
     if found.get("version") != VERSION:
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; train the map anew")
-    info = from_plain(MapInfo, {k: v for k, v in found.items() if k != "config"} | {"config": {}}, str(path))
-    return replace(info, config=found.get("config", {}))
+    return from_plain(MapInfo, found, str(path))
 
 
 def load_map(folder: Path, device: torch.device | str = "cpu") -> Map:

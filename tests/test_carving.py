@@ -170,6 +170,12 @@ def test_order_of_views_does_not_matter() -> None:
     assert torch.equal(one, occupied_cells(views[::-1], LOWER, UPPER, SHAPE))
 
 
+def test_many_views_do_not_make_votes_overflow() -> None:
+    views = [ball_view(place) for place in around(2)]
+    once = occupied_cells(views, LOWER, UPPER, (8, 8, 8))
+    assert torch.equal(once | occupied_cells(views * 128, LOWER, UPPER, (8, 8, 8)), once)
+
+
 def test_a_far_and_large_world_is_the_same_world() -> None:
     """Metres or millimetres, here or a thousand kilometres away."""
     scale, shift = 1000.0, torch.tensor([1e9, -2e9, 3e8], dtype=torch.float64)
@@ -270,7 +276,7 @@ def test_wild_measurements_do_not_move_the_box() -> None:
         assert view.frame.depth is not None
         view.frame.depth[0, 0] = 1000.0  # one of some 400 measured pixels of a view
         view.frame.depth[0, 1] = 1e-4
-    wild = estimate_bounds(views * 1)
+    wild = estimate_bounds(views)
     assert max(wild.size) < 2000  # one in 400 is more than may be wild: the box tells of it ...
     for view in views[1:]:
         assert view.frame.depth is not None

@@ -3,33 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.carving.cells import Corner, occupied_cells
+from bidnerf_core.carving.boxes import Box, corner, grown, rays_of
+from bidnerf_core.carving.hull import carved_box, has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 
-Box: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
-"""Lower and upper corner: metres, world, float64."""
-
 OUTLIERS = 1e-3  # the part of measured points at either end of each axis that may be wrong
 POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements that are looked at: in all, and at least of each view
-MARGIN = 0.03  # of the box's size, at each end
 FAR_MARGIN = 1.1  # a camera may stand a little farther off than any of the views did
 LEAST_NEAR = 0.01  # of far, where cameras stand in the box and nothing was measured
-HULL = (64, 64, 64)
-CARVING_ROUNDS = 3  # each in the box that the one before found
-WITNESSES = (
-    0.25  # of the most views that see something at one cell: fewer than that is periphery, hardly carved
-)
 LEAST_SPREAD = 0.01  # mean squared sine of the angles between optical axes and their mean: about 6 degrees
 INWARD = 0.8  # the part of the cameras that must have the point in sight that all look at
-ROOM = 4.0
+ROOM = 4.0  # how far a hand-held camera sees, in parts of how far it was moved: a guess
 
 
 def estimate_bounds(
@@ -46,17 +37,17 @@ def estimate_bounds(
     if not views:
         raise InputError("scene bounds: no views to estimate them from")
     measured = [view for view in views if view.frame.has_depth]
-    outlined = [view for view in views if _has_outline(view)]
+    outlined = [view for view in views if has_outline(view)]
     if measured and (2 * len(measured) >= len(views) or not outlined):
         box, near = _measured_box(measured)
         far = _farthest(views, box)
     else:
         box = _guessed_box(views)
         if 2 * len(outlined) >= len(views):
-            box = _carved_box(box, outlined)
+            box = carved_box(box, outlined)
         far = _farthest(views, box)
         near = max(_nearest(views, box) / 2, LEAST_NEAR * far)
-    return SceneBounds(_corner(box[0]), _corner(box[1]), near, FAR_MARGIN * far, background)
+    return SceneBounds(corner(box[0]), corner(box[1]), near, FAR_MARGIN * far, background)
 
 
 def _measured_box(views: Sequence[View]) -> tuple[Box, float]:
@@ -67,7 +58,7 @@ def _measured_box(views: Sequence[View]) -> tuple[Box, float]:
     last = len(points) - 1
     first = round(OUTLIERS * last)
     ordered, nearest = points.sort(dim=0).values, distances.sort().values[first].item()
-    return _grown(ordered[first], ordered[last - first], at_least=nearest / 100), nearest / 2
+    return grown(ordered[first], ordered[last - first], at_least=nearest / 100), nearest / 2
 
 
 def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
@@ -75,41 +66,9 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
     depth = view.frame.depth
     if depth is None:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-    rows, columns = (depth > 0).nonzero(as_tuple=True)
-    stride = max(1, len(rows) // share)
-    rows, columns = rows[::stride], columns[::stride]
-    ray = view.frame.intrinsics.unproject(torch.stack([columns, rows], dim=-1).double() + 0.5)  # z = 1
-    points = ray * depth[rows, columns, None].double()
+    ray, chosen = rays_of(view, depth > 0, share)
+    points = ray * depth[chosen][:, None].double()
     return view.T_ref_camera.to(torch.float64).apply(points), torch.linalg.vector_norm(points, dim=-1)
-
-
-def _carved_box(box: Box, views: Sequence[View]) -> Box:
-    """The box around those cells that no two views see through and that enough views see something at."""
-    for _ in range(CARVING_ROUNDS):
-        lower, upper = box
-        cell = (upper - lower) / torch.tensor(HULL)
-        kept = occupied_cells(views, _corner(lower), _corner(upper), HULL).nonzero()
-        if len(kept) == 0:
-            return box
-        witnesses = _witnesses(views, lower + (kept + 0.5) * cell)
-        kept = kept[witnesses >= WITNESSES * witnesses.amax()]
-        box = _grown(lower + kept.amin(dim=0) * cell, lower + (kept.amax(dim=0) + 1) * cell)
-    return box
-
-
-def _witnesses(views: Sequence[View], points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """How many views see something (alpha over 0) where each point (metres, world) is."""
-    return torch.stack([_shows_something(view, points) for view in views]).sum(dim=0)
-
-
-def _shows_something(view: View, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    camera, alpha = view.frame.intrinsics, view.frame.alpha
-    seen = view.T_ref_camera.to(torch.float64).inverse().apply(points).float()
-    column, row = camera.project(seen).nan_to_num(-1.0, -1.0, -1.0).floor().unbind(-1)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    if alpha is None:
-        return inside
-    return inside & (alpha[torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long()] > 0)
 
 
 def _guessed_box(views: Sequence[View]) -> Box:
@@ -141,11 +100,6 @@ def _looked_at(views: Sequence[View]) -> Float[Tensor, "3"] | None:
     return middle if (off < ahead * tangents).double().mean() >= INWARD else None
 
 
-def _has_outline(view: View) -> bool:
-    """Whether there is background in the image; alpha that is 1 all over tells nothing."""
-    return view.frame.alpha is not None and bool((view.frame.alpha <= 0).any())
-
-
 def _corner_rays(view: View) -> Float[Tensor, "4 3"]:
     """Towards the corners of the image, as far as the plane z = 1 (camera frame)."""
     camera = view.frame.intrinsics
@@ -172,15 +126,3 @@ def _farthest(views: Sequence[View], box: Box) -> float:
     """From the farthest camera to the farthest corner of the box (metres)."""
     across = torch.maximum((_places(views) - box[0]).abs(), (_places(views) - box[1]).abs())
     return torch.linalg.vector_norm(across, dim=-1).amax().item()
-
-
-def _grown(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0) -> Box:
-    """By a margin; a box without thickness gets some."""
-    size = upper - lower
-    margin = torch.maximum(size * MARGIN, size.amax() * 0.01).clamp(min=at_least)
-    return lower - margin, upper + margin
-
-
-def _corner(point: Float[Tensor, "3"]) -> Corner:
-    x, y, z = point.tolist()
-    return x, y, z

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.carving.boxes import Corner
 from bidnerf_core.carving.free_space import FreeSpace
 from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
-
-Corner: TypeAlias = tuple[float, float, float]
 
 BLOCK = 8
 """Cells along the side of a block. Blocks out of a view's sight cost that view next to nothing."""
@@ -45,7 +43,8 @@ def occupied_cells(
         seen = space.may_free(firsts + within.mean(dim=1, keepdim=True), grid.block_radius)
         for rows in (seen & undecided).nonzero()[:, 0].split(BLOCKS_AT_ONCE):
             points = (firsts[:, rows, None] + within[:, None, :]).flatten(1)
-            votes[rows] += space.frees(points, grid.cell_radius).unflatten(0, (-1, BLOCK**3))
+            freed = space.frees(points, grid.cell_radius).unflatten(0, (-1, BLOCK**3))
+            votes[rows] = (votes[rows] + freed).clamp(max=needed)  # a byte is soon full
             undecided[rows] = (votes[rows] < needed).any(dim=1)
     return grid.assembled(votes < needed)
 
@@ -64,9 +63,7 @@ class _Grid:
 
     def middles(self, T_world_camera: SE3) -> tuple[Float[Tensor, "3 b"], Float[Tensor, "3 c"]]:
         """Middles of each block's first cell in the camera's frame, and what to add for each cell of a block (metres)."""
-        T_camera_world = T_world_camera.to(
-            torch.float64
-        ).inverse()  # float64: the world's origin may be far away
+        T_camera_world = T_world_camera.to(torch.float64).inverse()  # the world's origin may be far away
         first = T_camera_world.apply(self.lower + self.size / 2)[:, None]
         step = T_camera_world.rotation * self.size
         within = step @ _indices([BLOCK] * 3).double()

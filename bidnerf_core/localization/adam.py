@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Generator, Tensor
@@ -11,7 +12,7 @@ from torch import Generator, Tensor
 from bidnerf_core.field import widened
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.pixels import draw, uniform
+from bidnerf_core.pixels import draw, measured_middle, uniform
 from bidnerf_core.rendering import render
 from bidnerf_core.residuals import objective
 from bidnerf_core.se3 import SE3
@@ -32,6 +33,7 @@ class BidConfig:
     depth_weight: float = 1.0  # lambda_d
     huber_delta: float = 0.1
     level: int | None = 0  # of the field: 0 is the coarsest, null the field itself
+    pivot: Literal["scene", "camera"] = "scene"  # what the update turns about; the paper's is the camera
     wide: float = 1.0  # sampled interval over [near, far]; the paper's "wide" is 2
     stop_loss: float = (
         0.0  # epsilon of Alg. 1: stop once the mean loss of 20 steps is below it; 0 never stops early
@@ -49,17 +51,18 @@ def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
     generator = torch.Generator().manual_seed(seed)
     delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([delta], lr=config.learning_rate, betas=(0.9, 0.999))
+    pivot = _pivot(problem, config)
     T, poses, losses = problem.start, [problem.start], []
     reason = f"reached {config.max_steps} steps"
     for step in range(config.max_steps):
         optimizer.param_groups[0]["lr"] = config.learning_rate * config.decay ** (step / config.decay_steps)
-        loss = _loss(problem, T.retract(delta), config, generator)
+        loss = _loss(problem, _moved(T, pivot, delta), config, generator)
         losses.append(float(loss.detach()))
         if loss.requires_grad:
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-        T = T.retract(delta.detach()).normalized()
+        T = _moved(T, pivot, delta.detach()).normalized()
         poses.append(T)
         with torch.no_grad():
             delta.zero_()
@@ -77,6 +80,25 @@ def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
         poses=SE3.stack(poses),
         losses=torch.tensor(losses, dtype=torch.float64),
     )
+
+
+def _pivot(problem: Problem, config: BidConfig) -> SE3:
+    """T_camera_pivot, a translation: the frame in which updates are written.
+
+    For a camera some metres away, a turn and a sideways motion look almost alike: in its own frame the objective is a
+    long narrow valley, along which first-order steps crawl. About the middle of what the camera sees, the two part.
+    """
+    if config.pivot == "camera":
+        return SE3.identity()
+    point = measured_middle(problem.views)
+    if point is None:
+        corners = torch.tensor([problem.bounds.lower, problem.bounds.upper], dtype=torch.float64)
+        point = problem.start.inverse().apply(corners.mean(0))
+    return SE3(torch.eye(3, dtype=torch.float64), point)
+
+
+def _moved(T: SE3, pivot: SE3, delta: Tensor) -> SE3:
+    return (T @ pivot).retract(delta) @ pivot.inverse()
 
 
 def _loss(problem: Problem, T_world_last: SE3, config: BidConfig, generator: Generator) -> Tensor:

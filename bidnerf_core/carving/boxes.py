@@ -1,0 +1,48 @@
+"""Boxes along the axes of the world, and rays towards what a view shows of them."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.frames import View
+
+Corner: TypeAlias = tuple[float, float, float]
+Box: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
+"""Lower and upper corner: metres, world, float64."""
+
+MARGIN = 0.03  # of the box's size, at each end
+
+
+def grown(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0) -> Box:
+    """By a margin; a box without thickness gets some."""
+    size = upper - lower
+    margin = torch.maximum(size * MARGIN, size.amax() * 0.01).clamp(min=at_least)
+    return lower - margin, upper + margin
+
+
+def met(box: Box, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> float:
+    """The part of the rays that meet the box (slab method)."""
+    slope = 1 / torch.where(directions == 0, torch.finfo(directions.dtype).tiny, directions)
+    first, second = (box[0] - origins) * slope, (box[1] - origins) * slope
+    near, far = torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
+    return (far >= near.clamp(min=0)).double().mean().item()
+
+
+def corner(point: Float[Tensor, "3"]) -> Corner:
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def rays_of(
+    view: View, wanted: Bool[Tensor, "h w"], share: int
+) -> tuple[Float[Tensor, "n 3"], tuple[Int[Tensor, "n"], Int[Tensor, "n"]]]:
+    """About ``share`` of the wanted pixels, evenly spread: points at z = 1 (camera frame), and (rows, columns)."""
+    rows, columns = wanted.nonzero(as_tuple=True)
+    stride = max(1, len(rows) // share)
+    rows, columns = rows[::stride], columns[::stride]
+    ray = view.frame.intrinsics.unproject(torch.stack([columns, rows], dim=-1).double() + 0.5)
+    return ray, (rows, columns)

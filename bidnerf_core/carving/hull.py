@@ -1,0 +1,72 @@
+"""The box around the visual hull: what silhouettes, seen from many sides, leave room for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.carving.boxes import Box, corner, grown, met, rays_of
+from bidnerf_core.carving.cells import occupied_cells
+from bidnerf_core.frames import View
+
+HULL = (64, 64, 64)
+CARVING_ROUNDS = 3  # each in the box that the one before found
+WITNESSES = (0.5, 0.25, 0.1, 0.0)
+"""Of the most views that see something at one cell: where fewer do is periphery, which hardly any view could empty."""
+EXPLAINED = 0.999  # the part of the pixels with matter whose rays must meet the box
+RAYS_OF_VIEW = 500
+
+
+def has_outline(view: View) -> bool:
+    """Whether there is background in the image; alpha that is 1 all over tells nothing."""
+    return view.frame.alpha is not None and bool((view.frame.alpha <= 0).any())
+
+
+def carved_box(box: Box, views: Sequence[View]) -> Box:
+    """The box around those cells that no two views see through and that many views see something at.
+
+    How many are many is settled by the silhouettes: the most for which the box still explains them.
+    """
+    origins, directions = _rays_to_matter(views)
+    for _ in range(CARVING_ROUNDS):
+        lower, upper = box
+        cell = (upper - lower) / torch.tensor(HULL)
+        kept = occupied_cells(views, corner(lower), corner(upper), HULL).nonzero()
+        if len(kept) == 0:
+            return box
+        witnesses = _witnesses(views, lower + (kept + 0.5) * cell)
+        for share in WITNESSES:
+            cells = kept[witnesses >= share * witnesses.amax()]
+            box = grown(lower + cells.amin(dim=0) * cell, lower + (cells.amax(dim=0) + 1) * cell)
+            if met(box, origins, directions) >= EXPLAINED:
+                break
+    return box
+
+
+def _rays_to_matter(views: Sequence[View]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Origins and directions (world) of a sample of the pixels whose alpha is over a half."""
+    origins, directions = [], []
+    for view in views:
+        assert view.frame.alpha is not None  # it has an outline
+        ray = rays_of(view, view.frame.alpha > 0.5, RAYS_OF_VIEW)[0]
+        directions.append(view.T_ref_camera.to(torch.float64).rotate(ray))
+        origins.append(view.T_ref_camera.translation.double().expand_as(ray))
+    return torch.cat(origins), torch.cat(directions)
+
+
+def _witnesses(views: Sequence[View], points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    """How many views see something (alpha over 0) where each point (metres, world) is."""
+    return torch.stack([_shows_something(view, points) for view in views]).sum(dim=0)
+
+
+def _shows_something(view: View, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    camera, alpha = view.frame.intrinsics, view.frame.alpha
+    seen = view.T_ref_camera.to(torch.float64).inverse().apply(points).float()
+    column, row = camera.project(seen).nan_to_num(-1.0, -1.0, -1.0).floor().unbind(-1)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    if alpha is None:
+        return inside
+    return inside & (alpha[torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long()] > 0)
