@@ -9,11 +9,19 @@ import torch
 from torch import Generator, Tensor
 
 from bidnerf_core.carving import occupied_cells
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
 from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
+
+
+LEAST = {
+    "width": 1, "geometry_features": 1, "grid_resolution": 2, "coarse_levels": 0, "steps": 1, "samples_per_step": 1,
+    "learning_rate": 0, "coarse_every": 0, "depth_weight": 0, "seed": 0, "rays_at_most": 1, "prune_from": 0,
+    "prune_every": 1, "prune_fade": 0, "prune_threshold": 0,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -32,6 +40,12 @@ class HashGridConfig(FieldConfig):
     prune_fade: float = 0.85  # a cell's largest weight fades by this each time that rays visit it
     prune_threshold: float = 0.01  # rendering weight
     carve: bool = True  # start from the cells that the views' depth and silhouettes leave
+
+    def __post_init__(self) -> None:
+        for name, least in LEAST.items():
+            value = getattr(self, name)
+            if not value >= least:
+                raise InputError(f"{name} is {value}, expected {least} or more")
 
 
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
@@ -67,7 +81,8 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
 def _room_for_matter(grid: OccupancyGrid, views: Sequence[View]) -> Tensor:
     upper = grid.lower + grid.side
     shape = (grid.resolution,) * 3
-    return occupied_cells(views, tuple(grid.lower.tolist()), tuple(upper.tolist()), shape)
+    # Measured depth of a real sensor is off by a few per cent, and a cell that is emptied by mistake is lost.
+    return occupied_cells(views, tuple(grid.lower.tolist()), tuple(upper.tolist()), shape, tolerance=0.05)
 
 
 def _tend(
