@@ -25,7 +25,7 @@ def write_record(name: str, results: dict[str, Any], seed: int) -> Path:
         "benchmark": name,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _git("rev-parse", "--verify", "HEAD") or None,
-        "dirty": bool(_git("status", "--porcelain")),
+        "dirty": bool(_git("status", "--porcelain", "--", ".", ":!benchmarks/results")),
         "command": _command(),
         "seed": seed,
         "cpu": _cpu_model(),

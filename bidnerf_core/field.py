@@ -104,7 +104,7 @@ class SceneBounds:
             tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
             slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
             first, second = (lower - origins) * slope, (upper - origins) * slope
-            near = torch.minimum(first, second).amax(-1).clamp(min=self.near)
+            near = torch.minimum(first, second).amax(-1).clamp(self.near, self.far)
             far = torch.maximum(first, second).amin(-1).clamp(max=self.far)
         return Rays(origins, directions, near, torch.maximum(near, far))
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
+import sys
 import types
 import typing
 from typing import Any, TypeVar
@@ -12,65 +14,122 @@ from bidnerf_core.errors import InputError
 
 T = TypeVar("T")
 
+LARGEST = sys.float_info.max  # JSON knows NaN, 1e999 and integers that no float holds
 
-def to_plain(value: Any) -> Any:
-    """Dataclasses as dicts, tuples as lists."""
+
+def to_plain(value: Any, where: str = "") -> Any:
+    """Dataclasses as dicts, tuples as lists. Raises ``InputError`` for what strict JSON cannot hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = [f.name for f in dataclasses.fields(value) if f.init]
+        return {name: to_plain(getattr(value, name), _inside(where, name)) for name in fields}
+    if isinstance(value, dict):
+        return {_key(key, where): to_plain(item, _inside(where, key)) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return [to_plain(item) for item in value]
-    return value
+        return [to_plain(item, f"{where}[{place}]") for place, item in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{where or 'value'} is {value}, expected a finite number")
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    raise InputError(f"{where or 'value'} is a {type(value).__name__}, expected what JSON can hold")
 
 
 def from_plain(kind: type[T], value: Any, where: str) -> T:
     """An instance of the dataclass ``kind``; missing keys take their defaults. ``where`` opens the error's line.
 
-    Raises ``InputError`` for a key that ``kind`` does not have and for a value of another type than declared.
+    Raises ``InputError`` for a key that ``kind`` does not have, for one that it lacks, for a value of another type than
+    declared, and for values that ``kind`` itself refuses.
     """
     if not isinstance(value, dict):
-        raise InputError(f"{where}: found {value!r}, expected an object with the fields of {kind.__name__}")
+        raise InputError(
+            f"{where}: found {_shown(value)}, expected an object with the fields of {kind.__name__}"
+        )
+    _check_keys(kind, value, where)
     hints = typing.get_type_hints(kind)
-    known = [f.name for f in dataclasses.fields(kind) if f.init]  # type: ignore[arg-type]
+    fields = {key: _converted(hints[key], item, f"{where}: {key}") for key, item in value.items()}
+    try:
+        return kind(**fields)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _check_keys(kind: type, value: dict[str, Any], where: str) -> None:
+    known = {f.name: _is_required(f) for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
             hint = f", did you mean {near[0]!r}?" if near else f", expected some of {', '.join(known)}"
             raise InputError(f"{where}: {kind.__name__} has no field {key!r}{hint}")
-    try:
-        return kind(**{key: _converted(hints[key], item, f"{where}: {key}") for key, item in value.items()})
-    except TypeError as error:  # a field without default is missing
-        raise InputError(f"{where}: {error}") from error
+    missing = [key for key, required in known.items() if required and key not in value]
+    if missing:
+        raise InputError(
+            f"{where}: no {', '.join(map(repr, missing))}, expected all fields of {kind.__name__}"
+        )
+
+
+def _is_required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
 def _converted(kind: Any, value: Any, where: str) -> Any:
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    """``value`` as JSON holds it, as the type ``kind``."""
+    origin, arguments = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if kind is Any or (origin is typing.Literal and value in arguments):
+        return value
     if dataclasses.is_dataclass(kind):
         return from_plain(typing.cast(type, kind), value, where)
     if origin in (typing.Union, types.UnionType):
         return _first_fit(arguments, value, where)
-    if origin is tuple and isinstance(value, list | tuple):
-        kinds = arguments[:1] * len(value) if arguments[-1:] == (Ellipsis,) else arguments
+    if origin in (tuple, list) and isinstance(value, list | tuple):
+        kinds = _kinds_of_items(origin, arguments, len(value))
         if len(kinds) == len(value):
-            return tuple(_converted(k, v, where) for k, v in zip(kinds, value, strict=True))
-    elif origin is typing.Literal:
-        if value in arguments:
-            return value
-    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+            return origin(_converted(k, v, where) for k, v in zip(kinds, value, strict=True))
     elif origin is dict and isinstance(value, dict):
+        inner = arguments[1] if arguments else Any
+        return {key: _converted(inner, item, f"{where}.{key}") for key, item in value.items()}
+    elif kind is float and type(value) in (int, float):
+        if abs(value) <= LARGEST:
+            return float(value)
+    elif type(value) is kind or (value is None and kind is type(None)):
         return value
-    elif kind is Any or (isinstance(kind, type) and type(value) is kind):
-        return value
-    raise InputError(f"{where}: found {value!r}, expected {getattr(kind, '__name__', kind)}")
+    raise InputError(f"{where}: found {_shown(value)}, expected {_name(kind)}")
+
+
+def _kinds_of_items(origin: type, arguments: tuple[Any, ...], count: int) -> tuple[Any, ...]:
+    if not arguments:
+        return (Any,) * count
+    return arguments[:1] * count if origin is list or arguments[-1:] == (Ellipsis,) else arguments
 
 
 def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
-    if value is None and type(None) in kinds:
-        return None
-    for kind in kinds:
+    for kind in sorted(
+        kinds, key=lambda kind: type(value) is not kind
+    ):  # an exact fit goes first: 1 is an int
         try:
             return _converted(kind, value, where)
         except InputError:
             continue
-    names = " or ".join(getattr(kind, "__name__", str(kind)) for kind in kinds)
-    raise InputError(f"{where}: found {value!r}, expected {names}")
+    raise InputError(f"{where}: found {_shown(value)}, expected {' or '.join(map(_name, kinds))}")
+
+
+def _name(kind: Any) -> str:
+    if typing.get_origin(kind) is typing.Literal:
+        return " or ".join(map(repr, typing.get_args(kind)))
+    if kind is type(None):
+        return "null"
+    return kind.__name__ if isinstance(kind, type) else str(kind)
+
+
+def _shown(value: Any) -> str:
+    """A found value on one line, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _inside(where: str, name: Any) -> str:
+    return f"{where}.{name}" if where else str(name)
+
+
+def _key(key: Any, where: str) -> str:
+    if not isinstance(key, str):
+        raise InputError(f"{where or 'value'} has the key {key!r}, expected text")
+    return key

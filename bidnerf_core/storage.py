@@ -9,12 +9,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError
@@ -34,6 +35,9 @@ from bidnerf_core.training import TrainingState
 FORMAT = "bidnerf map"
 VERSION = 1
 DESCRIPTION = "map.json"
+TENSORS = r"(weights|training)-\d{8,}-[0-9a-f]{8}\.safetensors"
+OURS = re.compile(rf"{TENSORS}|\.({TENSORS}|map\.json)\.[0-9a-f]{{8}}")
+"""Names that a save may leave behind; whatever else is in the folder is not ours to remove."""
 
 
 @dataclass(frozen=True)
@@ -86,25 +90,31 @@ def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
 
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
-    """An untrained field and its config, as ``info`` describes them."""
+    """An untrained field (an ``nn.Module``) and its config, as ``info`` describes them."""
     config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
-    return backend.build(config, info.bounds), config
+    try:
+        field = backend.build(config, info.bounds)
+    except ValueError as error:
+        raise InputError(f"{where}: backend {info.backend!r} refuses its config: {error}") from error
+    if not isinstance(field, nn.Module):
+        found = type(field).__name__
+        raise InputError(f"{where}: backend {info.backend!r} built a {found}, expected an nn.Module")
+    return field, config
 
 
 def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     """Write one whole map; what an earlier save left is removed once the new one stands."""
-    folder.mkdir(parents=True, exist_ok=True)
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
     info = replace(info, weights=f"weights-{name}", training=None if info.complete else f"training-{name}")
-    _write(folder / info.weights, tensors_to_bytes(_packed(state.field)))
-    if info.training is not None:
-        _write(folder / info.training, tensors_to_bytes(_packed(state.optimizer)))
-    _write(folder / DESCRIPTION, json.dumps(to_plain(info), indent=1, allow_nan=False).encode())
-    for other in folder.glob("*-*.safetensors"):
-        if other.name not in (info.weights, info.training) and other.name.startswith(
-            ("weights-", "training-")
-        ):
-            other.unlink()
+    description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        write_file(folder / info.weights, tensors_to_bytes(_packed(state.field)))
+        if info.training is not None:
+            write_file(folder / info.training, tensors_to_bytes(_packed(state.optimizer)))
+        write_file(folder / DESCRIPTION, description)
+    finally:
+        _sweep(folder)
     return info
 
 
@@ -117,33 +127,49 @@ def load_info(folder: Path) -> MapInfo:
         raise InputError(f"{folder}: no {DESCRIPTION} in it, expected a map as written by 'bidnerf train'")
     try:
         found = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}), expected the description of a map") from error
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise InputError(f'{path}: not the description of a map, expected "format": "{FORMAT}"')
     if found.get("version") != VERSION:
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; train the map anew")
-    return from_plain(MapInfo, found, str(path))
+    info = from_plain(MapInfo, found, str(path))
+    for name in (info.weights, info.training):
+        if name is not None and (not name or Path(name).name != name):
+            raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
+    return info
 
 
 def load_map(folder: Path, device: torch.device | str = "cpu") -> Map:
     """The map in ``folder``, its field built by its backend and frozen."""
-    info = load_info(folder)
+    info, tensors = _read(folder)
     field, _ = build_field(load_backend(info.backend), info, str(folder / DESCRIPTION))
-    if not isinstance(field, nn.Module):
-        raise InputError(
-            f"{folder}: backend {info.backend!r} built a {type(field).__name__}, expected an nn.Module"
-        )
-    _fill(field, read_tensors(folder / info.weights), folder / info.weights)
-    field.requires_grad_(False).eval().to(device)
+    _check_weights(field, tensors, folder / info.weights)
+    module = cast(nn.Module, field)
+    module.load_state_dict(tensors)
+    module.requires_grad_(False).eval().to(device)
     return Map(info, field)
 
 
-def load_state(folder: Path, info: MapInfo) -> TrainingState:
-    """What an interrupted training needs to go on."""
+def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
+    """What the interrupted training of ``field`` needs to go on."""
     if info.training is None:
         raise InputError(f"{folder}: training is complete ({info.step} steps), nothing to resume")
-    return TrainingState(info.step, read_tensors(folder / info.weights), read_tensors(folder / info.training))
+    weights = read_tensors(folder / info.weights)
+    _check_weights(field, weights, folder / info.weights)
+    return TrainingState(info.step, weights, read_tensors(folder / info.training))
+
+
+def _read(folder: Path) -> tuple[MapInfo, dict[str, Tensor]]:
+    """Description and weights that belong together, even while a training replaces them."""
+    info = load_info(folder)
+    while True:
+        try:
+            return info, read_tensors(folder / info.weights)
+        except InputError:
+            before, info = info, load_info(folder)
+            if info.weights == before.weights:
+                raise
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
@@ -157,9 +183,10 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         raise InputError(f"{path}: not readable ({error}), expected a safetensors file") from error
 
 
-def _fill(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
-    """Load weights, comparing names and shapes first: torch's own message would run over many lines."""
-    expected = field.state_dict()
+def _check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> None:
+    """Compare names, shapes and values with what a field takes: torch's own message would run over many lines."""
+    module = cast(nn.Module, field)
+    expected = module.state_dict()
     for name, value in expected.items():
         if name not in tensors:
             raise InputError(f"{path}: no tensor {name!r}, expected one of shape {list(value.shape)}")
@@ -171,7 +198,9 @@ def _fill(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
         raise InputError(
             f"{path}: tensor {surplus[0]!r} is not part of the field that {DESCRIPTION} describes"
         )
-    field.load_state_dict(tensors)
+    for name, _ in module.named_parameters():
+        if name in tensors and not bool(tensors[name].isfinite().all()):
+            raise InputError(f"{path}: tensor {name!r} holds NaN or infinity, expected finite numbers")
 
 
 def _packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -179,8 +208,23 @@ def _packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
 
 
-def _write(path: Path, content: bytes) -> None:
-    """All of it or nothing, and on the disk before it has its name."""
+def _sweep(folder: Path) -> None:
+    """Remove what saves left that ``map.json`` does not name: earlier ones, and those that did not come to their end."""
+    try:
+        found = json.loads((folder / DESCRIPTION).read_bytes())
+        kept = {found.get("weights"), found.get("training")}
+    except FileNotFoundError:
+        kept = set()
+    except (OSError, ValueError, AttributeError):  # damaged: nothing tells what is of use
+        return
+    for file in list(folder.iterdir()):
+        if OURS.fullmatch(file.name) and file.name not in kept:
+            with contextlib.suppress(OSError):  # it is only in the way
+                file.unlink()
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """All of it or nothing, and on the disk before it has its name. Raises ``OSError``, which names the file."""
     beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
         with beside.open("wb") as file:
@@ -188,7 +232,20 @@ def _write(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         beside.replace(path)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             beside.unlink()
+        if isinstance(error, OSError):
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Names reach the disk as well, where the system can do that."""
+    with contextlib.suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.field import Rays, SceneBounds
 from bidnerf_core.frames import View
 
@@ -171,7 +172,8 @@ def fit(
     """Adam on parameter ``groups`` (each with its ``lr``), ``steps`` times ``outcome(step, generator)``.
 
     Resumes from ``report.resume()``; saves when ``report`` says that it is due; raises ``TrainingStopped`` after saving
-    when it says stop. A resumed run computes what an uninterrupted one would have.
+    when it says stop. A resumed run computes what an uninterrupted one would have. Raises ``InputError`` where the loss is
+    not finite.
     """
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
     rates = [group["lr"] for group in optimizer.param_groups]
@@ -182,10 +184,15 @@ def fit(
             group["lr"] = rate * schedule(step, steps)
         optimizer.zero_grad(set_to_none=True)
         result = outcome(step, generator)
+        loss = float(result.loss.detach())
+        if not math.isfinite(loss):  # before it spreads to the weights, and from there to a checkpoint
+            raise InputError(
+                f"training diverged: loss {loss} at step {step + 1}; try a smaller learning rate"
+            )
         result.loss.backward()
         optimizer.step()
         psnr = -10 * math.log10(max(result.mse, 1e-10))
-        report.step(Progress(step + 1, steps, float(result.loss.detach()), psnr, result.samples_per_ray))
+        report.step(Progress(step + 1, steps, loss, psnr, result.samples_per_ray))
         if report.stopping or report.due(step + 1):
             report.save(_state(step + 1, field, optimizer, generator))
         if report.stopping and step + 1 < steps:

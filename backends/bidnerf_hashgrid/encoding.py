@@ -34,12 +34,12 @@ class HashEncodingConfig:
     of the encoding by position is continuous.
     """
 
-    levels: int = 16
-    features: int = 2
-    log2_table_size: int = 19
-    base_resolution: float = 16
-    finest_resolution: float = 512
-    interpolation: Literal["linear", "smooth"] = "linear"
+    levels: int = 16  # of resolution
+    features: int = 2  # of an entry; even numbers are faster
+    log2_table_size: int = 19  # entries of a level's table, as a power of two
+    base_resolution: float = 16  # cells along a side at the coarsest level
+    finest_resolution: float = 512  # and at the finest
+    interpolation: Literal["linear", "smooth"] = "linear"  # between the corners of a cell
 
 
 @dataclass(frozen=True)

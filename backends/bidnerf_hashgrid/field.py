@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -20,10 +22,11 @@ class FieldConfig:
     """Size of the field."""
 
     encoding: HashEncodingConfig = field(
-        default_factory=lambda: HashEncodingConfig(levels=8, log2_table_size=18, finest_resolution=256)
+        default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=19, finest_resolution=768)
     )
     width: int = 64  # of the hidden layers
-    geometry_features: int = 15
+    colour_layers: int = 2  # hidden layers of the colour network
+    geometry_features: int = 15  # that the density network passes on to the colour network
     grid_resolution: int = 128  # cells of the occupancy grid along the longest side of the scene
     coarse_levels: int = 4  # levels of the encoding that the coarse field keeps
 
@@ -47,10 +50,7 @@ class HashGridField(nn.Module):
             nn.Linear(config.width, 1 + config.geometry_features),
         )
         self.colour = nn.Sequential(
-            nn.Linear(config.geometry_features + 9, config.width),
-            nn.ReLU(),
-            nn.Linear(config.width, config.width),
-            nn.ReLU(),
+            *_hidden([config.geometry_features + 9, *[config.width] * config.colour_layers]),
             nn.Linear(config.width, 3),
             nn.Sigmoid(),
         )
@@ -78,6 +78,10 @@ class HashGridField(nn.Module):
     def encode(self, positions: Float[Tensor, "p 3"], active: int | None) -> Float[Tensor, "p f"]:
         encoded: Tensor = self.encoding((positions - self.lower) / self.side, active)
         return encoded
+
+
+def _hidden(widths: Sequence[int]) -> list[nn.Module]:
+    return [part for a, b in pairwise(widths) for part in (nn.Linear(a, b), nn.ReLU())]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ class OccupancyGrid(nn.Module):
 
     A cell counts as occupied while some training ray gave weight to it: matter that no ray sees, such as the inside of a
     solid, costs nothing. ``peak`` is the largest rendering weight seen in a cell, fading with each step that visits it;
-    a cell that no ray visits keeps its state. Occupied cells are those above a threshold and their neighbours, so
-    surfaces can move back.
+    a cell that no ray visits keeps its state. Occupied cells are those above a threshold and, while surfaces may still
+    move, their neighbours.
     """
 
     lower: Float[Tensor, "3"]
@@ -57,9 +57,9 @@ class OccupancyGrid(nn.Module):
         flat[cells] = torch.maximum(flat[cells] * fade, seen[cells])
 
     @torch.no_grad()
-    def prune(self, threshold: float) -> None:
-        """Decide anew which cells are occupied."""
-        self.occupied.copy_(_dilated(self.peak > threshold, 1))
+    def prune(self, threshold: float, grow: bool = True) -> None:
+        """Decide anew which cells are occupied: those that count, and their neighbours if surfaces may still move."""
+        self.occupied.copy_(_dilated(self.peak > threshold, 1 if grow else 0))
         self._refresh()
 
     @torch.no_grad()

@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Generator, Tensor
 
 from bidnerf_core.carving import occupied_cells
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
+from bidnerf_core.supervision import supervised_loss
 from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 
-
 LEAST = {
-    "width": 1, "geometry_features": 1, "grid_resolution": 2, "coarse_levels": 0, "steps": 1, "samples_per_step": 1,
+    "width": 1, "colour_layers": 1, "geometry_features": 1, "grid_resolution": 2, "coarse_levels": 0, "steps": 1, "samples_per_step": 1,
     "learning_rate": 0, "coarse_every": 0, "depth_weight": 0, "seed": 0, "rays_at_most": 1, "prune_from": 0,
     "prune_every": 1, "prune_fade": 0, "prune_threshold": 0,
 }  # fmt: skip
@@ -28,17 +27,18 @@ LEAST = {
 class HashGridConfig(FieldConfig):
     """Size of the field and its training. The defaults suit a few minutes on a small CPU."""
 
-    steps: int = 2000
+    steps: int = 2500  # of the optimizer
     samples_per_step: int = 65536  # the number of rays follows from it
-    learning_rate: float = 1e-2
+    learning_rate: float = 1e-2  # of the tables; the networks learn at a quarter of it
     coarse_every: int = 4  # one step in so many trains the coarse field
-    depth_weight: float = 0.1
-    seed: int = 0
-    rays_at_most: int = 16384  # per step
+    depth_weight: float = 0.1  # of the depth term beside the colour term; 0 leaves depth out
+    seed: int = 0  # of initial weights and of all that is drawn at random
+    rays_at_most: int = 16384  # a step, however few samples they take
     prune_from: int = 200  # step from which empty cells are left out
-    prune_every: int = 16
-    prune_fade: float = 0.85  # a cell's largest weight fades by this each time that rays visit it
-    prune_threshold: float = 0.01  # rendering weight
+    prune_every: int = 16  # steps between two such rounds
+    prune_fade: float = 0.95  # a cell's largest weight fades by this each time that rays visit it
+    prune_threshold: float = 0.01  # rendering weight up to which a cell counts as empty
+    grow_until: float = 0.6  # share of the steps in which the neighbours of occupied cells are asked as well
     carve: bool = True  # start from the cells that the views' depth and silhouettes leave
 
     def __post_init__(self) -> None:
@@ -66,13 +66,12 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         coarse = config.coarse_every > 0 and step % config.coarse_every == config.coarse_every - 1
         level: CoarseField | HashGridField = field.levels[0] if coarse else field
         grid = level.sampler
-        count = min(
-            config.rays_at_most, int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1)))
-        )
+        affordable = int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1)))
+        count = max(1, min(config.rays_at_most, affordable))
         batch = bank.draw(count, generator)
         rendering = render(level, batch.rays, batch.background, generator)
         _tend(grid, batch, rendering, step, config)
-        loss, mse = _loss(rendering, batch, field.side, config.depth_weight)
+        loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
     fit(field, groups, outcome, config.steps, report, seed=config.seed)
@@ -94,15 +93,4 @@ def _tend(
     grid.observe(positions.detach(), rendering.weights.detach()[valid], config.prune_fade)
     grid.samples_per_ray.lerp_(valid.sum() / len(valid), 0.1 if step > 10 else 1.0)
     if step >= config.prune_from and step % config.prune_every in (0, config.coarse_every - 1):
-        grid.prune(config.prune_threshold)
-
-
-def _loss(rendering: Rendering, batch: RayBatch, side: float, depth_weight: float) -> tuple[Tensor, float]:
-    """Squared error of colour, and the mean distance of each ray's weight from where its depth was measured."""
-    error = (rendering.rgb - batch.rgb) ** 2
-    measured = batch.distance > 0
-    away = (rendering.weights * (rendering.samples.middles - batch.distance[:, None]).abs()).sum(-1)
-    missing = (1 - rendering.opacity) * batch.distance
-    off = torch.where(measured, away + missing, 0).sum() / measured.sum().clamp(min=1) / side
-    mse = float(error.detach().mean())
-    return error.mean() + depth_weight * off, mse
+        grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)

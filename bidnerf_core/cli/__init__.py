@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 import importlib
+import os
 import sys
 from collections.abc import Sequence
+from typing import TextIO
+
+from bidnerf_core.errors import InputError
 
 COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
@@ -15,44 +21,82 @@ COMMANDS = {
     "localize": "find the pose of images in a map",
 }
 
+DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
+"""Exit status; the last two are 128 and the number of the signal, as shells have it."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0 done, 1 bad input, 2 wrong usage, 130 interrupted."""
+    """Run one command; returns the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    _open_streams()
+    name = " ".join(["bidnerf", *[word for word in given[:1] if word in COMMANDS]])
+    try:
+        status = _guarded(name, given)
+        sys.stdout.flush()  # here, where a full disk can still be told
+    except BrokenPipeError:
+        _discard(sys.stdout)
+        return READER_GONE
+    except OSError as error:
+        _discard(sys.stdout)
+        return _failed(name, error.strerror or str(error), BAD_INPUT)
+    return status
+
+
+def _guarded(name: str, given: list[str]) -> int:
+    """A user's mistake ends in one line, not in a traceback."""
+    try:
+        return _dispatch(given)
+    except SystemExit as stopped:  # the parser has said all
+        return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
+    except KeyboardInterrupt:
+        return _failed(name, "interrupted", INTERRUPTED)
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # a full disk, a folder that may not be written
+        where = f"{error.filename}: " if error.filename else ""
+        return _failed(name, f"{where}{error.strerror or error}", BAD_INPUT)
+    except InputError as error:
+        return _failed(name, str(error), getattr(error, "status", BAD_INPUT))
+
+
+def _dispatch(given: list[str]) -> int:
     if not given or given[0] in ("-h", "--help"):
-        print(_usage())
-        return 0 if given else 2
+        print(_usage(), file=sys.stdout if given else sys.stderr)
+        return DONE if given else WRONG_USAGE
     if given[0] == "--version":
         from importlib.metadata import version
 
         print(f"bidnerf {version('bidnerf')}")
-        return 0
+        return DONE
     if given[0] not in COMMANDS:
-        print(f"bidnerf: no command {given[0]!r}\n\n{_usage()}", file=sys.stderr)
-        return 2
-    return _guarded(given[0], given[1:])
+        near = difflib.get_close_matches(given[0], COMMANDS, n=1)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        return _failed("bidnerf", f"no command {given[0]!r}{hint}", WRONG_USAGE, f"\n{_usage()}")
+    importlib.import_module(f"bidnerf_core.cli.{given[0]}").run(given[1:])
+    return DONE
 
 
-def _guarded(command: str, arguments: list[str]) -> int:
-    """A user's mistake ends in one line, not in a traceback."""
-    from bidnerf_core.errors import InputError
+def _failed(name: str, message: str, status: int, more: str = "") -> int:
+    """Say why, on one line; that nobody listens is no reason to fail otherwise."""
+    with contextlib.suppress(OSError):
+        print(f"{name}: {' '.join(message.splitlines())}", file=sys.stderr)
+        print(more, end=more and "\n", file=sys.stderr, flush=True)
+    return status
 
-    try:
-        importlib.import_module(f"bidnerf_core.cli.{command}").run(arguments)
-    except InputError as error:
-        print(f"bidnerf {command}: {error}", file=sys.stderr)
-        return 1
-    except BrokenPipeError:  # the reader of our output has gone
-        sys.stderr.close()
-        return 0
-    except OSError as error:  # a full disk, a folder that may not be written
-        where = f"{error.filename}: " if error.filename else ""
-        print(f"bidnerf {command}: {where}{error.strerror or error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"bidnerf {command}: interrupted", file=sys.stderr)
-        return 130
-    return 0
+
+def _open_streams() -> None:
+    """Python has no streams where the shell closed them (``>&-``): what would go there goes nowhere."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+
+
+def _discard(stream: TextIO) -> None:
+    """What is left in a stream's buffer must not fail once more when Python ends."""
+    with contextlib.suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
 
 
 def _usage() -> str:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import tyro
-from rich.console import Console
 from rich.table import Table
 
-from bidnerf_core.cli.common import parse, print_json
+from bidnerf_core.cli.common import Flag, option, parse, print_json, print_table
 from bidnerf_core.registry import BackendInfo, list_backends
 
 
@@ -16,16 +14,18 @@ def run(arguments: list[str]) -> None:
     parse("backends", backends, arguments)
 
 
-def backends(json: Annotated[bool, tyro.conf.arg(help="print a JSON list")] = False) -> None:
+def backends(json: Annotated[Flag, option(None, "print a JSON list", "")] = False) -> None:
     """List the installed kinds of field, importing none of them."""
     infos = list_backends()
     if json:
         print_json([_row(info) for info in infos])
         return
-    table = Table("name", "summary", "distribution", "version", "fault", box=None, pad_edge=False)
+    faults = ["fault"] if any(info.fault for info in infos) else []
+    table = Table("name", "summary", "distribution", "version", *faults, box=None, pad_edge=False)
     for info in infos:
-        table.add_row(info.name, info.summary, info.distribution, info.version, info.fault or "")
-    Console(highlight=False).print(table)
+        fault = [info.fault or ""] if faults else []
+        table.add_row(info.name, info.summary, info.distribution, info.version, *fault)
+    print_table(table)
 
 
 def _row(info: BackendInfo) -> dict[str, str | None]:

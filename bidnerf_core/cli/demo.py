@@ -9,14 +9,25 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import imageio.v3 as iio
-import tyro
-from rich.console import Console
 from rich.table import Table
 
+from bidnerf_core.backend import Backend
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.cli.common import check_free, console, parse, say
+from bidnerf_core.cli.common import (
+    DEFAULT_BACKEND,
+    LARGEST_SEED,
+    Flag,
+    UsageError,
+    console,
+    option,
+    output_folder,
+    parse,
+    print_table,
+    require,
+    say,
+)
 from bidnerf_core.cli.progress import timed
-from bidnerf_core.cli.train import DEFAULT_BACKEND, train_map
+from bidnerf_core.cli.train import train_map
 from bidnerf_core.closed_form import views
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import PoseError, pose_error
@@ -30,6 +41,7 @@ from bidnerf_core.rigs import orbit
 from bidnerf_core.scenes import demo_object
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map, load_map
+from bidnerf_core.training import TrainingStopped
 
 CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 TRAINING_VIEWS, RADIUS = 60, 3.5
@@ -55,28 +67,44 @@ def run(arguments: list[str]) -> None:
 
 
 def demo(
-    backend: Annotated[str, tyro.conf.arg(help="name from 'bidnerf backends'")] = DEFAULT_BACKEND,
-    out: Path = Path("demo-out"),
-    frames: Annotated[int, tyro.conf.arg(help="how many unseen frames to localize")] = 4,
-    steps: Annotated[int, tyro.conf.arg(help="training steps")] = 400,
-    seed: int = 0,
-    overwrite: Annotated[bool, tyro.conf.arg(help="replace what is in --out")] = False,
+    backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
+    out: Annotated[Path, option("DIR", "folder for the map and the pictures")] = Path("demo-out"),
+    frames: Annotated[int, option("N", "how many unseen frames to localize")] = 4,
+    steps: Annotated[int, option("N", "training steps")] = 400,
+    seed: Annotated[int, option("N", "of the views and of the starts")] = 0,
+    overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
 ) -> None:
-    """Train a map of a closed-form scene, localize unseen RGB-D frames in it from bad starts, and draw the result."""
-    check_free(out, overwrite)
-    if frames < 1:
-        raise InputError(f"--frames is {frames}, expected 1 or more")
+    """Train a closed-form scene, localize unseen frames in it, draw the result.
+
+    The frames are RGB-D images from poses that the training has not seen; the search for each begins far from its pose.
+    """
+    require("--frames", frames, 1)
+    require("--steps", steps, 1)
+    require("--seed", seed, 0, LARGEST_SEED)
     chosen = load_backend(backend)
+    with output_folder(out, overwrite):
+        trials, stored = _demonstrated(chosen, backend, out, frames, steps, seed)
+        _print(trials)
+        _draw(stored, trials, out)
+
+
+def _demonstrated(
+    chosen: Backend, backend: str, out: Path, frames: int, steps: int, seed: int
+) -> tuple[list[Trial], Map]:
     scene = demo_object()
     seen = views(scene, CAMERA, orbit(RADIUS, TRAINING_VIEWS, seed=seed))
     unseen = views(scene, CAMERA, orbit(RADIUS, frames, elevation=(15.0, 50.0), seed=seed + 1))
-    config = dataclasses.replace(chosen.config_type(), steps=steps)
+    try:
+        config = dataclasses.replace(chosen.config_type(), steps=steps)
+    except TypeError as error:
+        raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has") from error
     with timed(f"trained on {len(seen)} views of the closed-form scene"):
-        train_map(chosen, backend, seen, config, out / "map", scene.name, scene.bounds.background)
+        try:
+            train_map(chosen, backend, seen, config, out / "map", scene.name, scene.bounds.background)
+        except TrainingStopped as stopped:
+            raise KeyboardInterrupt from stopped
     stored = load_map(out / "map")
-    trials = [_trial(stored, view, number, seed) for number, view in enumerate(unseen)]
-    _print(trials)
-    _draw(stored, trials, out)
+    return [_trial(stored, view, number, seed) for number, view in enumerate(unseen)], stored
 
 
 def _trial(stored: Map, view: View, number: int, seed: int) -> Trial:
@@ -97,7 +125,7 @@ def _print(trials: Sequence[Trial]) -> None:
             f"{float(after.translation):.4f} m", f"{float(after.rotation_deg):.2f} deg",
             str(trial.found.steps), f"{trial.found.seconds:.1f}", "yes" if trial.found.converged else "NO",
         )  # fmt: skip
-    Console(highlight=False).print(table)
+    print_table(table)
 
 
 def _draw(stored: Map, trials: Sequence[Trial], out: Path) -> None:

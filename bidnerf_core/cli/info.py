@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-
-from bidnerf_core.cli.common import parse, print_json
+from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json
 from bidnerf_core.field import levels
 from bidnerf_core.plain import to_plain
 from bidnerf_core.storage import load_map
@@ -17,11 +15,8 @@ def run(arguments: list[str]) -> None:
     parse("info", info, arguments)
 
 
-def info(
-    map: tyro.conf.Positional[Path],
-    json: Annotated[bool, tyro.conf.arg(help="print one JSON object")] = False,
-) -> None:
-    """Describe the map in folder MAP."""
+def info(map: MapFolder, json: Annotated[Flag, option(None, "print one JSON object", "")] = False) -> None:
+    """Describe a map; it is loaded whole, so that a damaged one is told here."""
     facts = describe(map)
     if json:
         print_json(facts)
@@ -31,7 +26,7 @@ def info(
 
 
 def describe(folder: Path) -> dict[str, Any]:
-    """What a user may want to know; the map is loaded whole, so that a damaged one is told here."""
+    """What a user may want to know."""
     stored = load_map(folder)
     info = stored.info
     parameters = sum(p.numel() for p in stored.field.parameters())  # type: ignore[attr-defined]

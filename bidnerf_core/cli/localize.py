@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as jsonlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,29 +12,39 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from bidnerf_core.cli.common import parse, print_json, read_views, say, value_of
+from bidnerf_core.cli.common import (
+    LARGEST_SEED,
+    DataFolder,
+    Flag,
+    MapFolder,
+    Names,
+    UsageError,
+    option,
+    parse,
+    print_json,
+    read_views,
+    require,
+    say,
+    value_of,
+)
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.evaluation.errors import PoseError, pose_error
-from bidnerf_core.localization import Localization, find_method, rig
+from bidnerf_core.localization import METHODS, Localization, find_method, rig
 from bidnerf_core.localization import localize as find_pose
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
 
+one_of = tyro.conf.create_mutex_group(required=True, title="where to start")
+
 
 @dataclass(frozen=True)
 class Beginning:
-    """What the user says of where to start: exactly one of the three."""
+    """What the user says of where to start: one of the two, or that nothing is known."""
 
     file: Path | None
     perturb: tuple[float, float] | None  # metres, degrees
-    none: bool
-
-    def __post_init__(self) -> None:
-        given = [self.file is not None, self.perturb is not None, self.none]
-        if sum(given) != 1:
-            raise InputError("expected one of --start POSE.json, --perturb T R and --no-start")
 
     def pose(self, truth: SE3, method: str, seed: int) -> SE3:
         if self.file is not None:
@@ -48,48 +59,53 @@ def run(arguments: list[str]) -> None:
     kind = find_method(value_of("--method", arguments) or "auto").config_type
 
     def localize(
-        map: tyro.conf.Positional[Path],
-        data: tyro.conf.Positional[Path],
-        frame: tuple[str, ...],
-        split: str = "test",
-        method: str = "auto",
+        map: MapFolder,
+        data: DataFolder,
+        frame: Annotated[Names, option("NAME...", "names of frames, the stems of their image files")],
+        split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
+        method: Annotated[str, option("NAME", f"auto, {', '.join(METHODS)}")] = "auto",
         start: Annotated[
-            Path | None, tyro.conf.arg(help="JSON file with a 4x4 T_world_camera to start from")
+            Path | None, one_of, option("POSE.json", "file with a 4x4 T_world_camera to start from", "")
         ] = None,
         perturb: Annotated[
             tuple[float, float] | None,
-            tyro.conf.arg(metavar="T R", help="start from the true pose moved by T metres and R degrees"),
+            one_of,
+            option("T R", "start from the true pose moved by T metres and R degrees", ""),
         ] = None,
-        no_start: Annotated[bool, tyro.conf.arg(help="no start is known")] = False,
-        seed: int = 0,
-        json: Annotated[bool, tyro.conf.arg(help="print one JSON object")] = False,
+        no_start: Annotated[Flag, one_of, option(None, "no start is known", "")] = False,
+        seed: Annotated[int, option("N", "of all that is drawn at random")] = 0,
+        json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
         config: Any = kind(),
     ) -> None:
-        """Find the pose of a frame of the dataset in folder DATA in the map in folder MAP.
+        """Find the pose of a dataset's frame in a map.
 
         Several frames are taken as a rig: their relative poses come from the dataset, and the pose found is that of the
         last one's camera. Poses are camera to world, OpenCV axes (x right, y down, z forward).
         """
-        _localize(map, data, frame, split, method, Beginning(start, perturb, no_start), seed, json, config)
+        names = [name for group in frame for name in group]
+        _localize(map, data, names, split, method, Beginning(start, perturb), seed, json, config)
 
     localize.__annotations__["config"] = kind
     parse("localize", localize, arguments)
 
 
 def _localize(
-    folder: Path, data: Path, frames: tuple[str, ...], split: str, method: str, begin: Beginning, seed: int,
+    folder: Path, data: Path, frames: Sequence[str], split: str, method: str, begin: Beginning, seed: int,
     as_json: bool, config: Any,
 ) -> None:  # fmt: skip
     if not frames:
-        raise InputError("no frame to localize; name at least one with --frame")
+        raise UsageError("no frame to localize; name at least one with --frame")
+    require("--seed", seed, 0, LARGEST_SEED)
     stored = load_map(folder)
     views = read_views(open_dataset(data, stored.bounds.background), split, frames)
-    for view in views:
-        if not view.frame.has_depth:
-            say(f"{view.frame.name}: no measured depth; colour only")
     truth = views[-1].T_ref_camera
     start = begin.pose(truth, method, seed)
+    bare = [view.frame.name for view in views if not view.frame.has_depth]
+    if bare:
+        say(f"{', '.join(bare)}: no measured depth; colour only")
     found = find_pose(rig(stored.field, stored.bounds, views, start), method, config, seed)
+    if not bool(found.T_world_camera.matrix().isfinite().all()):
+        raise InputError(f"{folder}: {found.method} came to a pose that is not finite, expected a sound map")
     error = pose_error(found.T_world_camera, truth)
     if as_json:
         print_json(as_plain(found, stored.info.backend, error))
@@ -105,7 +121,7 @@ def as_plain(found: Localization, backend: str, error: PoseError | None) -> dict
         "converged": found.converged,
         "steps": found.steps,
         "seconds": found.seconds,
-        "covariance": None if found.covariance is None else found.covariance.tolist(),
+        "covariance": _covariance(found),
         "loss": found.loss if math.isfinite(found.loss) else None,
         "backend": backend,
         "method": found.method,
@@ -113,14 +129,20 @@ def as_plain(found: Localization, backend: str, error: PoseError | None) -> dict
     }
 
 
+def _covariance(found: Localization) -> list[list[float]] | None:
+    """Rows, where it is known."""
+    covariance = found.covariance
+    return None if covariance is None or not bool(covariance.isfinite().all()) else covariance.tolist()
+
+
 def read_pose(path: Path) -> SE3:
     """A 4x4 camera-to-world matrix, alone or under "T_world_camera", as ``localize --json`` prints it."""
     expected = 'expected {"T_world_camera": 4x4 rows}'
     try:
         found = jsonlib.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file, {expected}") from error
-    except ValueError as error:
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}), {expected}") from error
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}), {expected}") from error
     rows = found.get("T_world_camera") if isinstance(found, dict) else found
     try:

@@ -18,23 +18,29 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from torch import nn
 
 from bidnerf_core.cli.common import console, say
-from bidnerf_core.storage import MapInfo, load_state, save_map
+from bidnerf_core.field import RadianceField
+from bidnerf_core.storage import MapInfo, save_map
 from bidnerf_core.training import Progress as TrainingProgress
 from bidnerf_core.training import TrainingState
 
+CHECKPOINT_SECONDS = 60.0
 LINE_EVERY = 10.0  # seconds, where stderr is no terminal
 
 
 class StoredTraining:
     """The ``Report`` of a training that keeps its map in a folder. Use as a context: Ctrl-C then stops after a step."""
 
-    def __init__(self, folder: Path, info: MapInfo, total: int, checkpoint_seconds: float = 60.0) -> None:
+    def __init__(
+        self, folder: Path, info: MapInfo, state: TrainingState | None, total: int, checkpoint_seconds: float
+    ) -> None:
         self.folder, self.info, self.total = folder, info, total
         self.stopping = False
         self._checkpoint_seconds = checkpoint_seconds
-        self._resumed = load_state(folder, info) if info.weights else None
+        self._resumed, self._first_step = state, info.step
+        self._step, self._complete, self._told = info.step, False, False
         self._began = self._saved = self._spoke = time.monotonic()
         self._bar = Progress(
             TextColumn("training"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[numbers]}"),
@@ -47,8 +53,10 @@ class StoredTraining:
         return self._resumed
 
     def step(self, progress: TrainingProgress) -> None:
+        self._resumed = None  # it is as large as the field and its optimizer
+        self._step, self.total = progress.step, progress.total
         numbers = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB  {progress.samples_per_ray:.1f} samples a ray"
-        self._bar.update(self._task, completed=progress.step, numbers=numbers)
+        self._bar.update(self._task, completed=progress.step, total=progress.total, numbers=numbers)
         now = time.monotonic()
         last = progress.step == progress.total
         if not console.is_terminal and (last or now - self._spoke > LINE_EVERY):
@@ -56,10 +64,9 @@ class StoredTraining:
             done = progress.step - self._first_step
             left = (now - self._began) / max(1, done) * (progress.total - progress.step)
             say(f"step {progress.step}/{progress.total}  {numbers}  {left:.0f} s left")
-
-    @property
-    def _first_step(self) -> int:
-        return self._resumed.step if self._resumed else 0
+        if self.stopping and not self._told:  # not in the signal's handler, which may interrupt a print
+            self._told = True
+            say("stopping after this step (Ctrl-C again: at once, back to the last checkpoint)")
 
     def due(self, step: int) -> bool:
         return step == self.total or time.monotonic() - self._saved > self._checkpoint_seconds
@@ -67,9 +74,15 @@ class StoredTraining:
     def save(self, state: TrainingState) -> None:
         now = time.monotonic()
         seconds = self.info.seconds + now - self._began
-        info = replace(self.info, step=state.step, complete=state.step >= self.total, seconds=seconds)
-        save_map(self.folder, info, state)
-        self._saved = time.monotonic()
+        complete = state.step >= self.total
+        save_map(self.folder, replace(self.info, step=state.step, complete=complete, seconds=seconds), state)
+        self._saved, self._complete = time.monotonic(), complete
+
+    def finish(self, field: RadianceField) -> None:
+        """Save once more if the backend came to its end without saying so."""
+        if not self._complete and isinstance(field, nn.Module):
+            self.total = self._step
+            self.save(TrainingState(self._step, field.state_dict(), {}))
 
     def __enter__(self) -> StoredTraining:
         self._previous = signal.signal(signal.SIGINT, self._interrupt)
@@ -86,7 +99,6 @@ class StoredTraining:
         if self.stopping:  # asked twice: at once, back to the last checkpoint
             raise KeyboardInterrupt
         self.stopping = True
-        say("stopping after this step (Ctrl-C again: at once, back to the last checkpoint)")
 
 
 @contextmanager

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import imageio.v3 as iio
 import numpy as np
 import torch
-import tyro
 from kornia.metrics import psnr
 
-from bidnerf_core.cli.common import check_free, console, make_folder, parse, read_views, say
+from bidnerf_core.cli.common import (
+    DataFolder,
+    Flag,
+    MapFolder,
+    Names,
+    console,
+    option,
+    output_folder,
+    parse,
+    read_views,
+    say,
+)
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import levels
-from bidnerf_core.frames import Frame
+from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.frames import Frame, View
 from bidnerf_core.rendering import RenderedImage, render_image
-from bidnerf_core.storage import load_map
+from bidnerf_core.storage import Map, load_map, write_file
 
 DEEPEST = 65.535  # metres in a 16-bit image of millimetres
 
@@ -28,39 +39,45 @@ def run(arguments: list[str]) -> None:
 
 
 def render(
-    map: tyro.conf.Positional[Path],
-    data: tyro.conf.Positional[Path],
-    out: Path,
-    split: str = "test",
-    frame: Annotated[tuple[str, ...], tyro.conf.arg(help="names of frames; default: all of the split")] = (),
+    map: MapFolder,
+    data: DataFolder,
+    out: Annotated[Path, option("DIR", "folder for the images")],
+    split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
+    frame: Annotated[Names, option("NAME...", "names of frames", "all of the split")] = (),
     level: Annotated[
-        int | None, tyro.conf.arg(help="level of detail, 0 the coarsest; default: the field itself")
+        int | None, option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,
-    overwrite: Annotated[bool, tyro.conf.arg(help="replace images in --out")] = False,
+    overwrite: Annotated[Flag, option(None, "replace images in --out", "")] = False,
 ) -> None:
-    """Render the map in folder MAP from the poses of the dataset in folder DATA.
+    """Render a map from the poses of a dataset.
 
     Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where nothing was met) per frame into --out,
     and prints PSNR and depth error against the dataset's images.
     """
-    check_free(out, overwrite)
-    stored = load_map(map)
+    with output_folder(out, overwrite):
+        stored = load_map(map)
+        field = stored.field if level is None else _level(stored, level, map)
+        names = [name for group in frame for name in group]
+        views = read_views(open_dataset(data, stored.bounds.background), split, names or None)
+        _render(field, stored.bounds, views, out)
+
+
+def _level(stored: Map, number: int, folder: Path) -> RadianceField:
     offered = levels(stored.field)
-    if level is not None and not 0 <= level < len(offered):
-        raise InputError(f"{map}: no level {level}, expected 0 to {len(offered) - 1}")
-    field = stored.field if level is None else offered[level]
-    views = read_views(open_dataset(data, stored.bounds.background), split, frame or None)
-    make_folder(out)
+    if not 0 <= number < len(offered):
+        raise InputError(f"{folder}: no level {number}, expected 0 to {len(offered) - 1}")
+    return offered[number]
+
+
+def _render(field: RadianceField, bounds: SceneBounds, views: Sequence[View], out: Path) -> None:
     rows = []
     with console.status("") as status:
         for number, view in enumerate(views):
             status.update(f"rendering {number + 1}/{len(views)}: {view.frame.name}")
-            image = render_image(field, view.frame.intrinsics, view.T_ref_camera, stored.bounds)
+            image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds)
             write_images(out, view.frame.name, image)
             rows.append((view.frame.name, *_scores(image, view.frame)))
-            print(
-                f"{rows[-1][0]}  PSNR {rows[-1][1]:.2f} dB  depth error {_metres(rows[-1][2])} m"
-            )
+            print(f"{rows[-1][0]}  PSNR {rows[-1][1]:.2f} dB  depth error {_metres(rows[-1][2])} m")
     errors = torch.cat([row[3] for row in rows])
     median = float(errors.median()) if len(errors) else None
     print(f"mean of {len(rows)}: PSNR {statistics.fmean(row[1] for row in rows):.2f} dB", end="")
@@ -69,11 +86,15 @@ def render(
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
     """``NAME.png`` and ``NAME.depth.png``."""
-    iio.imwrite(out / f"{name}.png", (image.rgb * 255).round().to(torch.uint8).numpy())
+    write_file(out / f"{name}.png", _as_png((image.rgb * 255).round().to(torch.uint8).numpy()))
     if float(image.depth.max()) > DEEPEST:
         say(f"{name}: depth beyond {DEEPEST} m does not fit a 16-bit image of millimetres and is cut off")
     millimetres = (image.depth.clamp(0, DEEPEST) * 1000).round().numpy().astype(np.uint16)
-    iio.imwrite(out / f"{name}.depth.png", millimetres)
+    write_file(out / f"{name}.depth.png", _as_png(millimetres))
+
+
+def _as_png(pixels: np.ndarray) -> bytes:
+    return bytes(iio.imwrite("<bytes>", pixels, extension=".png"))
 
 
 def _scores(image: RenderedImage, frame: Frame) -> tuple[float, float | None, torch.Tensor]:

@@ -6,47 +6,72 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-
 from bidnerf_core.backend import Backend
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.cli.common import check_free, make_folder, parse, read_views, say, value_of
-from bidnerf_core.cli.progress import StoredTraining
+from bidnerf_core.cli.common import (
+    DEFAULT_BACKEND,
+    DataFolder,
+    Flag,
+    UsageError,
+    option,
+    output_folder,
+    parse,
+    read_views,
+    require,
+    say,
+    value_of,
+)
+from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.plain import to_plain
 from bidnerf_core.registry import load_backend
-from bidnerf_core.storage import MapInfo, build_field, load_info, stored_cameras
+from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
 from bidnerf_core.training import TrainingStopped
-
-DEFAULT_BACKEND = "hashgrid"
 
 
 def run(arguments: list[str]) -> None:
     """Parse with the options of the backend that the arguments name."""
-    name = value_of("--backend", arguments) or DEFAULT_BACKEND
+    named = value_of("--backend", arguments)
+    name = named or _resumed_backend(arguments) or DEFAULT_BACKEND
     chosen = load_backend(name)
     kind = chosen.config_type
 
     def train(
-        data: tyro.conf.Positional[Path],
-        out: Path,
-        backend: Annotated[str, tyro.conf.arg(help="name from 'bidnerf backends'")] = DEFAULT_BACKEND,
-        split: str = "train",
+        data: DataFolder,
+        out: Annotated[Path, option("MAP", "folder for the map")],
+        backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
+        split: Annotated[str, option("NAME", "which of the dataset's splits to train on")] = "train",
         background: Annotated[
-            str | None, tyro.conf.arg(help="white or black, under images with alpha")
+            str | None, option("COLOUR", "white or black, under images with alpha", "as the dataset has it")
         ] = None,
-        resume: Annotated[bool, tyro.conf.arg(help="go on with an interrupted training in --out")] = False,
-        overwrite: Annotated[bool, tyro.conf.arg(help="replace the map in --out")] = False,
+        resume: Annotated[Flag, option(None, "go on with the interrupted training in --out", "")] = False,
+        overwrite: Annotated[Flag, option(None, "replace the map in --out", "")] = False,
+        checkpoint_every: Annotated[
+            float, option("SECONDS", "how much work an interruption may cost")
+        ] = CHECKPOINT_SECONDS,
         config: Any = kind(),
     ) -> None:
-        """Make a map of the dataset in folder DATA."""
-        if resume:
-            _resume(data, out, split, background)
-        else:
-            check_free(out, overwrite)
-            _start(chosen, backend, data, out, split, background, config)
+        """Make a map of a dataset.
+
+        Ctrl-C stops after a step and keeps what is there; --resume goes on from it, or from the last checkpoint if the
+        program was killed, and arrives where an uninterrupted training would have.
+        """
+        require("--checkpoint-every", checkpoint_every, 0)
+        if resume and overwrite:
+            raise UsageError("--resume goes on with a map, --overwrite begins anew; expected one of them")
+        try:
+            if resume:
+                info = load_interrupted(out)
+                _check_unchanged(out, info, named, kind(), config)
+                _resume(info, data, out, split, background, checkpoint_every)
+            else:
+                with output_folder(out, overwrite):
+                    _start(chosen, name, data, out, split, background, config, checkpoint_every)
+        except TrainingStopped as stopped:
+            say(f"{out}: saved after step {stopped.step}; the same with --resume goes on from there")
+            raise KeyboardInterrupt from stopped
 
     train.__annotations__["config"] = kind
     parse("train", train, arguments)
@@ -54,45 +79,85 @@ def run(arguments: list[str]) -> None:
 
 def train_map(
     backend: Backend, name: str, views: Sequence[View], config: Any, out: Path, data: str,
-    background: tuple[float, float, float],
+    background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS,
 ) -> None:  # fmt: skip
-    """A new map in folder ``out``, with progress on stderr; stops early, but resumable, on Ctrl-C."""
+    """A new map in folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
     bounds = estimate_bounds(views, background)
-    info = MapInfo(name, to_plain(config), bounds, 0, False, data, cameras=stored_cameras(views))
-    make_folder(out)
-    _run(backend, info, out, views)
+    settings = to_plain(config, "config")
+    info = MapInfo(name, settings, bounds, 0, False, data, cameras=stored_cameras(views))
+    with output_folder(out, overwrite=True):
+        _run(backend, info, out, views, checkpoint_seconds)
+
+
+def load_interrupted(out: Path) -> MapInfo:
+    """The description of the map in ``out``, whose training did not come to its end."""
+    try:
+        info = load_info(out)
+    except InputError as error:
+        raise InputError(f"{error}; nothing to resume, train without --resume") from error
+    if info.complete:
+        raise InputError(f"{out}: training is complete ({info.step} steps), nothing to resume")
+    return info
+
+
+def _resumed_backend(arguments: list[str]) -> str | None:
+    """The backend of the map that is to be resumed, if it can be known already."""
+    out = value_of("--out", arguments)
+    if "--resume" not in arguments or out is None:
+        return None
+    try:
+        return load_info(Path(out)).backend
+    except InputError:  # told later, if the arguments are otherwise right
+        return None
+
+
+def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any, config: Any) -> None:
+    """A training goes on as it began: settings that would be ignored are refused."""
+    if backend not in (None, info.backend):
+        raise UsageError(f"{out}: is of backend {info.backend!r}, cannot resume it with {backend!r}")
+    stored, given, usual = info.config, to_plain(config), to_plain(default)
+    for key, value in given.items():
+        if value not in (usual[key], stored.get(key)):
+            raise UsageError(
+                f"{out}: was begun with {key} {stored.get(key)}, got {value}; --resume keeps settings"
+            )
 
 
 def _start(
-    backend: Backend, name: str, data: Path, out: Path, split: str, background: str | None, config: Any
-) -> None:
+    backend: Backend, name: str, data: Path, out: Path, split: str, background: str | None, config: Any,
+    checkpoint_seconds: float,
+) -> None:  # fmt: skip
     dataset = open_dataset(data, background)
     views = read_views(dataset, split)
     if not any(view.frame.has_depth for view in views):
         say(f"{data}: no measured depth in split {split!r}; training on colour only")
-    train_map(backend, name, views, config, out, data.resolve().name, dataset.background)
+    train_map(backend, name, views, config, out, data.resolve().name, dataset.background, checkpoint_seconds)
 
 
-def _resume(data: Path, out: Path, split: str, background: str | None) -> None:
-    info = load_info(out)
-    if info.complete:
-        raise InputError(f"{out}: training is complete ({info.step} steps), nothing to resume")
-    dataset = open_dataset(data, background)
+def _resume(
+    info: MapInfo, data: Path, out: Path, split: str, background: str | None, checkpoint_seconds: float
+) -> None:
+    dataset = open_dataset(data, info.bounds.background if background is None else background)
+    if dataset.background != info.bounds.background:
+        raise UsageError(f"{out}: was begun over background {info.bounds.background}, got {background!r}")
     views = read_views(dataset, split)
-    if tuple(view.frame.name for view in views) != tuple(camera.name for camera in info.cameras):
+    if stored_cameras(views) != info.cameras:
         raise InputError(
-            f"{data}: its frames are not those that {out} was trained on; expected {info.data!r} again"
+            f"{data}: split {split!r} has other frames or poses than {out} was begun with, expected those of"
+            f" {info.data!r} unchanged"
         )
-    say(f"{out}: going on from step {info.step}")
-    _run(load_backend(info.backend), info, out, views)
+    with output_folder(out, overwrite=True):
+        _run(load_backend(info.backend), info, out, views, checkpoint_seconds)
 
 
-def _run(backend: Backend, info: MapInfo, out: Path, views: Sequence[View]) -> None:
+def _run(
+    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], checkpoint_seconds: float
+) -> None:
     field, config = build_field(backend, info, str(out))
-    with StoredTraining(out, info, getattr(config, "steps", 0)) as report:
-        try:
-            backend.train(field, views, config, report)
-        except TrainingStopped as stopped:
-            say(f"{out}: stopped after step {stopped.step}; go on with --resume")
-            raise KeyboardInterrupt from stopped
+    state = load_state(out, info, field) if info.step else None
+    if state is not None:
+        say(f"{out}: going on from step {info.step}")
+    with StoredTraining(out, info, state, getattr(config, "steps", 0), checkpoint_seconds) as report:
+        backend.train(field, views, config, report)
+        report.finish(field)
     say(f"{out}: map of {info.data}, {sum(f.stat().st_size for f in out.iterdir()) / 2**20:.1f} MiB")

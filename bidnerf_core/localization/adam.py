@@ -26,12 +26,12 @@ class BidConfig:
     """Settings of method ``bid``."""
 
     rays: int = 2048  # in all, shared out equally among the views
-    max_steps: int = 400
-    learning_rate: float = 0.02  # metres and radians a step
+    max_steps: int = 200
+    learning_rate: float = 0.04  # metres and radians a step
     decay: float = 0.4  # factor on the learning rate ...
-    decay_steps: int = 100  # ... after so many steps
-    depth_weight: float = 1.0  # lambda_d
-    huber_delta: float = 0.1
+    decay_steps: int = 80  # ... after so many steps
+    depth_weight: float = 0.3  # lambda_d; the paper's is 1, with which far starts were lost more often here
+    huber_delta: float = 0.1  # of colour differences, and of metres
     level: int | None = 0  # of the field: 0 is the coarsest, null the field itself
     pivot: Literal["scene", "camera"] = "scene"  # what the update turns about; the paper's is the camera
     wide: float = 1.0  # sampled interval over [near, far]; the paper's "wide" is 2

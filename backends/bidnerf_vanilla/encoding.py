@@ -1,0 +1,26 @@
+"""Positional encoding (Mildenhall et al. 2020, section 5.1)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def encoded_width(frequencies: int, include_input: bool) -> int:
+    """How many numbers encode a point of three coordinates."""
+    return 3 * (2 * frequencies + include_input)
+
+
+def positional_encoding(
+    points: Float[Tensor, "p 3"], frequencies: int, include_input: bool = True
+) -> Float[Tensor, "p f"]:
+    """``(p, sin(2^0 pi p), cos(2^0 pi p), ..., sin(2^(L-1) pi p), cos(2^(L-1) pi p))`` (eq. 4).
+
+    Coordinates are in [-1, 1], half a period of the lowest frequency. Each frequency has its three sines, then its three
+    cosines; ``p`` itself goes first, or is left out.
+    """
+    octaves = torch.arange(frequencies, dtype=points.dtype, device=points.device)
+    angles = points[:, None, :] * (torch.pi * 2**octaves)[:, None]
+    waves = torch.stack([angles.sin(), angles.cos()], dim=-2).flatten(1)
+    return torch.cat([points, waves], dim=-1) if include_input else waves

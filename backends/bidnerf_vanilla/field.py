@@ -1,0 +1,74 @@
+"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, the second asked where the first found matter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.sampling import Importance, Stratified
+from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
+from bidnerf_vanilla.room import Room, Within
+
+SHARPNESS = 30.0
+"""Density per side of the scene at a raw density of about 1: networks whose outputs are small see surfaces."""
+THINNESS = 1.0
+"""How far raw density is shifted down, so that an untrained field is nearly transparent (Barron et al. 2021, mip-NeRF)."""
+
+
+@dataclass(frozen=True)
+class FieldConfig(NetworkConfig):
+    """Size of the field."""
+
+    coarse_samples: int = 64  # intervals of a ray at which the coarse network is asked
+    fine_samples: int = 32  # how many more the fine network is asked at, placed by the coarse one
+    room_resolution: int = 64  # cells along the longest side of the scene; those seen to be empty are skipped
+
+
+class Level(nn.Module):
+    """One network, and where on a ray it is asked."""
+
+    middle: Float[Tensor, "3"]
+
+    def __init__(self, config: NetworkConfig, bounds: SceneBounds, sampler: RaySampler) -> None:
+        super().__init__()
+        self.sampler = sampler
+        self.side = max(bounds.size)
+        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
+        self.register_buffer("middle", torch.tensor(middle), persistent=False)
+        self.network = NerfNetwork(config)
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        """Positions are brought into the cube [-1, 1], densities are per its side: no unit of length matters."""
+        shape = positions.shape[:-1]
+        points = (positions.reshape(-1, 3) - self.middle) * (2 / self.side)
+        raw, rgb = self.network(points, directions.reshape(-1, 3))
+        density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
+        return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
+
+
+class VanillaField(nn.Module):
+    """The fine level, and the coarse one in ``levels``. Hierarchical sampling (section 5.2) is what composes them."""
+
+    def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
+        super().__init__()
+        self.config = config
+        self.bounds = bounds
+        self.room = Room(bounds, config.room_resolution)
+        self.coarse = Level(config, bounds, Within(self.room, Stratified(config.coarse_samples)))
+        self.fine = Level(config, bounds, Within(self.room, Importance(self.coarse, config.fine_samples)))
+
+    @property
+    def sampler(self) -> RaySampler:
+        return self.fine.sampler
+
+    @property
+    def levels(self) -> tuple[Level, Level]:
+        return self.coarse, self.fine
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        return self.fine.query(positions, directions)

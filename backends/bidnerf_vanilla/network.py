@@ -1,0 +1,60 @@
+"""The MLP of NeRF (Mildenhall et al. 2020, figure 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bidnerf_vanilla.encoding import encoded_width, positional_encoding
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Size of one MLP."""
+
+    layers: int = 4  # hidden layers from which density is read off
+    width: int = 128  # of each; the layer that looks at the direction has half of it
+    skip: int = 2  # how many layers go before the position is fed in once more; 0 never
+    position_frequencies: int = 8
+    direction_frequencies: int = 2
+    include_input: bool = True  # feed positions and directions themselves in, beside their sines
+
+
+class NerfNetwork(nn.Module):
+    """Encoded position to raw density, with the encoded direction also to colour.
+
+    The paper's linear layer between the two parts has no activation: it is one with the linear layer that follows.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        seen = encoded_width(config.position_frequencies, config.include_input)
+        turned = encoded_width(config.direction_frequencies, config.include_input)
+        inputs = [config.width + seen * self._is_fed(number) for number in range(1, config.layers)]
+        self.trunk = nn.ModuleList(nn.Linear(count, config.width) for count in (seen, *inputs))
+        self.density = nn.Linear(config.width, 1)
+        self.view = nn.Linear(config.width + turned, max(1, config.width // 2))
+        self.colour = nn.Linear(max(1, config.width // 2), 3)
+
+    def _is_fed(self, number: int) -> bool:
+        """Whether a layer takes the position besides what the layer before it made of it."""
+        return number == self.config.skip > 0
+
+    def forward(
+        self, points: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
+        """Density before its activation, and rgb in [0, 1], of ``points`` in the cube [-1, 1]."""
+        config = self.config
+        position = positional_encoding(points, config.position_frequencies, config.include_input)
+        direction = positional_encoding(directions, config.direction_frequencies, config.include_input)
+        hidden = position
+        for number, layer in enumerate(self.trunk):
+            given = torch.cat([hidden, position], dim=-1) if self._is_fed(number) else hidden
+            hidden = functional.relu(layer(given), inplace=True)
+        looked = functional.relu(self.view(torch.cat([hidden, direction], dim=-1)), inplace=True)
+        return self.density(hidden)[:, 0], torch.sigmoid(self.colour(looked))

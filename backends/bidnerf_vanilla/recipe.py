@@ -1,0 +1,91 @@
+"""How a NeRF is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Generator
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+from bidnerf_core.rendering import render
+from bidnerf_core.supervision import supervised_loss
+from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit
+from bidnerf_vanilla.field import FieldConfig, VanillaField
+
+LEAST = {
+    "layers": 1, "width": 1, "skip": 0, "position_frequencies": 0, "direction_frequencies": 0, "coarse_samples": 1,
+    "fine_samples": 1, "room_resolution": 2, "steps": 1, "samples_per_step": 1, "rays_at_most": 1, "learning_rate": 0,
+    "depth_weight": 0, "seed": 0,
+}  # fmt: skip
+PROBE = 4096
+"""Rays from which is learnt how many samples a ray takes."""
+
+
+@dataclass(frozen=True)
+class VanillaConfig(FieldConfig):
+    """Size of the field and its training. The defaults suit some forty minutes on a small CPU."""
+
+    steps: int = 20000
+    samples_per_step: int = 16384  # of the fine network, about; the number of rays follows from it
+    rays_at_most: int = 4096  # per step
+    learning_rate: float = 2e-3
+    depth_weight: float = 0.1
+    seed: int = 0
+    carve: bool = True  # ask no network where the views' depth and silhouettes leave no room for matter
+
+    def __post_init__(self) -> None:
+        for name, least in LEAST.items():
+            value = getattr(self, name)
+            if not value >= least:
+                raise InputError(f"{name} is {value}, expected {least} or more")
+        if not (self.include_input or self.position_frequencies):
+            raise InputError("position_frequencies is 0 without include_input, expected one of them")
+
+    @classmethod
+    def small(cls) -> VanillaConfig:
+        """The defaults."""
+        return cls()
+
+    @classmethod
+    def paper(cls) -> VanillaConfig:
+        """Sizes and training of the paper (section 5.3, appendix A)."""
+        return cls(
+            layers=8, width=256, skip=5, position_frequencies=10, direction_frequencies=4, coarse_samples=64,
+            fine_samples=128, steps=200_000, samples_per_step=4096 * 192, learning_rate=5e-4, carve=False,
+        )  # fmt: skip
+
+
+def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, report: Report) -> None:
+    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    if config.carve:
+        field.room.carve(views)
+    bank = RayBank(views, field.bounds)
+    rays_per_step = _rays_per_step(field, bank, config)
+
+    def outcome(step: int, generator: Generator) -> StepOutcome:
+        return step_outcome(field, bank.draw(rays_per_step, generator), config.depth_weight, generator)
+
+    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
+    fit(field, groups, outcome, config.steps, report, seed=config.seed)
+
+
+def step_outcome(
+    field: VanillaField, batch: RayBatch, depth_weight: float, generator: Generator
+) -> StepOutcome:
+    """Both levels must see what was seen (eq. 6); the samples that are counted are the fine level's."""
+    coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
+    rough, _ = supervised_loss(coarse, batch, field.coarse.side, depth_weight)
+    loss, mse = supervised_loss(fine, batch, field.fine.side, depth_weight)
+    return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch.rgb)))
+
+
+@torch.no_grad()
+def _rays_per_step(field: VanillaField, bank: RayBank, config: VanillaConfig) -> int:
+    """Where there is little room for matter, a step affords more rays."""
+    rays = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
+    asked = float(field.coarse.sampler(rays).valid.sum()) / PROBE
+    samples = asked * (1 + config.fine_samples / config.coarse_samples)
+    return max(1, min(config.rays_at_most, int(config.samples_per_step / max(samples, 1.0))))

@@ -1,0 +1,90 @@
+"""Train a map as a user would, and judge it on frames that training never saw.
+
+    python benchmarks/map_quality.py DATA --out MAP --name map_lego [-- OPTIONS OF bidnerf train]
+
+Records wall time and peak memory of ``bidnerf train`` as a process, the size of the map, and on the test split the PSNR
+of images and the absolute error of depth where depth was measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+from kornia.metrics import psnr, ssim
+from record import write_record
+
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.frames import View
+from bidnerf_core.rendering import render_image
+from bidnerf_core.storage import load_map
+
+
+def train(data: Path, out: Path, options: list[str]) -> dict[str, float]:
+    """Wall seconds and peak resident memory (GB) of the training process."""
+    command = [sys.executable, "-c", "import sys; from bidnerf_core.cli import main; sys.exit(main())"]
+    began = time.perf_counter()
+    subprocess.run([*command, "train", str(data), "--out", str(out), "--overwrite", *options], check=True)
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+    return {"seconds": time.perf_counter() - began, "peak_resident_GiB": peak}
+
+
+def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, float | None]:
+    """Mean PSNR and SSIM; median and 90th percentile of absolute depth error (metres) over measured pixels."""
+    quality, likeness, errors, missing, measured = [], [], [], 0, 0
+    for view in views:
+        image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds)
+        quality.append(float(psnr(image.rgb, view.frame.rgb, 1.0)))
+        pair = [i.permute(2, 0, 1)[None] for i in (image.rgb, view.frame.rgb)]
+        likeness.append(float(ssim(*pair, window_size=11).mean()))
+        if view.frame.depth is not None:
+            known = view.frame.depth > 0
+            errors.append((image.depth - view.frame.depth).abs()[known])
+            missing += int((known & (image.depth == 0)).sum())
+            measured += int(known.sum())
+    depth = torch.cat(errors) if errors else torch.zeros(0)
+    return {
+        "frames": len(views),
+        "psnr_mean_dB": statistics.fmean(quality),
+        "psnr_lowest_dB": min(quality),
+        "ssim_mean": statistics.fmean(likeness),
+        "depth_error_median": float(depth.median()) if len(depth) else None,
+        "depth_error_p90": float(depth.quantile(0.9)) if 0 < len(depth) < 2**24 else None,
+        "share_of_measured_pixels_without_rendered_depth": missing / measured if measured else None,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--name", required=True, help="of the record")
+    parser.add_argument("--keep", action="store_true", help="judge the map that is there already")
+    parser.add_argument("options", nargs="*", help="after --: options of bidnerf train")
+    given = parser.parse_args()
+    training = {} if given.keep else train(given.data, given.out, given.options)
+    stored = load_map(given.out)
+    views = open_dataset(given.data, stored.bounds.background).views("test")
+    results = {
+        "backend": stored.info.backend,
+        "config": stored.info.config,
+        "training": training,
+        "training_seconds_in_map": stored.info.seconds,
+        "map_MiB": sum(f.stat().st_size for f in given.out.iterdir()) / 2**20,
+        "levels": [judge(level, stored.bounds, views) for level in levels(stored.field)],
+    }
+    print(write_record(given.name, results, seed=stored.info.config.get("seed", 0)))
+    print({k: v for k, v in results.items() if k != "config"})
+
+
+if __name__ == "__main__":
+    main()

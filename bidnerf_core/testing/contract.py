@@ -1,0 +1,186 @@
+"""``BackendContract``: what a backend promises, one test a promise."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from bidnerf_core.backend import Backend
+from bidnerf_core.field import RadianceField, levels
+from bidnerf_core.testing import derivatives, recipes, samples, values
+from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.scene import awkward_rays, joined, points, rgb_views, rgbd_views
+from bidnerf_core.testing.subject import Subject, called, frozen, precise
+
+
+class BackendContract(Subject):
+    """Inherit under a name that begins with ``Test`` and say which backend; pytest does the rest.
+
+    ``backend`` is the object that the entry point names, or ``name`` is the entry point's. ``config`` should be small:
+    a few dozen steps of milliseconds, which suffice to learn something of 6 images of 24 x 24 pixels. Without it the
+    default config is taken, with fewer steps.
+    """
+
+    # What the entry point names.
+
+    def test_backend_says_what_it_is(self) -> None:
+        backend = self._backend()
+        require(
+            isinstance(backend, Backend),
+            f"{called(backend)} lacks some of summary, config_type, build, train",
+        )
+        summary = backend.summary
+        one_line = isinstance(summary, str) and summary.strip() != "" and "\n" not in summary
+        require(one_line, f"{called(backend)}.summary is {summary!r}, expected one line of text")
+
+    def test_config_is_a_frozen_dataclass_with_defaults_and_steps(self) -> None:
+        kind, who = self._backend().config_type, f"{called(self._backend())}.config_type"
+        require(
+            isinstance(kind, type) and dataclasses.is_dataclass(kind),
+            f"{who} is {kind!r}, expected a dataclass",
+        )
+        require(
+            cast(Any, kind).__dataclass_params__.frozen,
+            f"{who} {kind.__name__} is not frozen, expected @dataclass(frozen=True)",
+        )
+        missing = dataclasses.MISSING
+        bare = [
+            f.name for f in dataclasses.fields(kind) if f.default is missing and f.default_factory is missing
+        ]
+        require(
+            not bare,
+            f"{who} {kind.__name__} has no default for {', '.join(bare)}, expected one for every field",
+        )
+        steps = getattr(kind(), "steps", None)
+        require(
+            type(steps) is int and steps > 0,
+            f"{who} {kind.__name__} has steps = {steps!r}, expected a field of type int: the length of a training",
+        )
+
+    def test_config_survives_json(self) -> None:
+        for config in (self._backend().config_type(), self._config()):
+            found = self._reread(config)
+            require(
+                found == config, f"{type(config).__name__} comes back from JSON as {found}, expected {config}"
+            )
+
+    def test_build_gives_a_field(self) -> None:
+        field = self._build()
+        who = f"{called(self._backend())}.build gives a {type(field).__name__}"
+        require(
+            isinstance(field, nn.Module), f"{who}, expected an nn.Module, whose state_dict is what is saved"
+        )
+        require(isinstance(field, RadianceField), f"{who} without query or sampler, expected both")
+
+    def test_build_is_reproducible(self) -> None:
+        with torch.random.fork_rng(devices=[]):
+            first, second = (self._build().state_dict() for _ in range(2))
+        for name, value in first.items():
+            require(
+                torch.equal(value, second[name]),
+                f"{called(self._backend())}.build: {name!r} differs between two builds of one config, expected its chance"
+                " to come from a seed in the config",
+            )
+
+    # What the field says, at each of its levels.
+
+    def test_query_takes_any_shape(self) -> None:
+        self._each(values.check_shapes)
+
+    def test_query_is_finite_and_in_range(self) -> None:
+        self._each(values.check_ranges)
+
+    def test_query_is_differentiable_by_position(self) -> None:
+        self._each(lambda field: derivatives.check_position_derivatives(*precise(field)))
+
+    def test_query_is_differentiable_by_direction(self) -> None:
+        self._each(lambda field: derivatives.check_direction_derivatives(*precise(field)))
+
+    def test_query_follows_the_dtype(self) -> None:
+        for field in self._fields():
+            with telling(f"{type(field).__name__}.double()"):
+                doubled = copy.deepcopy(field).double()
+            for level, moved in zip(levels(field), levels(cast(RadianceField, doubled)), strict=True):
+                values.check_precision(level, moved)
+
+    def test_field_moves_to_a_device(self) -> None:
+        if not torch.cuda.is_available():
+            return
+        rays = joined(list(awkward_rays().values()))
+        field = self._trained()
+        with telling(f"{type(field).__name__} on CUDA"):
+            moved = copy.deepcopy(field).to("cuda")
+            names = (f.name for f in dataclasses.fields(rays))
+            elsewhere = dataclasses.replace(rays, **{name: getattr(rays, name).cuda() for name in names})
+            found = samples.seen(cast(RadianceField, moved), elsewhere, "rays on CUDA").cpu()
+        require(
+            values.close(found, samples.seen(field, rays, "rays"), 2e-2),
+            f"{type(field).__name__} renders otherwise on CUDA than on the CPU",
+        )
+
+    def test_query_serves_several_threads(self) -> None:
+        self._each(values.check_threads)
+
+    # Where the field is asked, and what is seen.
+
+    def test_samples_are_sorted_disjoint_and_on_the_ray(self) -> None:
+        self._each(samples.check_intervals)
+
+    def test_samples_are_repeatable(self) -> None:
+        self._each(samples.check_repeatable)
+
+    def test_rays_do_not_depend_on_each_other(self) -> None:
+        self._each(samples.check_rays_alone)
+
+    def test_rays_that_miss_see_the_background(self) -> None:
+        self._each(samples.check_background)
+
+    def test_levels_are_fields_coarsest_first(self) -> None:
+        for field in self._fields():
+            samples.check_levels(field)
+
+    def test_rendering_carries_gradients_to_the_pose(self) -> None:
+        for level in levels(self._trained()):
+            derivatives.check_pose_gradient(*precise(level))
+
+    # What is saved.
+
+    def test_saved_field_renders_the_same(self) -> None:
+        trained, fresh = self._trained(), self._build(self._reread(self._config()))
+        with telling(f"{type(fresh).__name__}.load_state_dict of a saved state_dict"):
+            fresh.load_state_dict(recipes.stored(dict(trained.state_dict())))
+        loaded = frozen(fresh)
+        rays = joined(list(awkward_rays().values()))
+        same = torch.equal(_answers(loaded), _answers(trained)) and all(
+            torch.equal(samples.seen(a, rays, "rays"), samples.seen(b, rays, "rays"))
+            for a, b in zip(levels(loaded), levels(trained), strict=True)
+        )
+        require(
+            same,
+            f"{type(fresh).__name__}: saved, built anew and loaded, it renders otherwise than before, expected the same"
+            " bits; is some state not in state_dict (a plain attribute, a buffer with persistent=False)?",
+        )
+
+    # How it is trained.
+
+    def test_training_learns_from_rgbd(self) -> None:
+        recipes.check_learning(
+            self._backend(), self._build, self._config(), rgbd_views(coverage=False), "RGB-D"
+        )
+
+    def test_training_learns_from_rgb(self) -> None:
+        recipes.check_learning(self._backend(), self._build, self._config(), rgb_views(), "RGB")
+
+    def test_training_reports_and_saves(self) -> None:
+        recipes.check_reports(self._backend(), self._build(), self._config())
+
+    def test_training_stops_and_resumes(self) -> None:
+        recipes.check_resuming(self._backend(), self._build, self._config())
+
+
+def _answers(field: RadianceField) -> Tensor:
+    return values.stacked(query(field, *points(256), "points"))

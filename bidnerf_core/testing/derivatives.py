@@ -1,0 +1,118 @@
+"""Derivatives of a field against finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.field import RadianceField
+from bidnerf_core.rendering import render
+from bidnerf_core.se3 import SE3
+from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.scene import SIDE, camera_rays, points, rgbd_views
+
+COUNT = 64
+AGREEING = 0.7
+"""Share of points at which derivatives must agree: a field may have kinks, which a step now and then crosses."""
+
+Asked = Callable[[Tensor], Tensor]
+"""Points (n 3) to values (n c)."""
+
+
+def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
+    """By position, along a random line through each point."""
+    positions, directions = (x.to(dtype) for x in points(COUNT))
+    along = points(COUNT, seed=1)[1].to(dtype)
+    for what in ("density", "rgb"):
+
+        def ask(places: Tensor, what: str = what) -> Tensor:
+            values = query(field, places, directions, "points with gradient")
+            return getattr(values, what).reshape(COUNT, -1)
+
+        share = agreement(ask, lambda t: positions + SIDE * t * along, SIDE * along, dtype)
+        _require_agreement(field, what, "position", share)
+
+
+def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
+    """By direction, along a random great circle through each, since directions stay unit."""
+    positions, directions = (x.to(dtype) for x in points(COUNT))
+    along = points(COUNT, seed=1)[1].to(dtype)
+    along = torch.nn.functional.normalize(
+        along - (along * directions).sum(-1, keepdim=True) * directions, dim=-1
+    )
+    for what in ("density", "rgb"):
+
+        def ask(turned: Tensor, what: str = what) -> Tensor:
+            values = query(field, positions, turned, "directions with gradient")
+            return getattr(values, what).reshape(COUNT, -1)
+
+        def on_circle(t: float) -> Tensor:
+            angle = torch.tensor(t, dtype=dtype)
+            return angle.cos() * directions + angle.sin() * along
+
+        _require_agreement(field, what, "direction", agreement(ask, on_circle, along, dtype))
+
+
+def check_pose_gradient(field: RadianceField, dtype: torch.dtype) -> None:
+    """``render`` carries a gradient from what is seen to the camera's pose."""
+    delta = torch.zeros(6, dtype=dtype, requires_grad=True)
+    start = rgbd_views()[0].T_ref_camera.to(dtype=dtype)
+    nudge = torch.tensor([0.02, -0.03, 0.01, 0.02, 0.01, -0.02], dtype=dtype)
+    T_world_camera: SE3 = start.retract(nudge).retract(delta)
+    who = f"{type(field).__name__} rendered from a pose"
+    with telling(who):
+        rendering = render(field, camera_rays(T_world_camera))
+        seen = {"rgb": rendering.rgb.square().mean(), "distance": rendering.distance.mean()}
+    for what, value in seen.items():
+        require(value.requires_grad, f"{who}: {what} carries no gradient; {DETACHED}")
+        (gradient,) = torch.autograd.grad(value, delta, retain_graph=True)
+        require(bool(gradient.isfinite().all()), f"{who}: the gradient of {what} is NaN or infinite")
+        require(bool(gradient.abs().max() > 0), f"{who}: the gradient of {what} is zero; {DETACHED}")
+
+
+DETACHED = "expected one: query must not detach positions or run under no_grad"
+
+
+def agreement(
+    ask: Asked, moved: Callable[[float], Tensor], speed: Float[Tensor, "n 3"], dtype: torch.dtype
+) -> Float[Tensor, ""]:
+    """Share of values whose derivative along a curve is that of finite differences, at the best of several steps.
+
+    ``moved(t)`` are the points at ``t`` on their curves, ``speed`` (n 3) is its derivative at 0.
+    """
+    exact = _slopes(ask, moved(0.0), speed)
+    steps, tolerance = (
+        ((1e-3, 1e-4, 1e-5, 1e-6), 1e-3) if dtype == torch.float64 else ((3e-2, 1e-2, 3e-3), 0.05)
+    )
+    with torch.no_grad():
+        measured = torch.stack([(ask(moved(h)) - ask(moved(-h))) / (2 * h) for h in steps])
+        size = ask(moved(0.0)).abs().amax()
+    error = (measured - exact).abs().amin(0)
+    allowed = tolerance * torch.maximum(exact.abs(), measured.abs().median(0).values)
+    return (error <= allowed + 1e-3 * tolerance * size).to(dtype).mean()
+
+
+def _slopes(ask: Asked, at: Float[Tensor, "n 3"], speed: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
+    """Derivative of each channel along ``speed``, by reverse mode; zero where nothing depends on the argument."""
+    leaf = at.detach().requires_grad_()
+    values = ask(leaf)
+    slopes = torch.zeros_like(values)
+    if not values.requires_grad:
+        return slopes
+    for c in range(values.shape[1]):
+        with telling("backward through query"):
+            (gradient,) = torch.autograd.grad(values[:, c].sum(), leaf, retain_graph=True, allow_unused=True)
+        if gradient is not None:
+            slopes[:, c] = (gradient * speed).sum(-1)
+    return slopes.detach()
+
+
+def _require_agreement(field: RadianceField, what: str, by: str, share: Tensor) -> None:
+    require(
+        float(share) >= AGREEING,
+        f"{type(field).__name__}.query: the derivative of {what} by {by} agrees with finite differences at"
+        f" {float(share):.0%} of the points, expected {AGREEING:.0%}; is something detached, rounded or clamped?",
+    )

@@ -1,0 +1,61 @@
+"""How a breach of the contract is told: in one sentence that says what was found and what is expected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Generator, Tensor
+
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples
+
+
+def require(condition: bool, fault: str) -> None:
+    """Not an ``assert``: those say nothing under ``python -O``."""
+    if not condition:
+        raise AssertionError(fault)
+
+
+@contextmanager
+def telling(doing: str) -> Iterator[None]:
+    """An exception of the backend's code becomes a breach that says what was asked of it."""
+    try:
+        yield
+    except AssertionError:
+        raise
+    except Exception as error:
+        raise AssertionError(f"{doing} raised {type(error).__name__}: {error}") from error
+
+
+def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) -> FieldValues:
+    """What ``field`` says, with shapes checked. ``of`` describes the points."""
+    who = f"{type(field).__name__}.query of {of}"
+    with telling(who):
+        values = field.query(positions, directions)
+    shape = tuple(positions.shape[:-1])
+    for what, found, expected in (
+        ("density", values.density, shape),
+        ("rgb", values.rgb, (*shape, 3)),
+    ):
+        require(
+            tuple(found.shape) == expected,
+            f"{who}: {what} has shape {tuple(found.shape)}, expected {expected} for positions of shape"
+            f" {tuple(positions.shape)}",
+        )
+    return values
+
+
+def sample(field: RadianceField, rays: Rays, of: str, jitter: Generator | None = None) -> RaySamples:
+    """Where ``field`` wants to be asked, with shapes checked. ``of`` describes the rays."""
+    who = f"sampler {type(field.sampler).__name__} of {of}"
+    with telling(who):
+        samples = field.sampler(rays, jitter)
+    shape, found = samples.starts.shape, tuple(rays.near.shape)
+    require(
+        tuple(shape[:-1]) == found and samples.ends.shape == shape and samples.valid.shape == shape,
+        f"{who}: starts, ends and valid have shapes {tuple(shape)}, {tuple(samples.ends.shape)} and"
+        f" {tuple(samples.valid.shape)}, expected the same for all three: {found} and one more axis",
+    )
+    require(samples.valid.dtype == torch.bool, f"{who}: valid is {samples.valid.dtype}, expected torch.bool")
+    return samples

@@ -1,0 +1,192 @@
+"""Laws of ``Backend.train``: it learns, reports, saves when asked, stops when asked, and goes on as if it had not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from safetensors.torch import load as tensors_from_bytes
+from safetensors.torch import save as tensors_to_bytes
+from torch import Tensor, nn
+
+from bidnerf_core.backend import Backend
+from bidnerf_core.field import RadianceField
+from bidnerf_core.frames import View
+from bidnerf_core.rendering import render
+from bidnerf_core.testing.faults import require, telling
+from bidnerf_core.testing.scene import BOUNDS, camera_rays, rgbd_views
+from bidnerf_core.training import Progress, TrainingState, TrainingStopped
+
+LEARNED = 0.8
+"""Factor by which the squared error of colour must have fallen."""
+
+
+class Recorder:
+    """A ``Report`` that writes down what it is told, and keeps states as a map on disk would: as bytes."""
+
+    def __init__(
+        self, due: Sequence[int] = (), stop: int | None = None, state: TrainingState | None = None
+    ) -> None:
+        self.steps: list[Progress] = []
+        self.saved: list[TrainingState] = []
+        self._due, self._stop, self._state = due, stop, state
+
+    def resume(self) -> TrainingState | None:
+        return self._state
+
+    def step(self, progress: Progress) -> None:
+        self.steps.append(progress)
+
+    def due(self, step: int) -> bool:
+        return step in self._due
+
+    def save(self, state: TrainingState) -> None:
+        self.saved.append(TrainingState(state.step, stored(state.field), stored(state.optimizer)))
+
+    @property
+    def stopping(self) -> bool:
+        return self._stop is not None and len(self.steps) >= self._stop
+
+
+def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """What comes back from a safetensors file."""
+    with telling("writing the tensors of a state to safetensors"):
+        packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+        return tensors_from_bytes(tensors_to_bytes(packed))
+
+
+def check_learning(
+    backend: Backend, make: Callable[[], RadianceField], config: Any, views: Sequence[View], kind: str
+) -> RadianceField:
+    """``config.steps`` steps bring the rendered views nearer to those that were seen. Returns the trained field."""
+    field = make()
+    before = colour_error(field)
+    _train(backend, field, views, config, Recorder(), f"on {kind} views")
+    after = colour_error(field)
+    require(
+        after <= LEARNED * before,
+        f"{_name(backend)}.train on {kind} views: {config.steps} steps took the squared error of colour from"
+        f" {before:.4g} to {after:.4g}, expected {LEARNED * before:.4g} or less; does the recipe change the field that it"
+        " is given? does the test's config suffice?",
+    )
+    return field
+
+
+def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
+    """Every step is told, in order; saves come when due, hold the field, and no others come."""
+    total = config.steps
+    due = sorted({1, total // 2, total})
+    report = Recorder(due)
+    _train(backend, field, rgbd_views(), config, report, "")
+    who = f"{_name(backend)}.train"
+    told = [(progress.step, progress.total) for progress in report.steps]
+    require(
+        told == [(i + 1, total) for i in range(total)],
+        f"{who}: report.step was told of {_shortly(told)}, expected (1, {total}) to ({total}, {total}), one a step",
+    )
+    odd = [p for p in report.steps if not (math.isfinite(p.loss) and math.isfinite(p.psnr))]
+    require(not odd, f"{who}: reported a loss or PSNR that is not finite: {odd[:1]}")
+    saved = [state.step for state in report.saved]
+    require(
+        saved == due,
+        f"{who}: saved after steps {saved}, expected {due}: whenever report.due(step) says so, and only then",
+    )
+    _require_same(
+        report.saved[-1].field,
+        _state_of(field),
+        f"{who}: the state saved after the last step is not that of the trained field",
+    )
+
+
+def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: Any) -> None:
+    """Stopped in the middle, with ``TrainingStopped``, and gone on with, a training arrives at the same bits."""
+    who, middle = f"{_name(backend)}.train", config.steps // 2
+    first, second, third = make(), make(), make()
+    beginning = stored(_state_of(first))
+    _train(backend, first, rgbd_views(), config, Recorder(), "")
+    for field in (second, third):  # that builds differ is told elsewhere
+        _module(field).load_state_dict(beginning)
+    report = Recorder(stop=middle)
+    try:
+        _train(backend, second, rgbd_views(), config, report, "")
+    except TrainingStopped as stopped:
+        require(
+            stopped.step == middle,
+            f"{who}: TrainingStopped says step {stopped.step}, but report.stopping was set after step {middle}",
+        )
+    else:
+        raise AssertionError(
+            f"{who}: did not stop when report.stopping was set after step {middle}, expected TrainingStopped"
+        )
+    saved = [state.step for state in report.saved]
+    require(
+        saved == [middle],
+        f"{who}: when stopped after step {middle}, saved after steps {saved}, expected [{middle}]",
+    )
+    rest = Recorder(state=report.saved[0])
+    _train(backend, third, rgbd_views(), config, rest, "resumed")
+    told = [progress.step for progress in rest.steps]
+    require(
+        told == list(range(middle + 1, config.steps + 1)),
+        f"{who}: resumed after step {middle}, it told of steps {_shortly(told)}, expected {middle + 1} to {config.steps}",
+    )
+    _require_same(
+        _state_of(third),
+        _state_of(first),
+        f"{who}: a resumed training arrives elsewhere than an uninterrupted one, expected the same bits; is all state in"
+        " state_dict, and all chance from the generator that is saved?",
+    )
+
+
+def colour_error(field: RadianceField) -> float:
+    """Mean squared error of colour over all pixels of the training views."""
+    with torch.no_grad(), telling(f"render by {type(field).__name__}"):
+        found = [
+            render(field, camera_rays(view.T_ref_camera.to(torch.float32)), BOUNDS.background).rgb
+            for view in rgbd_views()
+        ]
+    seen = torch.cat([view.frame.rgb.reshape(-1, 3) for view in rgbd_views()])
+    return float((torch.cat(found) - seen).square().mean())
+
+
+def _train(
+    backend: Backend, field: RadianceField, views: Sequence[View], config: Any, report: Recorder, how: str
+) -> None:
+    try:
+        with telling(f"{_name(backend)}.train {how}".rstrip()):
+            backend.train(field, views, config, report)
+    except AssertionError as error:
+        if isinstance(error.__cause__, TrainingStopped):
+            raise error.__cause__ from None
+        raise
+
+
+def _require_same(found: dict[str, Tensor], expected: dict[str, Tensor], fault: str) -> None:
+    require(
+        found.keys() == expected.keys(),
+        f"{fault}: the tensors are {sorted(found)}, expected {sorted(expected)}",
+    )
+    for name, value in expected.items():
+        require(torch.equal(found[name].cpu(), value.detach().cpu()), f"{fault} (tensor {name!r} differs)")
+
+
+def _state_of(field: RadianceField) -> dict[str, Tensor]:
+    return dict(_module(field).state_dict())
+
+
+def _module(field: RadianceField) -> nn.Module:
+    require(isinstance(field, nn.Module), f"the field is a {type(field).__name__}, expected an nn.Module")
+    assert isinstance(field, nn.Module)
+    return field
+
+
+def _name(backend: Backend) -> str:
+    return type(backend).__name__
+
+
+def _shortly(items: list[Any]) -> str:
+    return (
+        str(items) if len(items) <= 4 else f"[{items[0]}, {items[1]}, ... {items[-1]}] ({len(items)} in all)"
+    )

@@ -1,0 +1,130 @@
+"""Laws of a field's sampler, and of what is rendered with it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Generator, Tensor
+
+from bidnerf_core.field import RadianceField, Rays, RaySamples
+from bidnerf_core.rendering import Rendering, render
+from bidnerf_core.testing.faults import require, sample, telling
+from bidnerf_core.testing.scene import SIDE, awkward_rays, joined, picked
+from bidnerf_core.testing.values import close
+
+SLACK = 1e-4 * SIDE  # metres: what rounding may do to a distance
+BACKGROUND = (0.1, 0.5, 0.9)
+
+
+def check_intervals(field: RadianceField) -> None:
+    """Valid samples are sorted, disjoint and within [near, far]; rays that miss have none; zero rays are fine."""
+    for of, rays in awkward_rays().items():
+        for jitter, how in ((None, ""), (_generator(), " with jitter")):
+            _check_order(field, rays, sample(field, rays, of + how, jitter), of + how)
+    every = awkward_rays()["rays from outside"]
+    for shape in ((), (1,), (2, 3), (0,), (2, 0)):
+        count = torch.Size(shape).numel()
+        sample(field, picked(every, torch.arange(count).reshape(shape)), f"rays arranged as {shape}")
+
+
+def _check_order(field: RadianceField, rays: Rays, samples: RaySamples, of: str) -> None:
+    who = f"sampler {type(field.sampler).__name__} of {of}"
+    starts, ends, valid = samples.starts, samples.ends, samples.valid
+    finite = bool((starts.isfinite() & ends.isfinite()).all())
+    require(
+        finite, f"{who}: starts or ends are NaN or infinite; expected finite numbers, also where not valid"
+    )
+    require(
+        bool((starts <= ends + SLACK)[valid].all()),
+        f"{who}: an interval ends before it starts, or is not sorted",
+    )
+    reached = torch.where(valid, ends, -torch.inf).cummax(-1).values if starts.shape[-1] else ends
+    overlap = (starts[..., 1:] < reached[..., :-1] - SLACK) & valid[..., 1:]
+    require(
+        not bool(overlap.any()), f"{who}: valid intervals overlap or are not sorted, expected nearest first"
+    )
+    within = (starts >= rays.near[..., None] - SLACK) & (ends <= rays.far[..., None] + SLACK)
+    require(bool(within[valid].all()), f"{who}: a valid interval lies outside [near, far] of its ray")
+    missed = rays.far <= rays.near
+    require(not bool(valid[missed].any()), f"{who}: a ray with far <= near has valid samples, expected none")
+
+
+def check_repeatable(field: RadianceField) -> None:
+    """The same samples each time without jitter; with it, the same for the same seed of the given generator."""
+    rays = joined(list(awkward_rays().values()))
+    who = f"sampler {type(field.sampler).__name__}"
+    with torch.random.fork_rng(devices=[]):
+        twice = [sample(field, rays, "rays") for _ in range(2)]
+        require(
+            _same(*twice), f"{who}: two calls without jitter differ, expected no chance without a generator"
+        )
+        jittered = [sample(field, rays, "rays with jitter", _generator()) for _ in range(2)]
+    require(
+        _same(*jittered),
+        f"{who}: two calls with jitter of the same seed differ, expected all chance to come from the given generator",
+    )
+
+
+def check_rays_alone(field: RadianceField) -> None:
+    """What a ray sees does not depend on the rays beside it, nor on how they are arranged."""
+    rays = joined(list(awkward_rays().values()))
+    count = len(rays.near) // 4 * 4
+    whole = seen(field, picked(rays, torch.arange(count)), "rays")
+    order = torch.randperm(count, generator=_generator())
+    permuted = seen(field, picked(rays, order.reshape(4, -1)), "rays in another order").reshape(-1, 5)
+    alone = torch.cat(
+        [seen(field, picked(rays, torch.arange(i, i + 1)), "a ray") for i in range(0, count, 7)]
+    )
+    who = f"{type(field).__name__} rendered"
+    expected = "expected each ray to be sampled for itself"
+    require(
+        close(permuted, whole[order], 1e-3), f"{who}: rays in another order see something else; {expected}"
+    )
+    require(
+        close(alone, whole[::7], 1e-3),
+        f"{who}: a ray alone sees something else than among others; {expected}",
+    )
+
+
+def check_background(field: RadianceField) -> None:
+    """A ray that misses the scene sees the background and nothing else."""
+    found = seen(field, awkward_rays()["rays that miss the scene"], "rays that miss the scene")
+    require(
+        close(found, torch.tensor([*BACKGROUND, 0.0, 0.0]).expand_as(found)),
+        f"{type(field).__name__} rendered: a ray with far <= near does not see the background alone; is a sample valid"
+        " there?",
+    )
+
+
+def check_levels(field: RadianceField) -> None:
+    """Each level is a field, coarsest first; the last one is the field as it renders itself."""
+    offered = tuple(getattr(field, "levels", None) or (field,))
+    for number, level in enumerate(offered):
+        require(
+            isinstance(level, RadianceField),
+            f"levels[{number}] is a {type(level).__name__}, expected a field: an object with sampler and query",
+        )
+    rays = joined(list(awkward_rays().values()))
+    require(
+        close(seen(offered[-1], rays, "rays"), seen(field, rays, "rays"), 1e-3),
+        f"{type(field).__name__}.levels: the last one renders otherwise than the field itself; expected the coarsest"
+        " first and the field itself last",
+    )
+
+
+def seen(field: RadianceField, rays: Rays, of: str) -> Tensor:
+    """Colour, distance and opacity as five channels (*r 5)."""
+    with telling(f"render of {of} by {type(field).__name__}"), torch.no_grad():
+        rendering: Rendering = render(field, rays, BACKGROUND)
+    channels = [rendering.rgb, rendering.distance[..., None], rendering.opacity[..., None]]
+    return torch.cat(channels, dim=-1)
+
+
+def _same(a: RaySamples, b: RaySamples) -> bool:
+    def equal(x: Tensor, y: Tensor) -> bool:
+        return x.shape == y.shape and bool((x == y).all())
+
+    return equal(a.starts, b.starts) and equal(a.ends, b.ends) and equal(a.valid, b.valid)
+
+
+def _generator() -> Generator:
+    return torch.Generator().manual_seed(3)

@@ -1,0 +1,93 @@
+"""What a backend under test is shown: a tiny closed-form scene, and rays and points of every awkward kind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.closed_form import views as seen_from
+from bidnerf_core.field import Rays, widened
+from bidnerf_core.frames import View
+from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.se3 import SE3
+
+SIZE = 24
+CAMERA = Intrinsics(32.0, 32.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
+BOUNDS = demo_object().bounds
+SIDE = max(BOUNDS.size)  # metres
+
+
+@cache
+def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
+    """A toy from six sides with exact depth, as an object without background or, as a sensor sees it, before white."""
+    seen = seen_from(demo_object(), CAMERA, orbit(3.5, 6))
+    return tuple(v if coverage else replace(v, frame=replace(v.frame, alpha=None)) for v in seen)
+
+
+@cache
+def rgb_views() -> tuple[View, ...]:
+    """The same before white, without depth."""
+    return tuple(replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views(coverage=False))
+
+
+def camera_rays(T_world_camera: SE3) -> Rays:
+    """Rays through all pixels; differentiable in the pose, and in its precision."""
+    pixels = CAMERA.unproject(CAMERA.pixel_centres()).reshape(-1, 3).to(T_world_camera.translation)
+    directions = T_world_camera.rotate(torch.nn.functional.normalize(pixels, dim=-1))
+    return BOUNDS.rays(T_world_camera.translation.expand_as(directions), directions)
+
+
+def points(count: int, seed: int = 0) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Random positions within the box, and random unit directions."""
+    generator = torch.Generator().manual_seed(seed)
+    lower, size = torch.tensor(BOUNDS.lower), torch.tensor(BOUNDS.size)
+    return lower + size * torch.rand((count, 3), generator=generator), _directions(count, generator)
+
+
+def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
+    """Positions at which careless fields index out of range or overflow."""
+    lower, upper = torch.tensor(BOUNDS.lower), torch.tensor(BOUNDS.upper)
+    share = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
+    middle, corners = (lower + upper) / 2, lower + share * (upper - lower)
+    return {
+        "points within the box": points(256)[0],
+        "corners of the box": corners,
+        "points just outside the box": middle + (corners - middle) * (1 + 1e-6),
+        "points far outside the box": middle + (corners - middle) * 1e3 + SIDE,
+    }
+
+
+def awkward_rays() -> dict[str, Rays]:
+    """Rays of kinds that a sampler meets in localization."""
+    middle = (torch.tensor(BOUNDS.lower) + torch.tensor(BOUNDS.upper)) / 2
+    inside, away = points(24)
+    outside = middle - 2 * SIDE * away
+    across = torch.nn.functional.normalize(away + 0.3 * away.roll(1, 0), dim=-1)
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    return {
+        "rays from outside": BOUNDS.rays(outside, across),
+        "rays from within the box": BOUNDS.rays(inside, away),
+        "rays along the axes": BOUNDS.rays(middle - 2 * SIDE * axes + 0.1 * SIDE * axes.roll(1, -1), axes),
+        "rays that are sampled twice as far": widened(BOUNDS.rays(outside, away), 2.0),
+        "rays that miss the scene": BOUNDS.rays(outside, -away),
+    }
+
+
+def picked(rays: Rays, index: Tensor) -> Rays:
+    """Rays by their number, in the shape of ``index``."""
+    return Rays(rays.origins[index], rays.directions[index], rays.near[index], rays.far[index])
+
+
+def joined(parts: list[Rays]) -> Rays:
+    names = ("origins", "directions", "near", "far")
+    return Rays(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+
+def _directions(count: int, generator: Generator) -> Float[Tensor, "n 3"]:
+    return torch.nn.functional.normalize(torch.randn((count, 3), generator=generator), dim=-1)

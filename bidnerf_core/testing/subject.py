@@ -1,0 +1,105 @@
+"""What is under test: a backend, its config, and fields that are built and trained with them."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar
+
+import torch
+from torch import nn
+
+from bidnerf_core.field import RadianceField, levels
+from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.registry import load_backend
+from bidnerf_core.testing import recipes
+from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.scene import BOUNDS, points, rgbd_views
+
+STEPS = 40
+"""Length of a training where the test gives no ``config``."""
+
+
+class Subject:
+    """Says which backend, and makes fields of it."""
+
+    backend: ClassVar[Any] = None
+    name: ClassVar[str | None] = None
+    config: ClassVar[Any] = None
+
+    def _backend(self) -> Any:
+        if self.name is not None:
+            return load_backend(self.name)
+        require(
+            self.backend is not None,
+            f"{type(self).__name__} has neither backend nor name, expected one of them",
+        )
+        return self.backend
+
+    def _config(self) -> Any:
+        if self.config is not None:
+            return self.config
+        return dataclasses.replace(self._backend().config_type(), steps=STEPS)
+
+    def _reread(self, config: Any) -> Any:
+        """The config as a map on disk gives it back."""
+        with telling(f"{type(config).__name__} to JSON and back"):
+            text = json.dumps(to_plain(config, "config"), allow_nan=False)
+            return from_plain(self._backend().config_type, json.loads(text), "config")
+
+    def _build(self, config: Any = None) -> Any:
+        with telling(f"{called(self._backend())}.build"):
+            return self._backend().build(self._config() if config is None else config, BOUNDS)
+
+    def _trained(self) -> Any:
+        """A field after training on RGB-D views, frozen as a loaded map's; made once for each class of tests."""
+        kept = type(self).__dict__.get("_kept")
+        if kept is None:
+            kept = self._build()
+            with telling(f"{called(self._backend())}.train"):
+                self._backend().train(kept, rgbd_views(), self._config(), recipes.Recorder())
+            type(self)._kept = frozen(kept)  # type: ignore[attr-defined]
+        return type(self).__dict__["_kept"]
+
+    def _fields(self) -> Iterator[Any]:
+        yield frozen(self._build())
+        yield self._trained()
+
+    def _each(self, check: Callable[[RadianceField], None]) -> None:
+        """At all levels, untrained and trained."""
+        for field in self._fields():
+            for level in levels(field):
+                check(level)
+
+
+def frozen(field: Any) -> Any:
+    return field.requires_grad_(False).eval() if isinstance(field, nn.Module) else field
+
+
+def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
+    """A copy in float64 where the field has one, and its dtype; else the field itself."""
+    try:
+        doubled = copy.deepcopy(field)
+        _double(doubled)
+        positions, directions = (x.double() for x in points(2))
+        if query(doubled, positions, directions, "points").density.dtype == torch.float64:
+            return doubled, torch.float64
+    except Exception:  # told by the test of dtypes
+        pass
+    return field, torch.float32
+
+
+def _double(field: Any) -> None:
+    """In place; a level that is no module moves the modules that it holds."""
+    if isinstance(field, nn.Module):
+        field.double()
+    else:
+        for part in vars(field).values():
+            if isinstance(part, nn.Module):
+                part.double()
+
+
+def called(backend: Any) -> str:
+    return type(backend).__name__

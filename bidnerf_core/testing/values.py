@@ -1,0 +1,104 @@
+"""Laws of ``RadianceField.query``: shapes, ranges, and that an answer depends on nothing but the question."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.field import FieldValues, RadianceField
+from bidnerf_core.testing.faults import query, require
+from bidnerf_core.testing.scene import awkward_points, points
+
+SHAPES = ((), (7,), (1,), (2, 3), (2, 1, 3), (0,), (2, 0), (0, 3))
+THREADS, ROUNDS = 4, 8
+
+
+def check_shapes(field: RadianceField) -> None:
+    """Any leading axes, also no points at all; the same values however the points are arranged."""
+    positions, directions = points(7)
+    flat = stacked(query(field, positions, directions, "7 points"))
+    for shape in SHAPES:
+        count = torch.Size(shape).numel()
+        places, towards = (x[:count].reshape(*shape, 3) for x in (positions, directions))
+        values = stacked(query(field, places, towards, f"points arranged as {shape}"))
+        require(
+            close(values.reshape(-1, 4), flat[:count]),
+            f"{type(field).__name__}.query: points arranged as {shape} have other values than the same points in"
+            " one row; expected each point's value to depend on that point alone",
+        )
+
+
+def check_ranges(field: RadianceField) -> None:
+    """Finite everywhere; density >= 0; rgb in [0, 1]."""
+    for of, positions in awkward_points().items():
+        directions = points(len(positions), seed=1)[1]
+        values = query(field, positions, directions, of)
+        who = f"{type(field).__name__}.query of {of}"
+        for what, found in (("density", values.density), ("rgb", values.rgb)):
+            require(
+                bool(found.isfinite().all()), f"{who}: {what} is NaN or infinite, expected finite numbers"
+            )
+        low, high = float(values.rgb.min()), float(values.rgb.max())
+        least = float(values.density.min())
+        require(
+            least >= 0, f"{who}: density is {least:g}, expected 0 or more; end with softplus, relu or exp"
+        )
+        require(
+            low >= 0 and high <= 1,
+            f"{who}: rgb is from {low:g} to {high:g}, expected 0 to 1; end with a sigmoid",
+        )
+
+
+def check_precision(field: RadianceField, doubled: RadianceField) -> None:
+    """``field`` moved to float64 computes in it, and computes the same. ``doubled`` is the moved copy."""
+    positions, directions = points(64)
+    expected = query(field, positions, directions, "points in float32")
+    found = query(doubled, positions.double(), directions.double(), "points in float64, after .double()")
+    for what in ("density", "rgb"):
+        single, double = getattr(expected, what), getattr(found, what)
+        who = f"{type(field).__name__}.query after .double(): {what}"
+        require(
+            single.dtype == torch.float32,
+            f"{type(field).__name__}.query: {what} is {single.dtype} for points in float32, expected float32",
+        )
+        require(
+            double.dtype == torch.float64,
+            f"{who} is {double.dtype}, expected float64; make constants with positions.new_tensor or as buffers",
+        )
+        require(
+            close(double.float(), single, 1e-2),
+            f"{who} is another than in float32, expected the same to rounding",
+        )
+
+
+def check_threads(field: RadianceField) -> None:
+    """Several threads that ask at once are told what one is told."""
+    parts = [points(200 + 31 * i, seed=i) for i in range(THREADS)]
+    alone = [stacked(query(field, *part, "points")) for part in parts]
+
+    def ask(number: int) -> Tensor:
+        part = parts[number % THREADS]
+        return stacked(query(field, *part, "points, by several threads at once"))
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        answers = list(pool.map(ask, range(THREADS * ROUNDS)))
+    require(
+        all(close(answer, alone[i % THREADS]) for i, answer in enumerate(answers)),
+        f"{type(field).__name__}.query: several threads that ask at once get other values than one; expected query"
+        " to keep nothing on self",
+    )
+
+
+def stacked(values: FieldValues) -> Tensor:
+    """Density and colour as four channels (*p 4)."""
+    return torch.cat([values.density[..., None], values.rgb], dim=-1).detach()
+
+
+def close(found: Tensor, expected: Tensor, tolerance: float = 1e-4) -> bool:
+    """Equal to rounding, relative to the largest value of each channel."""
+    if expected.numel() == 0:
+        return found.shape == expected.shape
+    scale = expected.abs().reshape(-1, expected.shape[-1]).amax(0).clamp(min=1e-6)
+    return bool(((found - expected).abs() <= tolerance * scale).all())

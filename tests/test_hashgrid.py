@@ -1,0 +1,377 @@
+"""The hash-grid field and its occupancy grid."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+import tiny
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
+from bidnerf_core.rendering import render
+from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
+from bidnerf_hashgrid.encoding import HashEncodingConfig
+from bidnerf_hashgrid.occupancy import OccupancyGrid
+
+BOUNDS = SceneBounds((-1.2, -0.4, 0.1), (0.8, 0.7, 1.3), 0.1, 8.0, (0.3, 0.6, 0.9))
+RESOLUTION = 12
+
+# The occupancy grid as a sampler.
+
+
+def grid_of(occupied: Tensor, steps_per_cell: int = 2) -> OccupancyGrid:
+    """Exactly these cells, and no margin about them."""
+    grid = OccupancyGrid(BOUNDS, occupied.shape[0], steps_per_cell)
+    grid.peak.copy_(occupied)
+    grid.prune(0.5, grow=False)
+    assert torch.equal(grid.occupied, occupied)
+    return grid
+
+
+def random_cells(share: float, seed: int) -> Tensor:
+    return torch.rand((RESOLUTION,) * 3, generator=torch.Generator().manual_seed(seed)) < share
+
+
+def random_rays(count: int = 300, seed: int = 0) -> Rays:
+    """Float64, from outside and inside of the box, most but not all meeting it, some along the axes."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.randn((count, 3), generator=generator, dtype=torch.float64) * 1.5
+    targets = torch.rand((count, 3), generator=generator, dtype=torch.float64) * 2 - 1
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    directions[:9] = torch.eye(3, dtype=torch.float64).repeat(3, 1)
+    directions[3:6] *= -1
+    rays = BOUNDS.rays(origins, directions)
+    assert 0.1 < (rays.far > rays.near).double().mean() < 1
+    return rays
+
+
+def marched(grid: OccupancyGrid, rays: Rays, offset: Tensor) -> list[Tensor]:
+    """Distances of the occupied steps of each ray, found by looking at every one."""
+    found = []
+    for i in range(len(rays.near)):
+        near, far = float(rays.near[i]), float(rays.far[i])
+        steps = torch.arange(int(max(0.0, far - near) / grid.step) + 2, dtype=torch.float64)
+        distance = near + (steps + offset[i]) * grid.step
+        distance = distance[distance < far]
+        positions = rays.origins[i] + distance[:, None] * rays.directions[i]
+        cells = ((positions - grid.lower.double()) / grid.side * grid.resolution).floor().long()
+        x, y, z = cells.clamp(0, grid.resolution - 1).unbind(-1)
+        found.append(distance[grid.occupied[x, y, z]])
+    return found
+
+
+@pytest.mark.parametrize("steps_per_cell", [1, 2, 3])
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.03, 0.4, 1.0])
+@pytest.mark.parametrize("jitter", [False, True])
+def test_skipping_blocks_loses_no_sample(share: float, steps_per_cell: int, jitter: bool) -> None:
+    grid, rays = grid_of(random_cells(share, seed=3), steps_per_cell), random_rays()
+    offset, generator = torch.full_like(rays.near, 0.5), None
+    if jitter:
+        offset = torch.rand(rays.near.shape, generator=torch.Generator().manual_seed(7)).double()
+        generator = torch.Generator().manual_seed(7)
+    samples = grid(rays, generator)
+    expected = marched(grid, rays, offset)
+    assert torch.equal(samples.valid.sum(-1), torch.tensor([len(distances) for distances in expected]))
+    half, near, far = grid.step / 2, rays.near[:, None], rays.far[:, None]
+    every = torch.nn.utils.rnn.pad_sequence(expected, batch_first=True)
+    torch.testing.assert_close(
+        samples.starts[samples.valid], torch.maximum(every - half, near)[samples.valid], atol=1e-9, rtol=0
+    )
+    torch.testing.assert_close(
+        samples.ends[samples.valid], torch.minimum(every + half, far)[samples.valid], atol=1e-9, rtol=0
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("jitter", [False, True])
+def test_samples_are_sorted_disjoint_and_within_the_limits(jitter: bool, dtype: torch.dtype) -> None:
+    rays = random_rays()
+    rays = Rays(*(part.to(dtype) for part in (rays.origins, rays.directions, rays.near, rays.far)))
+    samples = grid_of(random_cells(0.3, seed=0))(rays, torch.Generator().manual_seed(0) if jitter else None)
+    assert samples.starts.dtype == samples.ends.dtype == dtype
+    assert bool((samples.valid.long().diff(dim=-1) <= 0).all())  # valid ones first
+    tolerance = 8 * torch.finfo(dtype).eps * 8.0
+    both = samples.valid[:, 1:]
+    assert bool((samples.ends >= samples.starts)[samples.valid].all())
+    assert bool((samples.starts[:, 1:] >= samples.ends[:, :-1] - tolerance)[both].all())
+    assert bool((samples.starts >= rays.near[:, None])[samples.valid].all())
+    assert bool((samples.ends <= rays.far[:, None])[samples.valid].all())
+
+
+def test_samples_are_in_occupied_cells() -> None:
+    """But for those that the limits cut short: their middles move by up to a quarter of a step."""
+    grid, rays = grid_of(random_cells(0.2, seed=1)), random_rays()
+    samples = grid(rays)
+    whole = samples.valid & (samples.ends - samples.starts > grid.step * 0.999)
+    assert whole.sum() > 0.9 * samples.valid.sum()
+    cells = ((rays.at(samples.middles)[whole] - grid.lower.double()) / grid.side * grid.resolution).long()
+    assert bool(grid.occupied[tuple(cells.unbind(-1))].all())
+
+
+def test_samples_repeat_without_jitter_and_with_the_same_one() -> None:
+    grid, rays = grid_of(random_cells(0.2, seed=1)), random_rays()
+    for first, second in (
+        (grid(rays), grid(rays)),
+        (grid(rays, torch.Generator().manual_seed(5)), grid(rays, torch.Generator().manual_seed(5))),
+    ):
+        assert torch.equal(first.starts, second.starts)
+        assert torch.equal(first.valid, second.valid)
+    other = grid(rays, torch.Generator().manual_seed(6))
+    assert other.starts.shape != grid(rays).starts.shape or not torch.equal(other.starts, grid(rays).starts)
+
+
+@pytest.mark.parametrize("shape", [(0,), (2, 0), (0, 3)])
+def test_no_rays_have_no_samples(shape: tuple[int, ...]) -> None:
+    rays = BOUNDS.rays(torch.zeros((*shape, 3)), torch.zeros((*shape, 3)))
+    samples = grid_of(random_cells(0.2, seed=1))(rays)
+    assert samples.valid.shape == (*shape, 0)
+
+
+def test_rays_that_miss_have_no_samples() -> None:
+    rays = random_rays()
+    missing = rays.far <= rays.near
+    samples = grid_of(random_cells(1.0, seed=0))(rays)
+    assert torch.equal(samples.valid.any(-1), ~missing)
+    alone = grid_of(random_cells(1.0, seed=0))(
+        Rays(rays.origins[missing], rays.directions[missing], rays.near[missing], rays.far[missing])
+    )
+    assert alone.valid.shape == (int(missing.sum()), 0)
+
+
+def test_leading_axes_of_rays_do_not_matter() -> None:
+    grid, rays = grid_of(random_cells(0.2, seed=1)), random_rays()
+    folded = Rays(
+        rays.origins.reshape(3, 20, 5, 3), rays.directions.reshape(3, 20, 5, 3), rays.near.reshape(3, 20, 5),
+        rays.far.reshape(3, 20, 5),
+    )  # fmt: skip
+    found, expected = grid(folded), grid(rays)
+    assert torch.equal(found.starts.reshape(300, -1), expected.starts)
+    assert torch.equal(found.valid.reshape(300, -1), expected.valid)
+
+
+@dataclass(frozen=True, eq=False)
+class Clouds:
+    """Matter in the occupied cells of a grid, nothing elsewhere; another colour everywhere."""
+
+    grid: OccupancyGrid
+    sampler: RaySampler
+
+    def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
+        cells = ((positions - self.grid.lower.to(positions)) / self.grid.side * self.grid.resolution).long()
+        inside = self.grid.occupied[tuple(cells.clamp(0, RESOLUTION - 1).unbind(-1))]
+        density = torch.where(inside, 4 + 3 * torch.sin(7 * positions).sum(-1), 0)
+        return FieldValues(density.clamp(min=0), 0.5 + 0.5 * torch.sin(5 * positions))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_leaving_out_empty_cells_changes_no_image(seed: int) -> None:
+    cells = random_cells(0.4, seed)
+    centres, margin = OccupancyGrid(BOUNDS, RESOLUTION).centres(), max(BOUNDS.size) / RESOLUTION
+    lower, upper = torch.tensor(BOUNDS.lower) + margin, torch.tensor(BOUNDS.upper) - margin
+    cells &= ((centres > lower) & (centres < upper)).all(-1)  # what the limits cut short is at the border
+    sparse, full, rays = grid_of(cells), grid_of(torch.ones_like(cells)), random_rays(600)
+    outside = rays.near > BOUNDS.near
+    rays = Rays(rays.origins[outside], rays.directions[outside], rays.near[outside], rays.far[outside])
+    jitter = torch.Generator().manual_seed(seed)
+    state = jitter.get_state()
+    found = render(Clouds(sparse, sparse), rays, BOUNDS.background, jitter)
+    jitter.set_state(state)
+    expected = render(Clouds(sparse, full), rays, BOUNDS.background, jitter)
+    assert found.samples.valid.sum() < 0.4 * expected.samples.valid.sum()
+    assert 0.1 < expected.opacity.mean() < 0.9
+    for name in ("rgb", "distance", "opacity"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=1e-9, rtol=1e-9)
+
+
+# What the grid takes note of.
+
+
+def test_a_new_grid_holds_everything() -> None:
+    grid = OccupancyGrid(BOUNDS, RESOLUTION)
+    assert bool(grid.occupied.all())
+    assert bool(grid.near_occupied.all())
+
+
+def test_peaks_rise_at_once_fade_when_visited_and_stay_when_not() -> None:
+    grid = grid_of(torch.zeros((RESOLUTION,) * 3, dtype=torch.bool))
+    grid.peak.fill_(0.5)
+    here, there = grid.centres()[3, 4, 5], grid.centres()[6, 7, 8]
+    grid.observe(torch.stack([here, there, here, here]), torch.tensor([0.1, 0.9, 0.2, 0.0]), fade=0.8)
+    assert float(grid.peak[3, 4, 5]) == pytest.approx(0.4)
+    assert float(grid.peak[6, 7, 8]) == pytest.approx(0.9)
+    assert int((grid.peak != 0.5).sum()) == 2
+    grid.observe(here[None], torch.tensor([0.35]), fade=0.8)
+    assert float(grid.peak[3, 4, 5]) == pytest.approx(0.35)
+    before = grid.peak.clone()
+    grid.observe(torch.zeros(0, 3), torch.zeros(0), fade=0.8)
+    assert torch.equal(grid.peak, before)
+
+
+def test_pruning_keeps_what_has_weight_and_its_neighbours_while_surfaces_may_move() -> None:
+    grid = OccupancyGrid(BOUNDS, RESOLUTION)
+    grid.peak.zero_()
+    grid.peak[0, 5, 11] = 0.3
+    grid.peak[6, 6, 6] = 0.1
+    grid.prune(0.2, grow=False)
+    assert grid.occupied.nonzero().tolist() == [[0, 5, 11]]
+    grid.prune(0.2)
+    near = (grid.occupied.nonzero() - torch.tensor([0, 5, 11])).abs()
+    assert len(near) == 2 * 3 * 2  # at a border on two sides
+    assert int(near.max()) == 1
+    grid.prune(0.3)
+    assert not grid.occupied.any()
+    assert not grid.near_occupied.any()
+
+
+def test_restricting_empties_what_is_not_allowed_for_good() -> None:
+    grid = OccupancyGrid(BOUNDS, RESOLUTION)
+    allowed = torch.zeros((RESOLUTION,) * 3, dtype=torch.bool)
+    allowed[2:5, 3:6, 4:7] = True
+    grid.restrict(allowed)
+    assert torch.equal(grid.peak > 0, allowed)
+    margin = torch.zeros_like(allowed)
+    margin[1:6, 2:7, 3:8] = True
+    assert torch.equal(grid.occupied, margin)
+    grid.prune(0.01)
+    assert torch.equal(grid.occupied, margin)
+
+
+def test_what_is_derived_from_the_occupancy_is_brought_up_to_date_on_loading() -> None:
+    sparse, fresh = grid_of(random_cells(0.01, seed=0)), OccupancyGrid(BOUNDS, RESOLUTION)
+    fresh.load_state_dict(sparse.state_dict())
+    assert torch.equal(fresh.near_occupied, sparse.near_occupied)
+    assert not fresh.near_occupied.all()
+
+
+# The field.
+
+
+@pytest.fixture(scope="module")
+def field() -> HashGridField:
+    """Float64, with features and density of order one, and with more detail at finer levels."""
+    config = tiny.config(encoding=HashEncodingConfig(4, 2, 9, 4, 32), coarse_levels=2)
+    made = backend.build(config, BOUNDS).double()
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for table in made.encoding.tables:
+            table.copy_(torch.randn(table.shape, generator=generator, dtype=torch.float64))
+    return made
+
+
+def random_points(shape: tuple[int, ...], seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Positions in the box, and directions."""
+    generator = torch.Generator().manual_seed(seed)
+    lower, size = torch.tensor(BOUNDS.lower), torch.tensor(BOUNDS.size)
+    positions = (lower + size * torch.rand((*shape, 3), generator=generator)).double()
+    directions = torch.randn((*shape, 3), generator=generator, dtype=torch.float64)
+    return positions, torch.nn.functional.normalize(directions, dim=-1)
+
+
+def test_levels_are_coarse_and_fine(field: HashGridField) -> None:
+    coarse, fine = field.levels
+    assert fine is field
+    assert isinstance(coarse, RadianceField)
+    assert coarse.sampler is field.coarse_sampler
+    assert coarse.sampler.resolution * 2 == field.sampler.resolution
+
+
+@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("shape", [(), (5,), (2, 3, 4), (0,), (3, 0)], ids=str)
+def test_values_have_the_shape_of_the_points_and_are_in_range(
+    shape: tuple[int, ...], level: int, field: HashGridField
+) -> None:
+    positions, directions = random_points(shape)
+    values = field.levels[level].query(positions, directions)
+    assert values.density.shape == shape
+    assert values.rgb.shape == (*shape, 3)
+    assert bool((values.density >= 0).all())
+    assert bool(((values.rgb >= 0) & (values.rgb <= 1)).all())
+    flat = field.levels[level].query(positions.reshape(-1, 3), directions.reshape(-1, 3))
+    torch.testing.assert_close(values.density.reshape(-1), flat.density)
+    torch.testing.assert_close(values.rgb.reshape(-1, 3), flat.rgb)
+
+
+def test_density_is_finite_whatever_the_network_says(field: HashGridField) -> None:
+    wild = copy.deepcopy(field)
+    with torch.no_grad():
+        for parameter in wild.geometry.parameters():
+            parameter.mul_(1e6)
+    values = wild.query(*random_points((200,)))
+    assert bool(values.density.isfinite().all())
+    assert bool((values.density >= 0).all())
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_derivatives_by_position_and_direction_are_the_slopes(level: int, field: HashGridField) -> None:
+    positions, directions = random_points((40,), seed=1)
+    weights = torch.linspace(0.5, 1.5, 40, dtype=torch.float64)
+
+    def value(moved: Tensor, turned: Tensor) -> Tensor:
+        values = field.levels[level].query(moved, turned)
+        return weights * (torch.log1p(values.density) + values.rgb @ torch.tensor([1.0, 2.0, -1.5]).double())
+
+    for which, point in enumerate((positions, directions)):
+        point = point.clone().requires_grad_()
+        arguments = [positions, directions]
+        arguments[which] = point
+        (found,) = torch.autograd.grad(value(*arguments).sum(), point)
+        assert float(found.abs().mean()) > 1e-2
+        for axis in range(3):
+            step = torch.zeros(3, dtype=torch.float64)
+            step[axis] = 1e-7
+            sides = []
+            for sign in (1, -1):
+                arguments[which] = point.detach() + sign * step
+                sides.append(value(*arguments).detach())
+            slope = (sides[0] - sides[1]) / 2e-7
+            torch.testing.assert_close(found[:, axis], slope, atol=1e-5, rtol=1e-5)
+
+
+def test_the_coarse_level_does_not_see_the_fine_tables(field: HashGridField) -> None:
+    points = random_points((50,))
+    other = copy.deepcopy(field)
+    with torch.no_grad():
+        for table in list(other.encoding.tables)[field.config.coarse_levels :]:
+            table.neg_()
+    assert torch.equal(other.levels[0].query(*points).density, field.levels[0].query(*points).density)
+    assert not torch.allclose(other.query(*points).density, field.query(*points).density)
+    loss = other.levels[0].query(*points).density.sum()
+    gradients = torch.autograd.grad(loss, list(other.encoding.tables), allow_unused=True)
+    assert [gradient is None for gradient in gradients] == [False, False, True, True]
+
+
+def test_the_coarse_level_is_smoother(field: HashGridField) -> None:
+    """Measured by how much the slope changes over a tenth of the scene, where the fine level has several cells."""
+    start, directions = random_points((300,), seed=2)
+    shift = torch.tensor([0.03, -0.02, 0.025], dtype=torch.float64) * field.side
+
+    def roughness(level: RadianceField) -> float:
+        a, b, c = (torch.log(level.query(start + k * shift, directions).density) for k in (-1, 0, 1))
+        return float((a - 2 * b + c).detach().abs().mean() / b.detach().std())
+
+    coarse, fine = field.levels
+    assert roughness(coarse) < 0.75 * roughness(fine)
+
+
+def test_a_scene_of_another_size_is_the_same_scene() -> None:
+    """With lengths in millimetres, an untrained field is as thick to the eye as in metres."""
+    opacity = []
+    for unit in (1.0, 1000.0):
+        scaled = SceneBounds(
+            tuple(unit * x for x in BOUNDS.lower), tuple(unit * x for x in BOUNDS.upper), unit * BOUNDS.near,
+            unit * BOUNDS.far,
+        )  # fmt: skip
+        made = backend.build(tiny.config(), scaled)
+        rays = random_rays()
+        moved = scaled.rays((rays.origins * unit).float(), rays.directions.float())
+        opacity.append(render(made, moved).opacity.detach())
+    torch.testing.assert_close(opacity[0], opacity[1], atol=2e-3, rtol=1e-2)
+
+
+def test_building_leaves_the_global_chance_alone() -> None:
+    state = torch.get_rng_state()
+    backend.build(HashGridConfig(encoding=tiny.ENCODING, grid_resolution=8), BOUNDS)
+    assert torch.equal(torch.get_rng_state(), state)

@@ -1,0 +1,125 @@
+"""Dataclasses to what JSON holds, and back."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.plain import from_plain, to_plain
+
+
+@dataclass(frozen=True)
+class Inner:
+    name: str = "x"
+    sizes: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if "!" in self.name:
+            raise InputError(f"name is {self.name}, expected no exclamation")
+
+
+@dataclass(frozen=True)
+class Outer:
+    need: int
+    rate: float = 0.5
+    flag: bool = True
+    kind: Literal["a", "b"] = "a"
+    maybe: int | None = None
+    either: int | float | str = 0
+    pair: tuple[float, str] = (1.0, "y")
+    bare: tuple = ()
+    inner: Inner = field(default_factory=Inner)
+    many: tuple[Inner, ...] = ()
+    rows: list[list[float]] = field(default_factory=list)
+    table: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    anything: Any = None
+    derived: int = field(default=0, init=False)
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+inners = st.builds(Inner, st.text(alphabet="abc"), st.lists(st.integers()).map(tuple))
+outers = st.builds(
+    Outer, st.integers(), finite, st.booleans(), st.sampled_from(["a", "b"]), st.none() | st.integers(),
+    st.integers() | finite | st.text(), st.tuples(finite, st.text()), st.lists(st.integers()).map(tuple), inners,
+    st.lists(inners, max_size=3).map(tuple), st.lists(st.lists(finite)),
+    st.dictionaries(st.text(), st.lists(st.integers()).map(tuple)), st.none() | st.booleans(),
+)  # fmt: skip
+
+
+@settings(max_examples=20)
+@given(outers)
+def test_through_json_and_back(value: Outer) -> None:
+    text = json.dumps(to_plain(value), allow_nan=False)
+    again = from_plain(Outer, json.loads(text), "here")
+    assert again == value
+    assert repr(again) == repr(value)  # which tells 1 from 1.0 and True
+
+
+def test_missing_keys_take_their_defaults_and_whole_numbers_serve_as_floats() -> None:
+    value = from_plain(Outer, {"need": 1, "rate": 2}, "here")
+    assert value == Outer(1, 2.0)
+    assert type(value.rate) is float
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "here: no 'need', expected all fields of Outer"),
+        ([], "here: found [], expected an object with the fields of Outer"),
+        ({"need": 1, "raet": 2}, "here: Outer has no field 'raet', did you mean 'rate'?"),
+        ({"need": 1, "derived": 2}, "here: Outer has no field 'derived', expected some of need, rate"),
+        ({"need": 1.5}, "here: need: found 1.5, expected int"),
+        ({"need": True}, "here: need: found True, expected int"),
+        ({"need": None}, "here: need: found None, expected int"),
+        ({"need": 1, "rate": "2"}, "here: rate: found '2', expected float"),
+        ({"need": 1, "rate": True}, "here: rate: found True, expected float"),
+        ({"need": 1, "rate": math.nan}, "here: rate: found nan, expected float"),
+        ({"need": 1, "rate": 10**400}, "expected float"),
+        ({"need": 1, "flag": 1}, "here: flag: found 1, expected bool"),
+        ({"need": 1, "kind": "c"}, "here: kind: found 'c', expected 'a' or 'b'"),
+        ({"need": 1, "maybe": "x"}, "here: maybe: found 'x', expected int or null"),
+        ({"need": 1, "pair": [1.0]}, "here: pair: found [1.0], expected tuple[float, str]"),
+        ({"need": 1, "pair": [1.0, 2]}, "here: pair: found 2, expected str"),
+        ({"need": 1, "inner": 3}, "here: inner: found 3, expected an object with the fields of Inner"),
+        ({"need": 1, "inner": {"name": "!"}}, "here: inner: name is !, expected no exclamation"),
+        ({"need": 1, "many": [{"sizes": ["x"]}]}, "here: many: sizes: found 'x', expected int"),
+        ({"need": 1, "table": {"k": [1.5]}}, "here: table.k: found 1.5, expected int"),
+        ({"need": "z" * 999}, "zzz..., expected int"),
+    ],
+    ids=lambda value: None if isinstance(value, str) else str(value)[:40],
+)
+def test_every_mistake_is_named(given: Any, message: str) -> None:
+    with pytest.raises(InputError) as error:
+        from_plain(Outer, given, "here")
+    assert message in str(error.value)
+    assert len(str(error.value)) < 250
+
+
+class Colour(Enum):
+    RED = 1
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (Outer(1, math.inf), "rate is inf, expected a finite number"),
+        (Outer(1, rows=[[0.0], [0.0, math.nan]]), "rows[1][1] is nan, expected a finite number"),
+        (Outer(1, anything=Path()), "anything is a PosixPath, expected what JSON can hold"),
+        (Outer(1, anything={"k": Colour.RED}), "anything.k is a Colour, expected what JSON can hold"),
+        (Outer(1, anything={1: 2}), "anything has the key 1, expected text"),
+    ],
+    ids=lambda value: None if isinstance(value, str) else "",
+)
+def test_what_json_cannot_hold_is_refused(value: Outer, message: str) -> None:
+    with pytest.raises(InputError) as error:
+        to_plain(value)
+    assert str(error.value) == message

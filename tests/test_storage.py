@@ -1,0 +1,299 @@
+"""Maps on disk: what is saved is what is loaded, and whenever writing stops, one whole map is there."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import tiny
+from bidnerf_core import storage
+from bidnerf_core.closed_fields import HomogeneousBall
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import SceneBounds
+from bidnerf_core.plain import to_plain
+from bidnerf_core.registry import load_backend
+from bidnerf_core.storage import (
+    MapInfo,
+    load_info,
+    load_map,
+    load_state,
+    save_map,
+    stored_cameras,
+    write_file,
+)
+from bidnerf_core.training import TrainingState
+from bidnerf_hashgrid import HashGridField, backend
+from tiny import backends_listed_once  # noqa: F401
+
+pytestmark = pytest.mark.usefixtures("backends_listed_once")
+
+BOUNDS = SceneBounds((-0.1, -1 / 3, -1.0), (1.0, 2 / 3, 1e-17), 0.1, 5.0, (1.0, 0.5, 0.0))
+
+
+CAMERAS = stored_cameras(tiny.views(2))
+
+
+def info(step: int = 5, complete: bool = False) -> MapInfo:
+    return MapInfo("hashgrid", to_plain(tiny.config()), BOUNDS, step, complete, "data", 1 / 3, CAMERAS)
+
+
+def field(seed: int) -> HashGridField:
+    """No two values alike, and an occupancy that no training would give."""
+    made = backend.build(tiny.config(seed=seed), BOUNDS)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for value in made.state_dict().values():
+            value.copy_(torch.rand(value.shape, generator=generator) > 0.5 if value.dtype == torch.bool
+                        else torch.randn(value.shape, generator=generator))  # fmt: skip
+    return made
+
+
+@functools.cache
+def state(step: int = 5) -> TrainingState:
+    """Another one for each step."""
+    moments = {
+        "generator": torch.Generator().manual_seed(step).get_state(),
+        "0.step": torch.tensor(float(step)),
+    }
+    return TrainingState(step, field(step).state_dict(), moments)
+
+
+def assert_equal(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert found[name].dtype == value.dtype
+        assert torch.equal(found[name], value), name
+
+
+def names(folder: Path) -> set[str]:
+    return {file.name for file in folder.iterdir()}
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None:
+    saved = save_map(tmp_path / "a" / "map", info(complete=complete), state())
+    assert replace(saved, weights="", training=None) == info(complete=complete)
+    assert load_info(tmp_path / "a" / "map") == saved
+    loaded = load_map(tmp_path / "a" / "map")
+    assert loaded.info == saved
+    assert loaded.bounds == BOUNDS
+    assert isinstance(loaded.field, nn.Module)
+    assert_equal(loaded.field.state_dict(), state().field)
+    assert not any(parameter.requires_grad for parameter in loaded.field.parameters())
+    assert not loaded.field.training
+    if complete:
+        with pytest.raises(InputError, match="complete"):
+            load_state(tmp_path / "a" / "map", saved, field(1))
+    else:
+        resumed = load_state(tmp_path / "a" / "map", saved, field(1))
+        assert resumed.step == 5
+        assert_equal(resumed.field, state().field)
+        assert_equal(resumed.optimizer, state().optimizer)
+
+
+def test_what_follows_from_the_occupancy_is_brought_up_to_date_on_loading(tmp_path: Path) -> None:
+    sparse = field(0)
+    sparse.sampler.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
+    save_map(tmp_path, info(), TrainingState(5, sparse.state_dict(), {}))
+    loaded = load_map(tmp_path).field
+    assert isinstance(loaded, HashGridField)
+    assert not loaded.sampler.near_occupied.any()
+    assert loaded.coarse_sampler.occupied.any()
+
+
+def test_views_of_shared_or_strided_memory_are_saved(tmp_path: Path) -> None:
+    tensors = dict(state().field)
+    weight = tensors["geometry.0.weight"]
+    tensors["geometry.0.weight"] = weight.t().contiguous().t()
+    save_map(tmp_path, info(), TrainingState(5, tensors, {}))
+    loaded = load_map(tmp_path).field
+    assert isinstance(loaded, nn.Module)
+    assert_equal(loaded.state_dict(), state().field)
+
+
+def test_nothing_on_disk_can_run(tmp_path: Path) -> None:
+    save_map(tmp_path, info(), state())
+    assert {file.suffix for file in tmp_path.iterdir()} == {".json", ".safetensors"}
+    (tmp_path / load_info(tmp_path).weights).write_bytes(b"\x80\x04.")  # a pickle
+    with pytest.raises(InputError, match="expected a safetensors file"):
+        load_map(tmp_path)
+
+
+def test_old_files_are_removed_and_others_are_left_alone(tmp_path: Path) -> None:
+    mine = ["weights-best.safetensors", "training-00000001-aaaaaaaa.txt", ".map.json.swp", "notes"]
+    stray = [".weights-00000004-0a1b2c3d.safetensors.0a1b2c3d", ".map.json.0a1b2c3d",
+             "training-00000004-0a1b2c3d.safetensors"]  # fmt: skip
+    for name in (*mine, *stray):
+        (tmp_path / name).touch()
+    save_map(tmp_path, info(step=5), state(5))
+    saved = save_map(tmp_path, info(step=6), state(6))
+    assert saved.training is not None
+    assert names(tmp_path) == {*mine, "map.json", saved.weights, saved.training}
+    done = save_map(tmp_path, info(step=7, complete=True), state(7))
+    assert names(tmp_path) == {*mine, "map.json", done.weights}
+
+
+# Whenever the writing stops, the folder holds one whole map.
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+class Stopped(BaseException):
+    """As Ctrl-C: no ``Exception``."""
+
+
+def outcomes(attempt: Callable[[], object], error: BaseException) -> Iterator[BaseException | None]:
+    """What ``attempt`` raises when ``error`` strikes in its first system call that writes, in its second ..., until
+    there is no such call left.
+    """
+    for number in itertools.count():
+        calls: list[object] = []
+        with pytest.MonkeyPatch.context() as patch:
+            for owner, name in ((Path, "open"), (Path, "replace"), (storage.os, "fsync")):
+                patch.setattr(owner, name, _striking(getattr(owner, name), calls, number, error))
+            try:
+                attempt()
+                raised = None
+            except (OSError, Stopped) as caught:
+                raised = caught
+        yield raised
+        if len(calls) <= number:
+            return
+
+
+def _striking(
+    call: Callable[..., Any], calls: list[object], number: int, error: BaseException
+) -> Callable[..., Any]:
+    def wrapper(*arguments: Any, **options: Any) -> Any:
+        if call.__name__ == "open" and "wb" not in arguments:
+            return call(*arguments, **options)
+        calls.append(call)
+        if len(calls) == number + 1:
+            raise error
+        return call(*arguments, **options)
+
+    return wrapper
+
+
+@pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])
+@pytest.mark.parametrize("complete", [True, False], ids=["complete", "checkpoint"])
+@pytest.mark.parametrize("before", [True, False], ids=["second save", "first save"])
+def test_a_save_that_stops_anywhere_leaves_a_whole_map(
+    before: bool, complete: bool, error: BaseException, tmp_path: Path
+) -> None:
+    places = (tmp_path / str(number) for number in itertools.count())
+    folder = tmp_path
+
+    def attempt() -> None:
+        nonlocal folder
+        folder = next(places)
+        folder.mkdir()
+        if before:
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(storage, "write_file", _written)  # not counted
+                save_map(folder, info(step=5), state(5))
+        save_map(folder, info(step=6, complete=complete), state(6))
+
+    steps = []
+    for raised in outcomes(attempt, error):
+        if isinstance(raised, OSError):
+            assert str(raised.filename).startswith(str(folder))
+        if before or (folder / "map.json").exists():
+            steps.append((raised, assert_whole(folder)))
+        else:
+            steps.append((raised, 5))
+            assert names(folder) == set()
+    assert steps[-1] == (None, 6)
+    assert len(steps) > (8 if complete else 12)  # open, sync, replace and sync again, of two files or three
+    assert all(step == 6 for raised, step in steps if raised is None)
+    assert all(step == 5 for raised, step in steps if isinstance(raised, OSError))
+
+
+def _written(path: Path, content: bytes) -> None:
+    with open(path, "wb") as file:
+        file.write(content)
+
+
+def assert_whole(folder: Path) -> int:
+    loaded = load_map(folder)
+    assert isinstance(loaded.field, nn.Module)
+    assert_equal(loaded.field.state_dict(), state(loaded.info.step).field)
+    assert names(folder) == {"map.json", loaded.info.weights, loaded.info.training} - {None}
+    return loaded.info.step
+
+
+def test_a_map_that_a_training_replaces_while_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the description and the weights, the next checkpoint comes."""
+    save_map(tmp_path, info(step=5), state(5))
+    read = storage.read_tensors
+    pending = [lambda: save_map(tmp_path, info(step=6), state(6))]
+
+    def late(path: Path) -> dict[str, Tensor]:
+        if pending:
+            pending.pop()()
+        return read(path)
+
+    monkeypatch.setattr(storage, "read_tensors", late)
+    loaded = load_map(tmp_path)
+    assert loaded.info.step == 6
+    assert isinstance(loaded.field, nn.Module)
+    assert_equal(loaded.field.state_dict(), state(6).field)
+
+
+def test_a_damaged_description_makes_no_save_remove_anything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_map(tmp_path, info(step=5), state(5))
+    (tmp_path / "map.json").write_text("{")
+    before = names(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", _striking(Path.replace, [], 0, FULL))
+        with pytest.raises(OSError, match="No space left"):
+            save_map(tmp_path, info(step=6), state(6))
+    assert names(tmp_path) == before
+
+
+def test_what_json_cannot_hold_is_told_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"config\.learning_rate is nan"):
+        save_map(tmp_path / "map", replace(info(), config={"learning_rate": float("nan")}), state())
+    assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.parametrize("error", [FULL, Stopped()], ids=["full", "stop"])
+def test_a_file_is_written_whole_or_not_at_all(error: BaseException, tmp_path: Path) -> None:
+    def attempt() -> None:
+        _written(path, b"old")
+        write_file(path, b"new")
+
+    path, found = tmp_path / "x", []
+    for raised in outcomes(attempt, error):
+        found.append(path.read_bytes())
+        assert names(tmp_path) == {"x"}
+        if isinstance(raised, OSError):
+            assert (raised.errno, raised.filename) == (errno.ENOSPC, str(path))
+    assert found[:3] == [b"old"] * 3  # open, sync, replace
+    assert found[3:] == [b"new"] * len(found[3:])
+
+
+# What a backend builds is judged as well.
+
+
+def test_a_backend_that_builds_something_else_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_map(tmp_path, info(), state())
+    chosen = load_backend("hashgrid")
+    monkeypatch.setattr(type(chosen), "build", lambda *_: HomogeneousBall(1.0, 1.0))
+    with pytest.raises(InputError, match=r"built a HomogeneousBall, expected an nn\.Module"):
+        load_map(tmp_path)
