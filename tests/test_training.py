@@ -125,6 +125,31 @@ def test_a_stop_that_is_asked_for_in_the_last_step_is_the_end(scene: tuple[list[
     assert [state.step for state in report.saved] == [3]
 
 
+class Late(Kept):
+    """Asked to stop at the worst moment: when it was just asked whether to stop."""
+
+    def __init__(self, stop: int) -> None:
+        super().__init__()
+        self.late, self.asked = stop, 0
+
+    @property
+    def stopping(self) -> bool:
+        self.asked += 1
+        return self.asked > self.late
+
+    @stopping.setter
+    def stopping(self, value: bool) -> None:
+        pass
+
+
+@pytest.mark.parametrize("stop", [1, 2, 3, 4])
+def test_a_training_stops_only_where_it_saved(stop: int) -> None:
+    line, report = nn.Linear(1, 1), Late(stop)
+    with pytest.raises(TrainingStopped) as stopped:
+        fit(line, [{"params": line.parameters(), "lr": 0.1}], line_outcome(line), 9, report)
+    assert [state.step for state in report.saved] == [stopped.value.step]
+
+
 def test_the_same_seed_gives_the_same_field_and_another_another(
     scene: tuple[list[View], SceneBounds],
 ) -> None:

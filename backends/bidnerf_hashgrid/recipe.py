@@ -27,7 +27,7 @@ LEAST = {
 class HashGridConfig(FieldConfig):
     """Size of the field and its training. The defaults suit a few minutes on a small CPU."""
 
-    steps: int = 2500  # of the optimizer
+    steps: int = 1600  # of the optimizer
     samples_per_step: int = 65536  # the number of rays follows from it
     learning_rate: float = 1e-2  # of the tables; the networks learn at a quarter of it
     coarse_every: int = 4  # one step in so many trains the coarse field
