@@ -193,9 +193,8 @@ def fit(
         optimizer.step()
         psnr = -10 * math.log10(max(result.mse, 1e-10))
         report.step(Progress(step + 1, steps, loss, psnr, result.samples_per_ray))
-        stopping = (
-            report.stopping
-        )  # asked once: it may change at any time, and who is told to stop must have saved
+        # Asked once: it may change at any time, and who is told to stop must have saved.
+        stopping = report.stopping
         if stopping or report.due(step + 1):
             report.save(_state(step + 1, field, optimizer, generator))
         if stopping and step + 1 < steps:

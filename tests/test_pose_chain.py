@@ -76,7 +76,7 @@ def test_zero_residual_at_the_truth() -> None:
     assert float(loss(problem, perturb(truth, 0.2, 5.0, seed=0))) > 1e-4
 
 
-SETTINGS = BidConfig(rays=512, max_steps=150, learning_rate=0.03, decay=0.4, decay_steps=50, level=None)
+SETTINGS = BidConfig(rays=512, max_steps=200, decay_steps=80, depth_weight=1.0, level=None)
 
 
 def test_a_view_finds_its_place() -> None:
@@ -87,9 +87,9 @@ def test_a_view_finds_its_place() -> None:
     error = pose_error(found.T_world_camera, truth)
     assert float(error.translation) < 0.03
     assert float(error.rotation_deg) < 1.0
-    assert found.steps == 150
-    assert found.poses.translation.shape == (151, 3)
-    assert len(found.losses) == 150
+    assert found.steps == 200
+    assert found.poses.translation.shape == (201, 3)
+    assert len(found.losses) == 200
 
 
 def test_a_moved_world_gives_a_moved_answer() -> None:
@@ -105,7 +105,7 @@ def test_a_moved_world_gives_a_moved_answer() -> None:
     there = localize(single(field.moved(motion), roomy, frame, motion @ start), "bid", few, seed=0)
     expected = motion @ here.T_world_camera
     torch.testing.assert_close(there.T_world_camera.matrix(), expected.matrix(), atol=2e-4, rtol=0)
-    assert float(pose_error(here.T_world_camera, truth).translation) < 0.25
+    assert float(pose_error(here.T_world_camera, start).translation) > 0.05
 
 
 def test_the_seed_decides() -> None:

@@ -46,6 +46,10 @@ class HashGridConfig(FieldConfig):
             value = getattr(self, name)
             if not value >= least:
                 raise InputError(f"{name} is {value}, expected {least} or more")
+        if self.coarse_every > self.prune_every:
+            raise InputError(
+                f"coarse_every is {self.coarse_every}, expected {self.prune_every} (prune_every) or less"
+            )
 
 
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:

@@ -1,0 +1,1 @@
+"""How localizers are judged: protocols, pose errors, statistics, figures."""

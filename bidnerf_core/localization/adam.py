@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import Literal
@@ -9,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Generator, Tensor
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.field import widened
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
@@ -32,13 +34,25 @@ class BidConfig:
     decay_steps: int = 80  # ... after so many steps
     depth_weight: float = 0.3  # lambda_d; the paper's is 1, with which far starts were lost more often here
     huber_delta: float = 0.1  # of colour differences, and of metres
-    level: int | None = 0  # of the field: 0 is the coarsest, null the field itself
+    level: int | None = 0  # of the field: 0 is the coarsest; none is the field itself, in full detail
     pivot: Literal["scene", "camera"] = "scene"  # what the update turns about; the paper's is the camera
     wide: float = 1.0  # sampled interval over [near, far]; the paper's "wide" is 2
-    stop_loss: float = (
-        0.0  # epsilon of Alg. 1: stop once the mean loss of 20 steps is below it; 0 never stops early
-    )
-    converged_loss: float = 0.01  # mean loss of the last 20 steps under which the answer is called converged
+    stop_loss: float = 0.0  # stop once the mean loss of 20 steps is below it (epsilon of Alg. 1); 0: never
+    converged_loss: float = 0.02  # mean loss of the last 20 steps below which the answer is called converged
+
+    def __post_init__(self) -> None:
+        for name in ("rays", "max_steps", "decay_steps"):
+            self._require(name, getattr(self, name) >= 1, "1 or more")
+        for name in ("learning_rate", "decay", "huber_delta", "wide"):
+            value = getattr(self, name)
+            self._require(name, math.isfinite(value) and value > 0, "a positive number")
+        for name in ("depth_weight", "stop_loss", "converged_loss"):
+            value = getattr(self, name)
+            self._require(name, math.isfinite(value) and value >= 0, "a number, 0 or more")
+
+    def _require(self, name: str, fits: bool, expected: str) -> None:
+        if not fits:
+            raise InputError(f"{name} is {getattr(self, name)}, expected {expected}")
 
 
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
@@ -58,6 +72,9 @@ def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
         optimizer.param_groups[0]["lr"] = config.learning_rate * config.decay ** (step / config.decay_steps)
         loss = _loss(problem, _moved(T, pivot, delta), config, generator)
         losses.append(float(loss.detach()))
+        if not math.isfinite(losses[-1]):
+            reason = f"the loss was {losses[-1]} at step {step + 1}"
+            break
         if loss.requires_grad:
             optimizer.zero_grad()
             loss.backward()
