@@ -46,6 +46,7 @@ from bidnerf_core.training import TrainingStopped
 CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 TRAINING_VIEWS, RADIUS = 60, 3.5
 START_ERROR = (0.6, 14.0)  # scene units (the object fills a 2x2x2 cube) and degrees
+DESCENT = BidConfig(rays=1024, max_steps=150, decay_steps=60)  # quicker than the defaults, for small images
 ANIMATED = 24  # frames of the animation
 
 
@@ -70,7 +71,7 @@ def demo(
     backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
     out: Annotated[Path, option("DIR", "folder for the map and the pictures")] = Path("demo-out"),
     frames: Annotated[int, option("N", "how many unseen frames to localize")] = 4,
-    steps: Annotated[int, option("N", "training steps")] = 400,
+    steps: Annotated[int, option("N", "training steps")] = 300,
     seed: Annotated[int, option("N", "of the views and of the starts")] = 0,
     overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
 ) -> None:
@@ -110,7 +111,7 @@ def _demonstrated(
 def _trial(stored: Map, view: View, number: int, seed: int) -> Trial:
     start = perturb(view.T_ref_camera, *START_ERROR, seed=seed + number)
     with console.status(f"localizing frame {number + 1}"):
-        found = localize(single(stored.field, stored.bounds, view.frame, start), "bid", BidConfig(), seed)
+        found = localize(single(stored.field, stored.bounds, view.frame, start), "bid", DESCENT, seed)
     return Trial(view, start, found)
 
 
