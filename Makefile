@@ -18,7 +18,7 @@ PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
 INSTALL = $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test bench check lint format types arrows clean
+.PHONY: help demo test check lint format types arrows clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
@@ -28,9 +28,6 @@ demo: $(VENV)/.installed-plots ## train a small scene, find poses in it, draw th
 
 test: $(VENV)/.installed-dev ## all tests; ARGS="-k se3" for some
 	@$(BIN)/python -m pytest $(ARGS)
-
-bench: $(VENV)/.installed-dev ## the micro-benchmarks among the tests, with timings
-	@$(BIN)/python -m pytest --benchmark-enable --benchmark-only $(ARGS)
 
 check: lint types arrows ## everything that is checked without running the code
 

@@ -69,9 +69,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--name", required=True, help="of the record")
     parser.add_argument("--keep", action="store_true", help="judge the map that is there already")
-    parser.add_argument("options", nargs="*", help="after --: options of bidnerf train")
-    given = parser.parse_args()
-    training = {} if given.keep else train(given.data, given.out, given.options)
+    words = sys.argv[1:]
+    end = words.index("--") if "--" in words else len(words)
+    given = parser.parse_args(words[:end])
+    training = {} if given.keep else train(given.data, given.out, words[end + 1 :])
     stored = load_map(given.out)
     views = open_dataset(given.data, stored.bounds.background).views("test")
     results = {

@@ -154,6 +154,7 @@ class StepOutcome:
 
 def cosine(step: int, total: int, warmup: int = 100, last: float = 0.02) -> float:
     """Factor on the learning rate: linear warm-up, then half a cosine down to ``last``."""
+    warmup = min(warmup, total // 10)
     if step < warmup:
         return (step + 1) / warmup
     done = (step - warmup) / max(1, total - warmup)

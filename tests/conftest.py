@@ -11,7 +11,9 @@ from jaxtyping import install_import_hook
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the library does, which is imported after torch here
 
 # Before the first import of the project: only modules that are imported afterwards are checked.
-install_import_hook(["bidnerf_core", "bidnerf_hashgrid", "bidnerf_vanilla"], "shape_checks.checked")
+install_import_hook(
+    ["bidnerf_core", "bidnerf_adanerf", "bidnerf_hashgrid", "bidnerf_vanilla"], "shape_checks.checked"
+)
 
 import pytest
 import torch

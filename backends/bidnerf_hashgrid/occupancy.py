@@ -74,7 +74,10 @@ class OccupancyGrid(nn.Module):
         steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
         distance = start[:, None] + steps + (offset[ray] * self.step)[:, None]
         positions = origins[ray][:, None] + distance[..., None] * directions[ray][:, None]
-        kept = self.occupied.view(-1)[self._cells(positions)] & (distance < far[ray][:, None])
+        within = (
+            (positions >= self.lower.to(positions)) & (positions <= (self.lower + self.side).to(positions))
+        ).all(-1)
+        kept = self.occupied.view(-1)[self._cells(positions)] & (distance < far[ray][:, None]) & within
         return self._padded(distance[kept], ray[:, None].expand_as(kept)[kept], near, far, shape)
 
     def _busy_blocks(

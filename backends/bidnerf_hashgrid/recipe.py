@@ -46,6 +46,10 @@ class HashGridConfig(FieldConfig):
             value = getattr(self, name)
             if not value >= least:
                 raise InputError(f"{name} is {value}, expected {least} or more")
+        if self.coarse_every == 1 or self.prune_fade > 1:
+            raise InputError(
+                "coarse_every is 1 or prune_fade above 1: the field itself would never be trained or pruned"
+            )
         if self.coarse_every > self.prune_every:
             raise InputError(
                 f"coarse_every is {self.coarse_every}, expected {self.prune_every} (prune_every) or less"

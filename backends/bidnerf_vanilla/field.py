@@ -58,6 +58,7 @@ class VanillaField(nn.Module):
         super().__init__()
         self.config = config
         self.bounds = bounds
+        self.side = max(bounds.size)
         self.room = Room(bounds, config.room_resolution)
         self.coarse = Level(config, bounds, Within(self.room, Stratified(config.coarse_samples)))
         self.fine = Level(config, bounds, Within(self.room, Importance(self.coarse, config.fine_samples)))
@@ -67,8 +68,8 @@ class VanillaField(nn.Module):
         return self.fine.sampler
 
     @property
-    def levels(self) -> tuple[Level, Level]:
-        return self.coarse, self.fine
+    def levels(self) -> tuple[Level, VanillaField]:
+        return self.coarse, self
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         return self.fine.query(positions, directions)

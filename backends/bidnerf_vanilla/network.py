@@ -19,7 +19,9 @@ class NetworkConfig:
     layers: int = 4  # hidden layers from which density is read off
     width: int = 128  # of each; the layer that looks at the direction has half of it
     skip: int = 2  # how many layers go before the position is fed in once more; 0 never
-    position_frequencies: int = 8
+    position_frequencies: int = (
+        8  # octaves of sines and cosines; the scene's longest side is one period of the first
+    )
     direction_frequencies: int = 2
     include_input: bool = True  # feed positions and directions themselves in, beside their sines
 

@@ -28,12 +28,12 @@ PROBE = 4096
 class VanillaConfig(FieldConfig):
     """Size of the field and its training. The defaults suit some forty minutes on a small CPU."""
 
-    steps: int = 20000
-    samples_per_step: int = 16384  # of the fine network, about; the number of rays follows from it
-    rays_at_most: int = 4096  # per step
-    learning_rate: float = 2e-3
-    depth_weight: float = 0.1
-    seed: int = 0
+    steps: int = 20000  # of the optimizer
+    samples_per_step: int = 4096  # of the fine network, about; the number of rays follows from it
+    rays_at_most: int = 4096  # a step, however few samples they take
+    learning_rate: float = 3e-3
+    depth_weight: float = 0.1  # of the depth term beside the colour term; 0 leaves depth out
+    seed: int = 0  # of initial weights and of all that is drawn at random
     carve: bool = True  # ask no network where the views' depth and silhouettes leave no room for matter
 
     def __post_init__(self) -> None:
@@ -77,8 +77,8 @@ def step_outcome(
 ) -> StepOutcome:
     """Both levels must see what was seen (eq. 6); the samples that are counted are the fine level's."""
     coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
-    rough, _ = supervised_loss(coarse, batch, field.coarse.side, depth_weight)
-    loss, mse = supervised_loss(fine, batch, field.fine.side, depth_weight)
+    rough, _ = supervised_loss(coarse, batch, field.side, depth_weight)
+    loss, mse = supervised_loss(fine, batch, field.side, depth_weight)
     return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch.rgb)))
 
 
@@ -86,6 +86,6 @@ def step_outcome(
 def _rays_per_step(field: VanillaField, bank: RayBank, config: VanillaConfig) -> int:
     """Where there is little room for matter, a step affords more rays."""
     rays = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
-    asked = float(field.coarse.sampler(rays).valid.sum()) / PROBE
-    samples = asked * (1 + config.fine_samples / config.coarse_samples)
+    asked = field.coarse.sampler(rays).valid
+    samples = float(asked.sum() + config.fine_samples * asked.any(-1).sum()) / PROBE
     return max(1, min(config.rays_at_most, int(config.samples_per_step / max(samples, 1.0))))

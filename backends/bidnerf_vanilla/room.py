@@ -33,9 +33,9 @@ class Room(nn.Module):
 
         ``tolerance`` is the part by which measured depth may be off: a cell that is emptied by mistake is lost.
         """
-        upper = self.lower + self.side
-        lower, upper = tuple(self.lower.tolist()), tuple(upper.tolist())
-        self.cells.copy_(occupied_cells(views, lower, upper, tuple(self.cells.shape), tolerance))
+        lower, upper = (tuple(corner.tolist()) for corner in (self.lower, self.lower + self.side))
+        shape = (self.resolution,) * 3
+        self.cells.copy_(occupied_cells(views, lower, upper, shape, tolerance))
 
     def holds(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
         """Whether there may be matter at ``positions`` (metres, world); outside the cube its border tells."""

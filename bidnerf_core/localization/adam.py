@@ -29,10 +29,12 @@ class BidConfig:
 
     rays: int = 2048  # in all, shared out equally among the views
     max_steps: int = 200
-    learning_rate: float = 0.04  # metres and radians a step
+    learning_rate: float = (
+        0.04  # metres that a step moves the camera, at first; radians about a pivot within 1 m
+    )
     decay: float = 0.4  # factor on the learning rate ...
     decay_steps: int = 80  # ... after so many steps
-    depth_weight: float = 0.3  # lambda_d; the paper's is 1, with which far starts were lost more often here
+    depth_weight: float = 1.0  # lambda_d
     huber_delta: float = 0.1  # of colour differences, and of metres
     level: int | None = 0  # of the field: 0 is the coarsest; none is the field itself, in full detail
     pivot: Literal["scene", "camera"] = "scene"  # what the update turns about; the paper's is the camera
@@ -42,10 +44,9 @@ class BidConfig:
 
     def __post_init__(self) -> None:
         for name in ("rays", "max_steps", "decay_steps"):
-            self._require(name, getattr(self, name) >= 1, "1 or more")
-        for name in ("learning_rate", "decay", "huber_delta", "wide"):
-            value = getattr(self, name)
-            self._require(name, math.isfinite(value) and value > 0, "a positive number")
+            self._require(name, 1 <= getattr(self, name) <= 10**7, "1 to 10 million")
+        for name, most in {"learning_rate": 1e3, "decay": 1.0, "huber_delta": 1e6, "wide": 100.0}.items():
+            self._require(name, 0 < getattr(self, name) <= most, f"a positive number, at most {most:g}")
         for name in ("depth_weight", "stop_loss", "converged_loss"):
             value = getattr(self, name)
             self._require(name, math.isfinite(value) and value >= 0, "a number, 0 or more")
@@ -63,26 +64,34 @@ def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
     """
     began = time.perf_counter()
     generator = torch.Generator().manual_seed(seed)
-    delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.Adam([delta], lr=config.learning_rate, betas=(0.9, 0.999))
     pivot = _pivot(problem, config)
+    rho, phi = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    # About a far pivot a turn moves the camera by that much more: steps of both kinds are to move it equally far.
+    rates = (config.learning_rate, config.learning_rate / max(1.0, float(pivot.translation.norm())))
+    groups = [{"params": [part], "lr": rate} for part, rate in zip((rho, phi), rates, strict=True)]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.999))
     T, poses, losses = problem.start, [problem.start], []
     reason = f"reached {config.max_steps} steps"
     for step in range(config.max_steps):
-        optimizer.param_groups[0]["lr"] = config.learning_rate * config.decay ** (step / config.decay_steps)
-        loss = _loss(problem, _moved(T, pivot, delta), config, generator)
-        losses.append(float(loss.detach()))
-        if not math.isfinite(losses[-1]):
-            reason = f"the loss was {losses[-1]} at step {step + 1}"
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * config.decay ** (step / config.decay_steps)
+        loss = _loss(problem, _moved(T, pivot, torch.cat([rho, phi])), config, generator)
+        if not math.isfinite(float(loss.detach())):
+            reason = f"the loss was {float(loss.detach())} at step {step + 1}"
             break
-        if loss.requires_grad:
-            optimizer.zero_grad()
-            loss.backward()
+        losses.append(float(loss.detach()))
+        if loss.requires_grad:  # it does not where no ray meets anything
+            rho.grad, phi.grad = torch.autograd.grad(loss, (rho, phi))
             optimizer.step()
-        T = _moved(T, pivot, delta.detach()).normalized()
+        moved = _moved(T, pivot, torch.cat([rho, phi]).detach())
+        if not bool(moved.matrix().isfinite().all()):
+            reason = f"the step was not finite at step {step + 1}"
+            break
+        T = moved.normalized()
         poses.append(T)
         with torch.no_grad():
-            delta.zero_()
+            rho.zero_()
+            phi.zero_()
         if step + 1 >= WINDOW and _recent(losses) < config.stop_loss:
             reason = f"mean loss of {WINDOW} steps fell below {config.stop_loss:g}"
             break
@@ -90,7 +99,7 @@ def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
         T_world_camera=T,
         converged=_recent(losses) < config.converged_loss,
         reason=reason,
-        steps=len(losses),
+        steps=len(poses) - 1,
         seconds=time.perf_counter() - began,
         loss=_recent(losses),
         method="bid",

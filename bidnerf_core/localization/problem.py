@@ -42,7 +42,7 @@ class Problem:
             return self.field
         offered = levels(self.field)
         if not -len(offered) <= number < len(offered):
-            raise InputError(f"level {number} does not exist: the field offers {len(offered)}, from 0")
+            raise InputError(f"level is {number}, expected 0 (coarsest) to {len(offered) - 1}")
         return offered[number]
 
 

@@ -1,0 +1,82 @@
+"""Bins: equal parts of a ray's way through the scene's box; and the choice of a few of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Generator, Tensor
+
+from bidnerf_adanerf.networks import Oracle
+from bidnerf_core.field import Rays, RaySamples, SceneBounds
+from bidnerf_core.sampling import Stratified
+
+
+@dataclass(frozen=True)
+class Bins:
+    """All bins of each ray: what is shaded in dense training. A ``RaySampler``.
+
+    A ray's bins depend on the box alone. Where the ray's own [near, far] is narrower, they are cut off; where it is
+    wider, there is nothing to see beyond the box.
+    """
+
+    bounds: SceneBounds
+    count: int
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        whole = Stratified(self.count)(self.through(rays), jitter)
+        near, far = rays.near[..., None], rays.far[..., None]
+        starts, ends = (torch.minimum(torch.maximum(x, near), far) for x in (whole.starts, whole.ends))
+        return RaySamples(starts, ends, whole.valid & (starts < ends))
+
+    @torch.no_grad()
+    def through(self, rays: Rays) -> Rays:
+        """The same rays with the whole of their way through the box."""
+        return self.bounds.rays(rays.origins.detach(), rays.directions.detach())
+
+
+@dataclass(frozen=True)
+class Sparse:
+    """The bins that the oracle chooses, at least one of each ray that meets the scene: a ``RaySampler``.
+
+    Bins whose score is above ``threshold``, the best ``most`` of them, nearest first. The choice carries no gradient: a
+    pose is felt through the positions that were chosen.
+    """
+
+    oracle: Oracle
+    bins: Bins
+    threshold: float
+    most: int
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        whole = self.bins(rays, jitter)
+        scores = torch.where(
+            whole.valid, ray_logits(self.oracle, self.bins, rays).sigmoid().to(whole.starts), -1.0
+        )
+        return chosen(whole, scores, self.threshold, self.most)
+
+
+def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
+    """What the oracle says of the bins of rays; differentiable in the oracle's parameters."""
+    shape = rays.near.shape
+    whole = bins.through(rays)
+    ends = torch.stack([whole.near, whole.far], dim=-1)
+    lower, upper = (ends.new_tensor(corner) for corner in (bins.bounds.lower, bins.bounds.upper))
+    points = (whole.at(ends) - (lower + upper) / 2) * (2 / max(bins.bounds.size))
+    enter, leave = points.reshape(-1, 2, 3).to(oracle.places).unbind(1)
+    logits: Tensor = oracle(enter, leave)
+    return logits.reshape(*shape, logits.shape[-1])
+
+
+def chosen(samples: RaySamples, scores: Float[Tensor, "*r n"], threshold: float, most: int) -> RaySamples:
+    """Of each ray the best ``most`` samples above ``threshold``, and the best one in any case, if it is valid."""
+    count = scores.shape[-1]
+    best, index = scores.topk(min(most, count), dim=-1)
+    taken: Bool[Tensor, "*r k"] = best > threshold
+    taken[..., 0] = best[..., 0] >= 0
+    index = index.masked_fill(~taken, count).sort(dim=-1).values  # nearest first, those not taken last
+    valid, index = index < count, index.clamp(max=count - 1)
+    return RaySamples(samples.starts.gather(-1, index), samples.ends.gather(-1, index), valid)

@@ -1,0 +1,77 @@
+"""The field of AdaNeRF (Kurz et al. 2022): a shading network, asked where a sampling network wants it to be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bidnerf_adanerf.bins import Bins, Sparse
+from bidnerf_adanerf.config import AdaNerfConfig
+from bidnerf_adanerf.networks import Oracle, ShadingNetwork
+from bidnerf_core.field import FieldValues, SceneBounds
+
+SHARPNESS = 30.0
+"""Density per side of the scene at a raw density of about 1: networks whose outputs are small see surfaces."""
+THINNESS = 1.0
+"""How far raw density is shifted down, so that an untrained field is nearly transparent."""
+
+
+class AdaNerfField(nn.Module):
+    """Density and colour of points of a scene's box; ``sampler`` chooses the few of a ray that matter.
+
+    There are no coarser ``levels``: the shading network is trained where the oracle looks, at one level of detail.
+    """
+
+    middle: Float[Tensor, "3"]
+
+    def __init__(self, config: AdaNerfConfig, bounds: SceneBounds) -> None:
+        super().__init__()
+        self.config = config
+        self.bounds = bounds
+        self.side = max(bounds.size)
+        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
+        self.register_buffer("middle", torch.tensor(middle), persistent=False)
+        self.shading = ShadingNetwork(
+            config.width, config.layers, config.position_frequencies, config.direction_frequencies
+        )
+        self.oracle = Oracle(
+            config.oracle_width, config.oracle_layers, config.ray_points, config.ray_frequencies, config.bins
+        )
+
+    @property
+    def bins(self) -> Bins:
+        return Bins(self.bounds, self.config.bins)
+
+    @property
+    def sampler(self) -> Sparse:
+        return Sparse(self.oracle, self.bins, self.config.threshold, self.config.max_samples)
+
+    @property
+    def dense(self) -> DenseField:
+        return DenseField(self)
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        """Positions are brought into the cube [-1, 1], densities are per its side: no unit of length matters."""
+        shape = positions.shape[:-1]
+        points = (positions.reshape(-1, 3) - self.middle) * (2 / self.side)
+        raw, rgb = self.shading(points, directions.reshape(-1, 3))
+        density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
+        return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
+
+
+@dataclass(frozen=True)
+class DenseField:
+    """The same field shaded in all its bins, without the oracle: what the sparse one is to look like."""
+
+    sparse: AdaNerfField
+
+    @property
+    def sampler(self) -> Bins:
+        return self.sparse.bins
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        return self.sparse.query(positions, directions)

@@ -1,0 +1,80 @@
+"""The two networks of AdaNeRF and the encoding of what they are given."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+def encoded_width(frequencies: int) -> int:
+    """How many numbers encode a point of three coordinates."""
+    return 3 * (1 + 2 * frequencies)
+
+
+def encode(points: Float[Tensor, "*p 3"], frequencies: int) -> Float[Tensor, "*p f"]:
+    """``(p, sin(2^k pi p), cos(2^k pi p))`` for k below ``frequencies`` (Mildenhall et al. 2020, eq. 4), p in [-1, 1]."""
+    octaves = torch.arange(frequencies, dtype=points.dtype, device=points.device)
+    angles = (points[..., None, :] * (torch.pi * 2**octaves)[:, None]).flatten(-2)
+    return torch.cat([points, angles.sin(), angles.cos()], dim=-1)
+
+
+def trunk(inputs: int, width: int, layers: int) -> nn.Sequential:
+    """Hidden layers with rectifiers."""
+    widths = [inputs, *[width] * layers]
+    pairs = pairwise(widths)
+    return nn.Sequential(*(m for a, b in pairs for m in (nn.Linear(a, b), nn.ReLU(inplace=True))))
+
+
+class ShadingNetwork(nn.Module):
+    """The MLP of NeRF, without its skip connection: position to density; with the direction, to colour."""
+
+    def __init__(
+        self, width: int, layers: int, position_frequencies: int, direction_frequencies: int
+    ) -> None:
+        super().__init__()
+        self.frequencies = position_frequencies, direction_frequencies
+        self.trunk = trunk(encoded_width(position_frequencies), width, layers)
+        self.density = nn.Linear(width, 1)
+        self.view = nn.Linear(width + encoded_width(direction_frequencies), max(1, width // 2))
+        self.colour = nn.Linear(max(1, width // 2), 3)
+
+    def forward(
+        self, points: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
+        """Density before its activation, and rgb in [0, 1], of ``points`` in the cube [-1, 1]."""
+        hidden = self.trunk(encode(points, self.frequencies[0]))
+        turned = encode(directions, self.frequencies[1])
+        seen = functional.relu(self.view(torch.cat([hidden, turned], dim=-1)), inplace=True)
+        return self.density(hidden)[:, 0], torch.sigmoid(self.colour(seen))
+
+
+class Oracle(nn.Module):
+    """The sampling network: scores all bins of a ray in one evaluation, knowing nothing but the ray.
+
+    A ray is described by points at equal steps of its way through the scene, the first where it enters and the last where
+    it leaves. So rays that see the same part of the scene look alike, wherever their camera is: outside or within.
+    """
+
+    places: Float[Tensor, "k"]
+
+    def __init__(self, width: int, layers: int, points: int, frequencies: int, bins: int) -> None:
+        super().__init__()
+        self.frequencies = frequencies
+        self.register_buffer("places", torch.linspace(0, 1, points), persistent=False)
+        self.trunk = trunk(points * encoded_width(frequencies), width, layers)
+        self.scores = nn.Linear(width, bins)
+        nn.init.constant_(self.scores.bias, FULL)
+
+    def forward(self, enter: Float[Tensor, "r 3"], leave: Float[Tensor, "r 3"]) -> Float[Tensor, "r n"]:
+        """Logits of the scores of rays that enter and leave the scene at these points of the cube [-1, 1]."""
+        places = self.places[:, None]
+        points = torch.lerp(enter[:, None], leave[:, None], places)
+        return self.scores(self.trunk(encode(points, self.frequencies).flatten(1)))
+
+
+FULL = 3.0
+"""Logit of the scores before training: all bins count, and there is a gradient to make them count less."""

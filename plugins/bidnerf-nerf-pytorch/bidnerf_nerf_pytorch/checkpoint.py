@@ -1,0 +1,110 @@
+"""Reading a checkpoint. Its architecture is read off the weights: the config file beside it may say something else."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_nerf_pytorch.network import Network, NetworkConfig
+
+NETWORKS = {"coarse": "model_coarse_state_dict", "fine": "model_fine_state_dict"}
+HIDDEN = re.compile(r"layers_xyz\.\d+\.weight")
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Two networks of one architecture."""
+
+    network: NetworkConfig
+    tensors: dict[str, Tensor]  # as the field's state_dict names them
+    steps: int  # of training
+
+
+def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
+    """The networks in ``path``; nothing that it holds is run. ``octaves`` is the one choice that no weight shows.
+
+    Raises ``InputError``, in one line, where there is no such file, it holds code or no checkpoint of nerf-pytorch, the
+    fine network is missing, or the architecture is another.
+    """
+    found = _loaded(path)
+    if not isinstance(found, dict) or not isinstance(found.get(NETWORKS["coarse"]), dict):
+        raise InputError(f"{path}: no {NETWORKS['coarse']!r} in it, expected a checkpoint of nerf-pytorch")
+    if not isinstance(found.get(NETWORKS["fine"]), dict):
+        raise InputError(f"{path}: it has no fine network, expected a coarse and a fine one")
+    kinds: dict[str, NetworkConfig] = {}
+    tensors: dict[str, Tensor] = {}
+    for level, key in NETWORKS.items():
+        kinds[level] = _architecture(found[key], octaves, f"{path}: {level} network")
+        tensors |= {f"{level}.network.{name}": value.float() for name, value in found[key].items()}
+    if kinds["coarse"] != kinds["fine"]:
+        raise InputError(f"{path}: the networks differ ({kinds['coarse']}; {kinds['fine']}), expected alike")
+    steps = found.get("iter")
+    return Checkpoint(kinds["fine"], tensors, steps + 1 if type(steps) is int and steps >= 0 else 0)
+
+
+def _loaded(path: Path) -> Any:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, expected a checkpoint of nerf-pytorch")
+    path.open(
+        "rb"
+    ).close()  # what keeps it from being read is told as it is; all later errors are the content's
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # each kind of damage has an exception of its own
+        code = re.search(r"GLOBAL ([\w.]+)", str(error))
+        if isinstance(error, pickle.UnpicklingError) and code:
+            raise InputError(
+                f"{path}: it would run code ({code[1]}) and was not read, expected tensors and numbers only"
+            ) from error
+        raise InputError(
+            f"{path}: not written by torch.save, or damaged ({type(error).__name__}); expected a checkpoint"
+        ) from error
+
+
+def _architecture(tensors: dict[str, Any], octaves: bool, where: str) -> NetworkConfig:
+    """What the shapes tell; and a network of that kind must have these tensors and no others."""
+    shapes = {name: tuple(getattr(value, "shape", ())) for name, value in tensors.items()}
+    width, seen = _sizes(shapes.get("layer1.weight"), where)
+    inputs = [shapes.get(f"layers_xyz.{i}.weight", ()) for i in range(sum(map(_is_hidden, shapes)))]
+    turned = shapes.get("layers_dir.0.weight", (0, width + 27))[-1] - width
+    network = NetworkConfig(
+        1 + len(inputs), width, tuple(i for i, shape in enumerate(inputs, 1) if shape[-1:] == (width + seen,)),
+        *_frequencies(seen, where), *_frequencies(turned, where), octaves, "fc_out.weight" not in shapes,
+    )  # fmt: skip
+    _check(tensors, shapes, Network(network), where)
+    return network
+
+
+def _is_hidden(name: str) -> bool:
+    return HIDDEN.fullmatch(name) is not None
+
+
+def _sizes(shape: tuple[int, ...] | None, where: str) -> tuple[int, int]:
+    if shape is None or len(shape) != 2:
+        raise InputError(f"{where}: unknown architecture without 'layer1.weight', expected FlexibleNeRFModel")
+    return shape[0], shape[1]
+
+
+def _frequencies(width: int, where: str) -> tuple[int, bool]:
+    """How many frequencies give that many numbers, and whether the input itself is among them."""
+    if width < 3 or width % 3:
+        raise InputError(f"{where}: unknown architecture, {width} inputs where a multiple of 3 was expected")
+    return width // 6, width // 3 % 2 == 1
+
+
+def _check(tensors: dict[str, Any], shapes: dict[str, tuple[int, ...]], network: Network, where: str) -> None:
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    for name in sorted(expected.keys() | shapes.keys()):
+        found, wanted = shapes.get(name, "nothing"), expected.get(name, "nothing")
+        if found != wanted:
+            raise InputError(f"{where}: unknown architecture, {name!r} is {found}, expected {wanted}")
+        value = tensors[name]
+        if not (value.is_floating_point() and bool(value.isfinite().all())):
+            raise InputError(f"{where}: {name!r} is not made of finite numbers")

@@ -1,0 +1,89 @@
+"""``bidnerf-import-nerf-pytorch``: a checkpoint becomes a map."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import SceneBounds
+from bidnerf_core.plain import to_plain
+from bidnerf_core.storage import MapInfo, save_map
+from bidnerf_core.training import TrainingState
+from bidnerf_nerf_pytorch import NerfPytorchConfig, backend, read_checkpoint
+
+NAME = "bidnerf-import-nerf-pytorch"
+COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+DONE, BAD_INPUT, INTERRUPTED = 0, 1, 130
+
+Box = tuple[float, float, float, float, float, float]
+
+
+def import_checkpoint(
+    checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CHECKPOINT")],
+    out: Annotated[Path, tyro.conf.arg(metavar="MAP")],
+    near: float = 2.0,
+    far: float = 6.0,
+    background: Literal["white", "black"] = "white",
+    box: Box = (-1.5, -1.5, -1.5, 1.5, 1.5, 1.5),
+    coarse_samples: int = 64,
+    fine_samples: int = 64,
+    octaves: bool = True,
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> None:
+    """Turn a checkpoint of krrish94/nerf-pytorch into a map.
+
+    The map's world is the one that the networks were trained in: for Blender's scenes that of transforms_*.json.
+
+    Args:
+        checkpoint: file that nerf-pytorch wrote (checkpoint*.ckpt)
+        out: folder for the map
+        near: distance along a ray before which nothing is, in the scene's unit
+        far: distance along a ray beyond which nothing is
+        background: colour where a ray meets nothing
+        box: lower and upper corner of what is of interest; what networks say outside of it is not looked at
+        coarse_samples: places on a ray at which the coarse network is asked
+        fine_samples: how many more the fine network is asked at
+        octaves: whether frequencies double (nerf-pytorch's log_sampling), which no weight shows
+        overwrite: replace the map in --out
+    """
+    bounds = SceneBounds(box[:3], box[3:], near, far, COLOURS[background])
+    found = read_checkpoint(checkpoint, octaves)
+    config = NerfPytorchConfig(
+        **asdict(found.network), coarse_samples=coarse_samples, fine_samples=fine_samples,
+        steps=max(1, found.steps),
+    )  # fmt: skip
+    if not overwrite and out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise InputError(f"{out}: exists already and is not empty; name another --out or pass --overwrite")
+    field = backend.build(config, bounds)
+    field.load_state_dict(found.tensors)
+    info = MapInfo("nerf-pytorch", to_plain(config, "config"), bounds, found.steps, True, checkpoint.name)
+    save_map(out, info, TrainingState(found.steps, dict(field.state_dict()), {}))
+    size = f"{config.layers} layers of {config.width}"
+    print(f"{out}: coarse and fine network of {size}, {found.steps} steps", file=sys.stderr)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit status 0, 1 with one line on stderr where the input is bad, 2 for wrong usage."""
+    try:
+        tyro.cli(import_checkpoint, args=arguments, prog=NAME)
+    except SystemExit as stopped:  # the parser has said all
+        return stopped.code if isinstance(stopped.code, int) else DONE
+    except KeyboardInterrupt:
+        return _failed("interrupted", INTERRUPTED)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _failed(f"{where}{error.strerror or error}", BAD_INPUT)
+    except InputError as error:
+        return _failed(str(error), BAD_INPUT)
+    return DONE
+
+
+def _failed(message: str, status: int) -> int:
+    print(f"{NAME}: {' '.join(message.splitlines())}", file=sys.stderr)
+    return status

@@ -1,0 +1,57 @@
+"""Two networks of nerf-pytorch as one radiance field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.sampling import Importance, Stratified
+from bidnerf_nerf_pytorch.network import Network, NetworkConfig
+
+
+@dataclass(frozen=True)
+class FieldConfig(NetworkConfig):
+    """Architecture of both networks, and where on a ray they are asked."""
+
+    coarse_samples: int = 64  # a ray
+    fine_samples: int = 64  # how many more for the fine network, placed by the coarse one
+
+
+class Level(nn.Module):
+    """One network, and where it is asked. Positions are those of the world that it was trained in: nothing is scaled."""
+
+    def __init__(self, config: NetworkConfig, sampler: RaySampler) -> None:
+        super().__init__()
+        self.sampler = sampler
+        self.network = Network(config)
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        shape = positions.shape[:-1]
+        density, rgb = self.network(positions.reshape(-1, 3), directions.reshape(-1, 3))
+        return FieldValues(density.relu().reshape(shape), torch.sigmoid(rgb).reshape(*shape, 3))
+
+
+class NerfPytorchField(nn.Module):
+    """What the fine network says; ``levels`` are what the coarse one says, and this."""
+
+    def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
+        super().__init__()
+        self.config = config
+        self.bounds = bounds
+        self.coarse = Level(config, Stratified(config.coarse_samples))
+        self.fine = Level(config, Importance(self.coarse, config.fine_samples))
+
+    @property
+    def sampler(self) -> RaySampler:
+        return self.fine.sampler
+
+    @property
+    def levels(self) -> tuple[Level, NerfPytorchField]:
+        return self.coarse, self
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        return self.fine.query(positions, directions)

@@ -1,0 +1,82 @@
+"""The network that krrish94/nerf-pytorch calls ``FlexibleNeRFModel``, tensor names included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Architecture of one network."""
+
+    layers: int = 4  # that positions go through
+    width: int = 128  # of each; the layer that looks at the direction has half of it
+    skips: tuple[int, ...] = ()  # how many layers go before each one that takes the position once more
+    position_frequencies: int = 10
+    position_input: bool = True  # feed the position itself in, beside its sines
+    direction_frequencies: int = 4
+    direction_input: bool = True
+    octaves: bool = True  # frequencies 1, 2, 4 ... 2^(n-1); otherwise n in equal steps between the same ends
+    view_dependent: bool = True  # whether colour depends on the direction
+
+
+class Network(nn.Module):
+    """Positions (world) and unit directions to raw density and colour.
+
+    As in its original, the first layer has no activation.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, seen = config.width, encoded_width(config.position_frequencies, config.position_input)
+        turned = encoded_width(config.direction_frequencies, config.direction_input)
+        self.layer1 = nn.Linear(seen, width)
+        inputs = [width + seen * (number in config.skips) for number in range(1, config.layers)]
+        self.layers_xyz = nn.ModuleList(nn.Linear(count, width) for count in inputs)
+        if config.view_dependent:
+            self.layers_dir = nn.ModuleList([nn.Linear(width + turned, width // 2)])
+            self.fc_alpha, self.fc_rgb = nn.Linear(width, 1), nn.Linear(width // 2, 3)
+            self.fc_feat = nn.Linear(width, width)
+        else:
+            self.fc_out = nn.Linear(width, 4)
+
+    def forward(
+        self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
+        """Density and colour, both before their activation."""
+        config = self.config
+        position = encoded(positions, config.position_frequencies, config.position_input, config.octaves)
+        hidden = self.layer1(position)
+        for number, layer in enumerate(self.layers_xyz, start=1):
+            given = torch.cat([hidden, position], dim=-1) if number in config.skips else hidden
+            hidden = layer(given).relu()
+        if not config.view_dependent:
+            rgb, density = self.fc_out(hidden).split([3, 1], dim=-1)
+            return density[:, 0], rgb
+        direction = encoded(directions, config.direction_frequencies, config.direction_input, config.octaves)
+        looked = self.layers_dir[0](torch.cat([self.fc_feat(hidden).relu(), direction], dim=-1)).relu()
+        return self.fc_alpha(hidden)[:, 0], self.fc_rgb(looked)
+
+
+def encoded_width(frequencies: int, include_input: bool) -> int:
+    """How many numbers encode three."""
+    return 3 * (2 * frequencies + include_input)
+
+
+def encoded(
+    points: Float[Tensor, "p 3"], frequencies: int, include_input: bool, octaves: bool
+) -> Float[Tensor, "p f"]:
+    """``(p, sin f1 p, cos f1 p, sin f2 p, ...)`` as nerf-pytorch orders it: unlike in NeRF's eq. 4 there is no pi."""
+    steps = torch.arange(frequencies, dtype=points.dtype, device=points.device)
+    if octaves:
+        factors = 2**steps
+    else:
+        factors = 1 + steps * ((2.0 ** (frequencies - 1) - 1) / max(1, frequencies - 1))
+    angles = points[:, None, :] * factors[:, None]
+    waves = torch.stack([angles.sin(), angles.cos()], dim=-2).flatten(1)
+    return torch.cat([points, waves], dim=-1) if include_input else waves

@@ -1,0 +1,81 @@
+"""A grid of voxels with trilinear interpolation: the least that is a backend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Generator, Tensor, nn
+from torch.nn import functional
+
+from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_core.frames import View
+from bidnerf_core.rendering import render
+from bidnerf_core.sampling import Stratified
+from bidnerf_core.supervision import supervised_loss
+from bidnerf_core.training import RayBank, Report, StepOutcome, fit
+
+__all__ = ["TemplateBackend", "TemplateConfig", "TemplateField", "backend"]
+
+
+@dataclass(frozen=True)
+class TemplateConfig:
+    """Each field is an option of ``bidnerf train`` and is stored with the map, so it must be what JSON can hold."""
+
+    resolution: int = 96  # grid points along each axis of the scene's box
+    samples: int = 96  # a ray
+    steps: int = 1500  # of the optimizer
+    rays_per_step: int = 2048
+    learning_rate: float = 0.1
+    depth_weight: float = 0.1  # of the depth term beside the colour term
+
+
+class TemplateField(nn.Module):
+    """What is asked for colour and density. All that is saved is its ``state_dict``."""
+
+    def __init__(self, config: TemplateConfig, bounds: SceneBounds) -> None:
+        super().__init__()
+        self.bounds = bounds
+        self.side = max(bounds.size)
+        self.sampler = Stratified(config.samples)
+        self.grid = nn.Parameter(
+            torch.zeros(4, *[config.resolution] * 3)
+        )  # density and rgb, before activation
+
+    def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
+        """Density (* per metre) and rgb (* 3) at positions (* 3, metres, world) along unit directions (* 3)."""
+        lower, upper = (positions.new_tensor(corner) for corner in (self.bounds.lower, self.bounds.upper))
+        places = (positions.reshape(1, -1, 1, 1, 3) - lower) / (upper - lower) * 2 - 1
+        raw = functional.grid_sample(self.grid[None], places, padding_mode="border", align_corners=True)
+        raw = raw.reshape(4, *positions.shape[:-1])
+        density = (
+            functional.softplus(raw[0] - 4) * 100 / self.side
+        )  # thin at first, whatever the unit of length
+        return FieldValues(density, raw[1:].sigmoid().movedim(0, -1))
+
+
+class TemplateBackend:
+    """What the entry point names."""
+
+    summary = "a grid of voxels with trilinear interpolation"
+    config_type = TemplateConfig
+
+    def build(self, config: TemplateConfig, bounds: SceneBounds) -> TemplateField:
+        return TemplateField(config, bounds)
+
+    def train(
+        self, field: TemplateField, views: Sequence[View], config: TemplateConfig, report: Report
+    ) -> None:
+        bank = RayBank(views, field.bounds)
+
+        def outcome(step: int, generator: Generator) -> StepOutcome:
+            batch = bank.draw(config.rays_per_step, generator)
+            rendering = render(field, batch.rays, batch.background, generator)
+            return StepOutcome(*supervised_loss(rendering, batch, field.side, config.depth_weight))
+
+        groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
+        fit(field, groups, outcome, config.steps, report)
+
+
+backend = TemplateBackend()

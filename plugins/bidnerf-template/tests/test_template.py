@@ -1,0 +1,11 @@
+"""All that is asked of a backend is in the contract. A small config keeps the tests fast."""
+
+from __future__ import annotations
+
+import bidnerf_template
+from bidnerf_core.testing import BackendContract
+
+
+class TestTemplate(BackendContract):
+    backend = bidnerf_template.backend
+    config = bidnerf_template.TemplateConfig(resolution=16, samples=32, steps=40, rays_per_step=512)
