@@ -21,6 +21,12 @@ class HashGridBackend:
     summary = "multiresolution hash grid with an occupancy grid (Instant-NGP), pure torch"
     config_type = HashGridConfig
 
+    def quick_config(self) -> HashGridConfig:
+        """For small, simple scenes: about a minute on two cores."""
+        return HashGridConfig(
+            steps=400, samples_per_step=16384, learning_rate=2e-2, colour_layers=1, coarse_every=8
+        )
+
     def build(self, config: HashGridConfig, bounds: SceneBounds) -> HashGridField:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)

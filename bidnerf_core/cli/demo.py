@@ -47,7 +47,6 @@ CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 TRAINING_VIEWS, RADIUS = 60, 3.5
 START_ERROR = (0.55, 13.0)  # scene units (the object fills a 2x2x2 cube) and degrees
 DESCENT = BidConfig(rays=768, max_steps=150, decay_steps=60)  # quicker than the defaults, for small images
-SAMPLES_PER_STEP = 16384
 ANIMATED = 14  # frames of the animation
 
 
@@ -72,7 +71,7 @@ def demo(
     backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
     out: Annotated[Path, option("DIR", "folder for the map and the pictures")] = Path("demo-out"),
     frames: Annotated[int, option("N", "how many unseen frames to localize")] = 4,
-    steps: Annotated[int, option("N", "training steps")] = 500,
+    steps: Annotated[int | None, option("N", "training steps", "what the backend finds quick")] = None,
     seed: Annotated[int, option("N", "of the views and of the starts")] = 0,
     overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
 ) -> None:
@@ -81,7 +80,7 @@ def demo(
     The frames are RGB-D images from poses that the training has not seen; the search for each begins far from its pose.
     """
     require("--frames", frames, 1)
-    require("--steps", steps, 1)
+    require("--steps", 1 if steps is None else steps, 1)
     require("--seed", seed, 0, LARGEST_SEED)
     chosen = load_backend(backend)
     with output_folder(out, overwrite):
@@ -91,15 +90,16 @@ def demo(
 
 
 def _demonstrated(
-    chosen: Backend, backend: str, out: Path, frames: int, steps: int, seed: int
+    chosen: Backend, backend: str, out: Path, frames: int, steps: int | None, seed: int
 ) -> tuple[list[Trial], Map]:
     scene = demo_object()
     seen = views(scene, CAMERA, orbit(RADIUS, TRAINING_VIEWS, seed=seed))
     unseen = views(scene, CAMERA, orbit(RADIUS, frames, elevation=(15.0, 50.0), seed=seed + 1))
     try:
-        config = dataclasses.replace(chosen.config_type(), steps=steps)
-        if hasattr(config, "samples_per_step"):  # many small steps suit a small scene
-            config = dataclasses.replace(config, samples_per_step=SAMPLES_PER_STEP)
+        config = getattr(
+            chosen, "quick_config", chosen.config_type
+        )()  # a backend may offer one for small scenes
+        config = config if steps is None else dataclasses.replace(config, steps=steps)
     except TypeError as error:
         raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has") from error
     with timed(f"trained on {len(seen)} views of the closed-form scene"):
