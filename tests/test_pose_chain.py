@@ -76,7 +76,9 @@ def test_zero_residual_at_the_truth() -> None:
     assert float(loss(problem, perturb(truth, 0.2, 5.0, seed=0))) > 1e-4
 
 
-SETTINGS = BidConfig(rays=512, max_steps=200, decay_steps=80, depth_weight=1.0, level=None)
+SETTINGS = BidConfig(
+    rays=512, max_steps=200, learning_rate=0.08, decay_steps=80, depth_weight=1.0, level=None
+)
 
 
 def test_a_view_finds_its_place() -> None:
