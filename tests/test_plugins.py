@@ -15,12 +15,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-UNFINISHED = {
-    "bidnerf-nerf-pytorch"
-}  # one law of the contract (the gradient to the pose) does not hold there yet
-PLUGINS = sorted(
-    file.parent for file in (ROOT / "plugins").glob("*/pyproject.toml") if file.parent.name not in UNFINISHED
-)
+PLUGINS = sorted(file.parent for file in (ROOT / "plugins").glob("*/pyproject.toml"))
 BUNDLED = {folder.name for folder in (ROOT / "backends").iterdir()}
 
 every_plugin = pytest.mark.parametrize("plugin", PLUGINS, ids=lambda plugin: plugin.name)

@@ -27,7 +27,8 @@ class NetworkConfig:
 class Network(nn.Module):
     """Positions (world) and unit directions to raw density and colour.
 
-    As in its original, the first layer has no activation.
+    As in its original, the first layer has no activation. Unlike there, density begins as thin fog: where a ReLU makes it
+    zero all over, no gradient brings it back.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -44,6 +45,7 @@ class Network(nn.Module):
             self.fc_feat = nn.Linear(width, width)
         else:
             self.fc_out = nn.Linear(width, 4)
+        nn.init.ones_(self.fc_alpha.bias if config.view_dependent else self.fc_out.bias[3:])
 
     def forward(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]

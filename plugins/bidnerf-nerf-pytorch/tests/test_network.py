@@ -54,3 +54,12 @@ def test_colour_without_directions() -> None:
     assert rgb.shape == (5, 3)
     assert torch.equal(again[0], density)
     assert torch.equal(again[1], rgb)
+
+
+@pytest.mark.parametrize("view_dependent", [True, False])
+def test_an_untrained_network_is_fog_everywhere(view_dependent: bool) -> None:
+    """What begins without density has no gradient by which to get any."""
+    net = Network(NetworkConfig(view_dependent=view_dependent))
+    density, rgb = net(torch.rand(500, 3) * 4 - 2, torch.randn(500, 3))
+    assert float(density.detach().min()) > 0
+    assert float(rgb.detach().abs().max()) < 1
