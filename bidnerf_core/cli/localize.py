@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as jsonlib
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +30,7 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.evaluation.errors import PoseError, pose_error
+from bidnerf_core.evaluation.trials import plain_localization
 from bidnerf_core.localization import METHODS, Localization, find_method, rig
 from bidnerf_core.localization import localize as find_pose
 from bidnerf_core.se3 import SE3
@@ -108,31 +108,9 @@ def _localize(
         raise InputError(f"{folder}: {found.method} came to a pose that is not finite, expected a sound map")
     error = pose_error(found.T_world_camera, truth)
     if as_json:
-        print_json(as_plain(found, stored.info.backend, error))
+        print_json(plain_localization(found, stored.info.backend, error))
     else:
         _print(found, views[-1].frame.name, pose_error(start, truth), error)
-
-
-def as_plain(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
-    """The object that ``localize --json`` prints."""
-    known = error and {"translation": float(error.translation), "rotation_deg": float(error.rotation_deg)}
-    return {
-        "T_world_camera": found.T_world_camera.matrix().tolist(),
-        "converged": found.converged,
-        "steps": found.steps,
-        "seconds": found.seconds,
-        "covariance": _covariance(found),
-        "loss": found.loss if math.isfinite(found.loss) else None,
-        "backend": backend,
-        "method": found.method,
-        "error": known,
-    }
-
-
-def _covariance(found: Localization) -> list[list[float]] | None:
-    """Rows, where it is known."""
-    covariance = found.covariance
-    return None if covariance is None or not bool(covariance.isfinite().all()) else covariance.tolist()
 
 
 def read_pose(path: Path) -> SE3:

@@ -1,0 +1,137 @@
+"""A trial depends on what it says alone, and its line says everything."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_core.cli import main
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
+from bidnerf_core.evaluation.trials import Trace, Trial, TrialResult, run_trial
+from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.se3 import SE3
+from tiny import backends_listed_once  # noqa: F401
+
+pytestmark = pytest.mark.usefixtures("backends_listed_once")
+QUICK = '{"max_steps": 4, "rays": 64}'
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("trials")
+    tiny.write_dataset(folder / "data")
+    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
+    return folder
+
+
+@pytest.fixture
+def trial(folder: Path) -> Trial:
+    return Trial(
+        str(folder / "map"), str(folder / "data"), ("t_0001",), "bid", (0.5,), "bid", config=QUICK, seed=3
+    )
+
+
+def timeless(result: TrialResult) -> TrialResult:
+    return dataclasses.replace(result, seconds=0.0, peak_memory_bytes=0)
+
+
+def test_a_line_has_what_localize_prints_and_more(
+    trial: Trial, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = to_plain(run_trial(trial))
+    capsys.readouterr()
+    assert main(["localize", str(folder / "map"), str(folder / "data"), "--frame", "t_0001", "--json",
+                 "--perturb", "0.1", "5", "--max-steps", "2", "--rays", "32"]) == 0  # fmt: skip
+    assert json.loads(capsys.readouterr().out).keys() <= line.keys()
+    assert json.loads(json.dumps(line, allow_nan=False)) == line
+    assert line["frame"] == "t_0001"
+    assert line["seed"] == 3
+    assert line["steps"] == 4
+    assert line["start_error"]["translation"] == pytest.approx(0.5, rel=0.01)  # exp bends it a little
+    assert line["start_error"]["rotation_deg"] == pytest.approx(math.degrees(0.2))
+    for kind in ("translation", "rotation_deg"):
+        assert len(line["errors"][kind]) == 5
+        assert line["errors"][kind][0] == pytest.approx(line["start_error"][kind])
+        assert line["errors"][kind][-1] == pytest.approx(line["error"][kind])
+    assert line["settings"]["rays"] == 64
+    assert line["settings"]["depth_weight"] == 1.0
+    assert line["weights"].startswith("weights-")
+    assert line["peak_memory_bytes"] > 10**7
+
+
+def test_its_error_is_that_of_its_pose(trial: Trial, folder: Path) -> None:
+    result = run_trial(trial)
+    matrix = torch.tensor(result.T_world_camera, dtype=torch.float64)
+    truth = tiny.views(3, seed=1)[1].T_ref_camera
+    error = pose_error(SE3.from_matrix(matrix), truth)
+    assert result.error is not None
+    assert result.error.translation == pytest.approx(float(error.translation), abs=1e-6)
+
+
+def test_the_same_trial_gives_the_same_line_here_and_elsewhere(trial: Trial) -> None:
+    first = timeless(run_trial(trial))
+    torch.manual_seed(17)
+    assert timeless(run_trial(trial)) == first
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        assert timeless(pool.submit(run_trial, trial).result()) == first
+    other = run_trial(dataclasses.replace(trial, seed=4))
+    assert other.start_error is not None
+    assert other.T_world_camera != first.T_world_camera
+
+
+def test_a_line_comes_back_from_json(trial: Trial) -> None:
+    result = run_trial(trial)
+    again = from_plain(TrialResult, json.loads(json.dumps(to_plain(result))), "line")
+    assert again == result
+    assert again.trial == trial
+    assert hash(trial) == hash(again.trial)
+
+
+def test_a_rig_is_judged_by_its_last_camera(trial: Trial) -> None:
+    result = run_trial(dataclasses.replace(trial, frames=("t_0000", "t_0002")))
+    assert result.frame == "t_0002"
+    assert result.trial.frames == ("t_0000", "t_0002")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"protocol": "bit"}, "no protocol 'bit', did you mean 'bid'"),
+        ({"size": ()}, "size is missing, expected e_t"),
+        ({"size": (0.1, 5.0)}, "size is 0.1:5, expected e_t"),
+        ({"config": '{"rays": 0}'}, "rays is 0"),
+        ({"config": "{"}, "not JSON"),
+        ({"config": '{"ray": 1}'}, "did you mean 'rays'"),
+        ({"protocol": "none", "size": ()}, "needs a start"),
+        ({"method": "magic"}, "method 'magic'"),
+        ({"frames": ("nope",)}, "no frame 'nope'"),
+    ],
+)
+def test_a_trial_that_cannot_be_is_refused(trial: Trial, change: dict, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        run_trial(dataclasses.replace(trial, **change))
+
+
+def test_a_trace_knows_what_was_not_finite() -> None:
+    trace = Trace((1.0, None), (2.0, 3.0)).as_error()
+    assert trace.translation.isnan().tolist() == [False, True]
+
+
+def test_peak_memory_is_of_what_went_on_since() -> None:
+    forget_peak_memory()
+    before = peak_memory_bytes()
+    block = torch.ones(40_000_000)
+    assert peak_memory_bytes() >= before + 100_000_000
+    del block
+    forget_peak_memory()
+    assert peak_memory_bytes() < before + 100_000_000
