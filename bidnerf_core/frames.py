@@ -25,6 +25,11 @@ class Frame:
     alpha: Float[Tensor, "ah aw"] | None = None
 
     def __post_init__(self) -> None:
+        if self.rgb.ndim != 3 or self.rgb.shape[-1] != 3:
+            raise InputError(
+                f"frame {self.name}: rgb has shape {tuple(self.rgb.shape)}, expected (height, width, 3); put alpha"
+                " apart and repeat grey three times"
+            )
         expected = (self.intrinsics.height, self.intrinsics.width)
         for what, image in (("rgb", self.rgb), ("depth", self.depth), ("alpha", self.alpha)):
             if image is not None and tuple(image.shape[:2]) != expected:

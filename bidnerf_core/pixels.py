@@ -36,7 +36,7 @@ class Pixels:
 
 @runtime_checkable
 class PixelDrawer(Protocol):
-    """Picks ``count`` pixels (column, row) of a frame."""
+    """Picks ``count`` pixels (column, row) of a frame; ``generator`` is on the CPU, and so is the answer."""
 
     def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]: ...
 
@@ -53,16 +53,27 @@ def all_pixels(frame: Frame) -> Int[Tensor, "n 2"]:
     return frame.intrinsics.pixel_centres().long().reshape(-1, 2)
 
 
-def observe(view: View, pixels: Int[Tensor, "n 2"], dtype: torch.dtype = torch.float32) -> Pixels:
-    """What ``view`` measured at ``pixels``, as half-lines of its reference frame."""
-    frame, (columns, rows) = view.frame, pixels.unbind(-1)
+def observe(
+    view: View,
+    pixels: Int[Tensor, "n 2"],
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,
+) -> Pixels:
+    """What ``view`` measured at ``pixels``, as half-lines of its reference frame, on ``device`` (default: the image's)."""
+    frame = view.frame
+    pixels = pixels.cpu()  # few, and a camera computes there
+    columns, rows = pixels.to(frame.rgb.device).unbind(-1)
     ray = frame.intrinsics.unproject(pixels.double() + 0.5)  # z = 1
     length = torch.linalg.vector_norm(ray, dim=-1)
-    depth = torch.zeros_like(length) if frame.depth is None else frame.depth[rows, columns].double()
-    directions = view.T_ref_camera.to(torch.float64).rotate(ray / length[:, None])
-    origins = view.T_ref_camera.to(torch.float64).translation.expand_as(directions)
-    rgb = frame.rgb[rows, columns]
-    return Pixels(origins.to(dtype), directions.to(dtype), rgb.to(dtype), (depth * length).to(dtype))
+    depth = torch.zeros_like(length)
+    if frame.depth is not None:
+        depth = frame.depth[rows.to(frame.depth.device), columns.to(frame.depth.device)].to(length)
+    T = view.T_ref_camera.to(length)
+    directions = T.rotate(ray / length[:, None])
+    origins = T.translation.expand_as(directions)
+    there = frame.rgb.device if device is None else device
+    parts = (origins, directions, frame.rgb[rows, columns], depth * length)
+    return Pixels(*(part.to(device=there, dtype=dtype) for part in parts))
 
 
 def draw(
@@ -71,10 +82,14 @@ def draw(
     drawer: PixelDrawer,
     generator: Generator,
     dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,
 ) -> Pixels:
-    """``count`` pixels shared out equally among the views; every tensor has leading axes (views, pixels a view)."""
+    """``count`` pixels shared out equally among the views; every tensor has leading axes (views, pixels a view).
+
+    Images may lie anywhere; what was drawn lies on ``device``, by default where the images are.
+    """
     share = max(1, count // len(views))
-    parts = [observe(view, drawer(view.frame, share, generator), dtype) for view in views]
+    parts = [observe(view, drawer(view.frame, share, generator), dtype, device) for view in views]
     return Pixels(
         torch.stack([p.origins for p in parts]),
         torch.stack([p.directions for p in parts]),
@@ -87,7 +102,7 @@ def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"
     """The median by axis of the points that ``views`` measured, in their reference frame; None where there are none."""
     points = []
     for view in views:
-        pixels = observe(view, all_pixels(view.frame)[::stride], torch.float64)
+        pixels = observe(view, all_pixels(view.frame)[::stride], torch.float64, "cpu")
         measured = pixels.distance > 0
         points.append((pixels.origins + pixels.distance[:, None] * pixels.directions)[measured])
     together = torch.cat(points)

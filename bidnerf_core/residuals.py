@@ -2,12 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.pixels import Pixels
 from bidnerf_core.rendering import Rendering
+from bidnerf_core.robust import Robust, huber
+
+__all__ = ["Objective", "depth", "huber", "masked_mean", "objective", "photometric"]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What a rendering is judged by: robust errors of colour, and of depth with its weight (lambda_d)."""
+
+    colour: Robust
+    depth: Robust  # its scale is in metres
+    depth_weight: float
+
+    def __call__(self, rendering: Rendering, pixels: Pixels) -> Float[Tensor, ""]:
+        """``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6), for pixels of shape (views, pixels).
+
+        The colour term sums rho over the three channels; the depth term is a mean over the rays where depth was measured.
+        """
+        colour = self.colour(photometric(rendering, pixels)).sum(-1).mean(-1)
+        if self.depth_weight == 0:
+            return colour.mean()
+        distance = masked_mean(self.depth(depth(rendering, pixels)), pixels.distance > 0)
+        return (colour + self.depth_weight * distance).mean()
 
 
 def photometric(rendering: Rendering, pixels: Pixels) -> Float[Tensor, "*p 3"]:
@@ -20,12 +45,6 @@ def depth(rendering: Rendering, pixels: Pixels) -> Float[Tensor, "*p"]:
     return torch.where(pixels.distance > 0, rendering.distance - pixels.distance, 0)
 
 
-def huber(residual: Float[Tensor, "*p"], delta: float) -> Float[Tensor, "*p"]:
-    """Huber's rho: ``r^2 / 2`` up to ``delta``, then linear with slope ``delta``."""
-    size = residual.abs()
-    return torch.where(size <= delta, 0.5 * size**2, delta * (size - 0.5 * delta))
-
-
 def masked_mean(values: Float[Tensor, "*k p"], mask: Bool[Tensor, "*k p"]) -> Float[Tensor, "*k"]:
     """Mean over the last axis where ``mask`` holds; 0 where it holds nowhere."""
     kept = torch.where(mask, values, 0)
@@ -33,10 +52,5 @@ def masked_mean(values: Float[Tensor, "*k p"], mask: Bool[Tensor, "*k p"]) -> Fl
 
 
 def objective(rendering: Rendering, pixels: Pixels, delta: float, depth_weight: float) -> Float[Tensor, ""]:
-    """``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6), for pixels of shape (views, pixels).
-
-    The colour term sums rho over the three channels; the depth term is a mean over the rays where depth was measured.
-    """
-    colour = huber(photometric(rendering, pixels), delta).sum(-1).mean(-1)
-    distance = masked_mean(huber(depth(rendering, pixels), delta), pixels.distance > 0)
-    return (colour + depth_weight * distance).mean()
+    """The paper's: Huber's rho for colour and depth alike."""
+    return Objective(Robust("huber", delta), Robust("huber", delta), depth_weight)(rendering, pixels)

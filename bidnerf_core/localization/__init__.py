@@ -1,6 +1,7 @@
 """Finding poses: ``localize`` and its parts."""
 
-from bidnerf_core.localization.adam import BidConfig
+from bidnerf_core.localization.bid import BidConfig
+from bidnerf_core.localization.inerf import InerfConfig
 from bidnerf_core.localization.methods import METHODS, Method, find_method, localize
 from bidnerf_core.localization.problem import Problem, rig, single
 from bidnerf_core.localization.result import Localization
@@ -8,6 +9,7 @@ from bidnerf_core.localization.result import Localization
 __all__ = [
     "METHODS",
     "BidConfig",
+    "InerfConfig",
     "Localization",
     "Method",
     "Problem",

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.adam import BidConfig, bid
+from bidnerf_core.localization.bid import BidConfig, bid
+from bidnerf_core.localization.inerf import InerfConfig, inerf
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 
@@ -21,7 +22,10 @@ class Method:
     summary: str
 
 
-METHODS = {"bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)")}
+METHODS = {
+    "bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)"),
+    "inerf": Method(inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)"),
+}
 
 AUTO = "bid"
 """What ``auto`` stands for."""

@@ -36,6 +36,15 @@ class Problem:
     def has_depth(self) -> bool:
         return any(view.frame.has_depth for view in self.views)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the field computes; rays are brought there."""
+        for kind in ("parameters", "buffers"):
+            first = next(iter(getattr(self.field, kind, tuple)()), None)
+            if isinstance(first, torch.Tensor):
+                return first.device
+        return torch.device("cpu")
+
     def level(self, number: int | None) -> RadianceField:
         """A level of the field, counted from the coarsest, negative from the finest; ``None`` is the field itself."""
         if number is None:

@@ -1,0 +1,59 @@
+"""What a step turns about: the frame in which updates of the pose are written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.pixels import measured_middle
+from bidnerf_core.se3 import SE3
+
+PivotName = Literal["scene", "camera", "world"]
+
+
+@dataclass(frozen=True, eq=False)
+class Pivot:
+    """A place that is fixed to the camera, or the world's origin."""
+
+    T_camera_pivot: SE3 | None  # a translation; None: the world's own frame
+
+    @property
+    def reach(self) -> float:
+        """Metres by which a turn of one radian moves the camera, if that is more than 1.
+
+        Steps of both kinds are to move it equally far; in the world's frame, iNeRF takes them as they come.
+        """
+        return 1.0 if self.T_camera_pivot is None else max(1.0, float(self.T_camera_pivot.translation.norm()))
+
+    def moved(self, T: SE3, delta: Float[Tensor, "6"]) -> SE3:
+        """``T`` after the update ``delta``; differentiable in it."""
+        if self.T_camera_pivot is None:
+            return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
+        return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
+
+
+def pivot(name: PivotName, problem: Problem) -> Pivot:
+    """A pivot by name: the camera (the paper's), the world's origin (iNeRF's), or the middle of what is seen.
+
+    For a camera some metres away, a turn and a sideways motion look almost alike: in its own frame the objective is a
+    long narrow valley, along which first-order steps crawl. About the middle of what the camera sees, the two part.
+    """
+    if name == "world":
+        return Pivot(None)
+    return Pivot(
+        SE3.identity() if name == "camera" else SE3(torch.eye(3, dtype=torch.float64), _middle(problem))
+    )
+
+
+def _middle(problem: Problem) -> Float[Tensor, "3"]:
+    """Of what was measured or, failing that, of the scene: in the last camera's frame."""
+    point = measured_middle(problem.views)
+    if point is not None:
+        return point
+    corners = torch.tensor([problem.bounds.lower, problem.bounds.upper], dtype=torch.float64)
+    return problem.start.inverse().apply(corners.mean(0))

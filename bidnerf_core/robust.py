@@ -1,0 +1,68 @@
+"""Robust losses: how much a residual counts.
+
+All are ``r^2 / 2`` for residuals that are small beside their scale, so that one may stand in for another without a change
+of weights; ``l1`` is the slope that ``huber`` ends in. Names and shapes are those of Barron 2019, "A general and adaptive
+robust loss function" (eqs. 7, 13 to 16), times the squared scale.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+
+RobustName = Literal["huber", "l2", "l1", "cauchy", "geman-mcclure"]
+
+
+def huber(residual: Float[Tensor, "*p"], delta: float) -> Float[Tensor, "*p"]:
+    """Huber's rho: ``r^2 / 2`` up to ``delta``, then linear with slope ``delta``."""
+    size = residual.abs()
+    return torch.where(size <= delta, 0.5 * size**2, delta * (size - 0.5 * delta))
+
+
+def l2(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
+    """``r^2 / 2``, whatever the scale."""
+    return 0.5 * residual**2
+
+
+def l1(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
+    """``scale |r|``; its derivative at 0 is 0."""
+    return scale * residual.abs()
+
+
+def cauchy(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
+    """``c^2 log(1 + (r/c)^2 / 2)``: far residuals pull the less, the farther they are."""
+    return scale**2 * torch.log1p(0.5 * (residual / scale) ** 2)
+
+
+def geman_mcclure(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
+    """``2 c^2 r^2 / (r^2 + 4 c^2)``: bounded by ``2 c^2``, so that far residuals pull hardly at all."""
+    squared = (residual / scale) ** 2
+    return scale**2 * 2 * squared / (squared + 4)
+
+
+LOSSES: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
+    "huber": huber, "l2": l2, "l1": l1, "cauchy": cauchy, "geman-mcclure": geman_mcclure,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Robust:
+    """A robust loss with its scale, in the unit of the residuals."""
+
+    name: RobustName
+    scale: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise InputError(f"scale of the robust loss is {self.scale}, expected a positive number")
+
+    def __call__(self, residual: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
+        return LOSSES[self.name](residual, self.scale)
