@@ -3,7 +3,8 @@
     python benchmarks/map_quality.py DATA --out MAP --name map_lego [-- OPTIONS OF bidnerf train]
 
 Records wall time and peak memory of ``bidnerf train`` as a process, the size of the map, and on the test split the PSNR
-of images and the absolute error of depth where depth was measured.
+of images, the absolute error of depth where depth was measured, and how many samples a ray takes. A field that offers
+``dense``, itself without the choice of samples that makes it fast, is judged beside that on every fifth frame.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from kornia.metrics import psnr, ssim
@@ -55,10 +57,32 @@ def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[
         "psnr_mean_dB": statistics.fmean(quality),
         "psnr_lowest_dB": min(quality),
         "ssim_mean": statistics.fmean(likeness),
+        "samples_per_ray": samples_per_ray(field, bounds, views),
         "depth_error_median": float(depth.median()) if len(depth) else None,
         "depth_error_p90": float(depth.quantile(0.9)) if 0 < len(depth) < 2**24 else None,
         "share_of_measured_pixels_without_rendered_depth": missing / measured if measured else None,
     }
+
+
+@torch.no_grad()
+def samples_per_ray(field: RadianceField, bounds: SceneBounds, views: list[View]) -> float:
+    """Mean number of queried samples over every fourth pixel along each axis, those that miss the scene included."""
+    taken, rays = 0, 0
+    for view in views:
+        ray = view.frame.intrinsics.unproject(view.frame.intrinsics.pixel_centres())[::4, ::4].reshape(-1, 3)
+        T = view.T_ref_camera.to(dtype=torch.float32)
+        turned = T.rotate(ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True))
+        taken += int(field.sampler(bounds.rays(T.translation.expand_as(turned), turned)).valid.sum())
+        rays += len(turned)
+    return taken / rays
+
+
+def beside_dense(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, Any] | None:
+    """The field and its ``dense`` twin on the same frames, fewer of them: the twin is slow."""
+    dense = getattr(field, "dense", None)
+    if dense is None:
+        return None
+    return {name: judge(f, bounds, views[::5]) for name, f in (("field", field), ("dense", dense))}
 
 
 def main() -> None:
@@ -83,6 +107,8 @@ def main() -> None:
         "map_MiB": sum(f.stat().st_size for f in given.out.iterdir()) / 2**20,
         "levels": [judge(level, stored.bounds, views) for level in levels(stored.field)],
     }
+    if compared := beside_dense(stored.field, stored.bounds, views):
+        results["beside_dense"] = compared
     print(write_record(given.name, results, seed=stored.info.config.get("seed", 0)))
     print({k: v for k, v in results.items() if k != "config"})
 

@@ -12,8 +12,9 @@ from torch import Generator, Tensor
 
 from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
 from bidnerf_adanerf.bins import Bins, chosen
-from bidnerf_adanerf.dense import Room, dense_samples, render_softly
-from bidnerf_adanerf.recipe import depth_lesson, sparsity
+from bidnerf_adanerf.dense import Room, dense_samples, opacity, render_softly, soft_student
+from bidnerf_adanerf.lessons import ENOUGH, by_depth, by_weight, lesson
+from bidnerf_adanerf.recipe import Phase, phase_at, sparsity
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.closed_form import views as seen_from
 from bidnerf_core.errors import InputError
@@ -185,6 +186,24 @@ def test_a_score_weighs_the_opacity_of_its_bin(rays: Rays) -> None:
     torch.testing.assert_close(found, expected, atol=2e-5, rtol=0)
 
 
+def test_bins_that_will_be_shaded_count_fully_in_the_soft_phase() -> None:
+    scores = torch.tensor([[0.0, 0.05, 0.1, 0.2, 0.7, 1.0]], requires_grad=True)
+    counted = soft_student(scores, 0.2)
+    torch.testing.assert_close(counted.detach(), torch.tensor([[0.0, 0.25, 0.5, 1.0, 1.0, 1.0]]))
+    counted.sum().backward()
+    assert scores.grad is not None
+    assert bool((scores.grad[0, :3] > 0).all())  # what a picture lacks, the oracle can call back
+    assert torch.equal(soft_student(scores.detach(), 0.0)[0, 1:], torch.ones(5))
+
+
+def test_opacity_is_that_of_the_bins_asked_about(rays: Rays) -> None:
+    samples, values = Bins(BOUNDS, 16)(rays), made_values(len(rays.near))
+    which = samples.valid & (torch.arange(16) == 3)
+    expected = 1 - torch.exp(-values.density * (samples.ends - samples.starts))
+    torch.testing.assert_close(opacity(values, samples, which), expected[which].mean())
+    assert float(opacity(values, samples, torch.zeros_like(which))) == 0
+
+
 def test_gradients_of_soft_rendering_are_finite_where_all_is_opaque(rays: Rays) -> None:
     samples = Bins(BOUNDS, 16)(rays)
     density = torch.full_like(samples.starts, 1e6).requires_grad_()
@@ -211,29 +230,82 @@ def test_bins_without_room_for_matter_are_shaded_now_and_then(
     assert int(dense_samples(field, rays, None, generator)[0].valid.sum()) == int(every.valid.sum())
 
 
-def test_measured_depth_teaches_the_oracle(rays: Rays) -> None:
+# What the oracle is taught.
+
+
+@pytest.fixture
+def lessons(rays: Rays) -> tuple[RaySamples, RayBatch]:
+    """All bins of rays that meet the scene in the middle of their sixth bin."""
     rays = Rays(*(x[hit(rays)] for x in (rays.origins, rays.directions, rays.near, rays.far)))
     samples, count = Bins(BOUNDS, 16)(rays), len(rays.near)
-    distance = samples.middles[:, 5]
-    batch = RayBatch(rays, torch.zeros(count, 3), distance, torch.zeros(count, 3))
-    logits = torch.zeros(count, 16, requires_grad=True)
-    depth_lesson(logits, samples, batch).backward()
+    return samples, RayBatch(rays, torch.zeros(count, 3), samples.middles[:, 5], torch.zeros(count, 3))
+
+
+def test_measured_depth_teaches_the_oracle(lessons: tuple[RaySamples, RayBatch]) -> None:
+    samples, batch = lessons
+    logits = torch.zeros_like(samples.starts, requires_grad=True)
+    lesson(logits, samples, torch.zeros_like(logits), batch).backward()
     assert logits.grad is not None
     assert bool((logits.grad[:, 5] < 0).all())  # the score is to rise at the surface
     assert bool((logits.grad[:, [0, 1, 2, 8, 9, 15]] > 0).all())  # and to fall elsewhere
-    nothing = replace(batch, distance=torch.zeros(count))
-    assert float(depth_lesson(logits, samples, nothing)) == 0
+    unmeasured = replace(batch, distance=torch.zeros_like(batch.distance))
+    assert float(by_depth(samples, unmeasured).max()) == 0
+    torch.testing.assert_close(by_depth(samples, batch)[:, 5], torch.ones(len(samples.starts)))
+
+
+def test_shaded_bins_teach_the_oracle_without_depth(lessons: tuple[RaySamples, RayBatch]) -> None:
+    samples, batch = lessons
+    unmeasured = replace(batch, distance=torch.zeros_like(batch.distance))
+    logits = torch.zeros_like(samples.starts, requires_grad=True)
+    weights = torch.zeros_like(logits)
+    weights[:, 9] = 0.9
+    weights.requires_grad_()
+    lesson(logits, samples, weights, unmeasured).backward()
+    assert logits.grad is not None
+    assert weights.grad is None  # the shading network is the teacher
+    assert bool((logits.grad[:, 9] < 0).all())
+    assert bool((logits.grad[:, :8] > 0).all() and (logits.grad[:, 11:] > 0).all())
+
+
+def test_a_bin_matters_more_the_more_weight_it_has() -> None:
+    weights = torch.zeros(5, 16)
+    weights[:, 7] = torch.tensor([0.0, 0.1, 0.4, 1.0, 3.0]) * ENOUGH
+    target = by_weight(weights)
+    torch.testing.assert_close(target[:, 7], torch.tensor([0.0, 0.1, 0.4, 1.0, 1.0]))
+    assert bool((target[1:4, 6] < target[1:4, 7]).all())
+    assert torch.equal(target[:, 6], target[:, 8])
+    assert float(target[:, [5, 9]].max()) == 0
+
+
+def test_rays_that_miss_the_scene_teach_nothing(rays: Rays) -> None:
+    samples, count = Bins(BOUNDS, 16)(rays), len(rays.near)
+    batch = RayBatch(rays, torch.zeros(count, 3), torch.zeros(count), torch.zeros(count, 3))
+    logits = torch.ones_like(samples.starts, requires_grad=True)
+    lesson(logits, samples, torch.zeros_like(logits), batch).backward()
+    assert logits.grad is not None
+    assert float(logits.grad[~hit(rays)].abs().max()) == 0
+    assert float(logits.grad[hit(rays)].abs().min()) > 0
 
 
 # Phases.
 
 
 def test_sparsity_comes_by_schedule() -> None:
-    config = replace(SMALL, steps=100, dense_part=0.4, sparse_part=0.2)
+    config = replace(SMALL, steps=100, dense_part=0.4, soft_part=0.2)
     weights = [sparsity(step, config) for step in range(60)]
     assert set(weights[:41]) == {0.0}
     assert weights[40:51] == sorted(weights[40:51])
+    assert len(set(weights[40:51])) == 11
     assert set(weights[50:]) == {config.sparsity_weight}
+
+
+@pytest.mark.parametrize("parts", [(0.4, 0.2), (0.0, 0.5), (1.0, 0.0), (0.0, 0.0), (0.5, 0.5)])
+def test_phases_follow_each_other(parts: tuple[float, float]) -> None:
+    config = replace(SMALL, steps=100, dense_part=parts[0], soft_part=parts[1])
+    found = [phase_at(step, config) for step in range(100)]
+    counts = [found.count(phase) for phase in (Phase.DENSE, Phase.SOFT, Phase.SPARSE)]
+    assert found == sorted(found, key=list(Phase).index)
+    assert counts == [round(100 * part) for part in (*parts, 1 - sum(parts))]
 
 
 def phases(field: AdaNerfField, config: AdaNerfConfig, report: Any) -> list[bool]:
@@ -253,14 +325,14 @@ def phases(field: AdaNerfField, config: AdaNerfConfig, report: Any) -> list[bool
 
 
 def test_phases_advance_by_schedule_and_the_oracle_is_frozen_in_the_last() -> None:
-    config = replace(SMALL, steps=20, dense_part=0.3, sparse_part=0.3)
+    config = replace(SMALL, steps=20, dense_part=0.3, soft_part=0.3)
     learned = phases(backend.build(config, BOUNDS), config, Recorder())
     assert learned == [True] * 12 + [False] * 8
 
 
 @pytest.mark.parametrize("at", [3, 6, 9, 12, 16])
 def test_training_resumes_in_any_phase(at: int) -> None:
-    config = replace(SMALL, steps=20, dense_part=0.3, sparse_part=0.3)
+    config = replace(SMALL, steps=20, dense_part=0.3, soft_part=0.3)
     whole, report = backend.build(config, BOUNDS), Recorder(due=[at])
     backend.train(whole, rgbd_views(), config, report)
     rest, resumed = backend.build(config, BOUNDS), Recorder(state=report.saved[0])
@@ -286,6 +358,7 @@ def test_samples_become_fewer_and_the_picture_stays(depth: bool) -> None:
 
 
 def test_rooms_are_learnt_from_within() -> None:
+    """Seen from its middle."""
     room = demo_room()
     camera = Intrinsics(16.0, 16.0, 12.0, 12.0, 24, 24)
     views: list[View] = seen_from(room, camera, look_around(room.bounds, 8))
@@ -296,7 +369,7 @@ def test_rooms_are_learnt_from_within() -> None:
     batch = RayBank(views, room.bounds).draw(256, torch.Generator().manual_seed(1))
     rendering = render(field, batch.rays, batch.background)
     away = (rendering.distance - batch.distance).abs()
-    assert float(away.median()) < 0.15 * max(room.bounds.size)
+    assert float(away.detach().median()) < 0.15 * max(room.bounds.size)
 
 
 # Settings.
@@ -306,7 +379,7 @@ def test_settings_are_judged() -> None:
     with pytest.raises(InputError, match="bins is 0, expected 1 or more"):
         AdaNerfConfig(bins=0)
     with pytest.raises(InputError, match=r"make 1\.2, expected 1 or less"):
-        AdaNerfConfig(dense_part=0.7, sparse_part=0.5)
+        AdaNerfConfig(dense_part=0.7, soft_part=0.5)
 
 
 def test_presets() -> None:

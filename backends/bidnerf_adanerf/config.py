@@ -10,13 +10,13 @@ LEAST = {
     "width": 1, "layers": 1, "position_frequencies": 0, "direction_frequencies": 0, "oracle_width": 1,
     "oracle_layers": 1, "ray_points": 2, "ray_frequencies": 0, "bins": 1, "max_samples": 1, "threshold": 0, "steps": 1,
     "samples_per_step": 1, "rays_at_most": 1, "learning_rate": 0, "depth_weight": 0, "sparsity_weight": 0,
-    "oracle_weight": 0, "dense_part": 0, "sparse_part": 0, "room_resolution": 2, "seed": 0,
+    "oracle_weight": 0, "empty_weight": 0, "dense_part": 0, "soft_part": 0, "room_resolution": 2, "seed": 0,
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class AdaNerfConfig:
-    """The defaults suit some forty minutes on a small CPU."""
+    """The defaults suit some ten minutes on one core of a small CPU."""
 
     # The shading network.
     width: int = 128  # of the hidden layers
@@ -24,29 +24,26 @@ class AdaNerfConfig:
     position_frequencies: int = 8
     direction_frequencies: int = 2
     # The sampling network, called oracle.
-    oracle_width: int = 128
+    oracle_width: int = 256
     oracle_layers: int = 3
     ray_points: int = 16  # points of a ray that describe it to the oracle
     ray_frequencies: int = 3  # with which each of them is encoded
     # How many samples a ray takes: the user's dial. It may be turned on a trained map.
     bins: int = 64  # equal parts of a ray's way through the scene's box, each with a score
-    threshold: float = 0.2  # a bin whose score is above it is shaded ...
-    max_samples: int = 8  # ... if it is among so many of its ray with the highest scores
+    threshold: float = 0.1  # a bin whose score is above it is shaded ...
+    max_samples: int = 12  # ... if it is among so many of its ray with the highest scores
     # Training.
-    steps: int = 6000
-    dense_part: float = 0.4  # of the steps: all bins are shaded
-    sparse_part: float = (
-        0.2  # of the steps that follow: scores are made sparse; the rest is for sparse shading
-    )
-    samples_per_step: int = 16384  # the number of rays follows from it
+    steps: int = 8000
+    dense_part: float = 0.4  # of the steps: all bins are shaded and count
+    soft_part: float = 0.25  # of the steps, then: bins count as their scores say; the rest shades sparsely
+    samples_per_step: int = 8192  # the number of rays follows from it
     rays_at_most: int = 4096  # per step
-    learning_rate: float = 2e-3
+    learning_rate: float = 3e-3
     depth_weight: float = 0.1
-    sparsity_weight: float = 0.05  # of the mean score, at the end of the sparse phase
-    oracle_weight: float = 0.1  # of what measured depth teaches the oracle
-    carve: bool = (
-        True  # in training, take bins as empty that the views' depth and silhouettes leave no matter in
-    )
+    sparsity_weight: float = 0.01  # of the mean score, once the soft phase is half over
+    oracle_weight: float = 0.1  # of what measured depth and the shaded bins teach the oracle
+    empty_weight: float = 0.1  # of the opacity of bins that are known to be empty
+    carve: bool = True  # in training, take bins as empty where depth and silhouettes leave no matter
     room_resolution: int = 64  # cells along the longest side of the scene, for that
     seed: int = 0
 
@@ -55,9 +52,9 @@ class AdaNerfConfig:
             value = getattr(self, name)
             if not value >= least:
                 raise InputError(f"{name} is {value}, expected {least} or more")
-        if not self.dense_part + self.sparse_part <= 1:
-            parts = self.dense_part + self.sparse_part
-            raise InputError(f"dense_part and sparse_part make {parts:g}, expected 1 or less together")
+        if not self.dense_part + self.soft_part <= 1:
+            parts = self.dense_part + self.soft_part
+            raise InputError(f"dense_part and soft_part make {parts:g}, expected 1 or less together")
 
     @classmethod
     def small(cls) -> AdaNerfConfig:

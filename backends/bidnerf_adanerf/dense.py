@@ -56,13 +56,22 @@ def dense_samples(
     return replace(samples, valid=samples.valid & held | probed), probed
 
 
+def soft_student(scores: Float[Tensor, "r n"], threshold: float) -> Float[Tensor, "r n"]:
+    """How much bins count in the soft phase: those above the threshold fully, as they will, the others in proportion.
+
+    In the paper a bin counts as much as its score itself. Matter then has to be denser than it is where scores are
+    middling, and is too dense once those bins count fully: on Lego the dense rendering lost 1 dB in this phase.
+    """
+    return (scores / max(threshold, 1e-6)).clamp(max=1)
+
+
 def render_softly(
     values: FieldValues,
     samples: RaySamples,
     scores: Float[Tensor, "r n"],
     background: Float[Tensor, "r 3"],
 ) -> Rendering:
-    """Volume rendering in which each bin's opacity is multiplied with its score (Kurz et al. 2022, section 3)."""
+    """Volume rendering in which each bin's opacity is multiplied with a score (Kurz et al. 2022, section 3)."""
     absorbed = torch.where(samples.valid, values.density * (samples.ends - samples.starts), 0)
     alpha = -torch.expm1(-absorbed) * scores
     passed = torch.log1p(-alpha * (1 - 1e-6))  # its logarithm; the factor keeps it finite
@@ -70,3 +79,9 @@ def render_softly(
     opacity = weights.sum(-1)
     rgb = (weights[..., None] * values.rgb).sum(-2) + (1 - opacity)[..., None] * background
     return Rendering(rgb, (weights * samples.middles).sum(-1), opacity, weights, samples)
+
+
+def opacity(values: FieldValues, samples: RaySamples, which: Bool[Tensor, "r n"]) -> Float[Tensor, ""]:
+    """Mean of ``1 - exp(-sigma dt)`` over some of the bins, without scores."""
+    absorbed = (values.density * (samples.ends - samples.starts))[which]
+    return -torch.expm1(-absorbed).sum() / which.sum().clamp(min=1)

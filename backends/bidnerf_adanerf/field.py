@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -68,6 +69,9 @@ class DenseField:
     """The same field shaded in all its bins, without the oracle: what the sparse one is to look like."""
 
     sparse: AdaNerfField
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        return self.sparse.parameters()
 
     @property
     def sampler(self) -> Bins:
