@@ -28,14 +28,15 @@ class AdaNerfConfig:
     oracle_layers: int = 3
     ray_points: int = 16  # points of a ray that describe it to the oracle
     ray_frequencies: int = 3  # with which each of them is encoded
-    # How many samples a ray takes: the user's dial. It may be turned on a trained map.
+    # How many samples a ray takes: the user's dial. It may be turned on a trained map. Fewer samples are faster, but holes
+    # in the picture, where bins are missed, lead a pose astray long before they are seen.
     bins: int = 64  # equal parts of a ray's way through the scene's box, each with a score
-    threshold: float = 0.1  # a bin whose score is above it is shaded ...
-    max_samples: int = 12  # ... if it is among so many of its ray with the highest scores
+    threshold: float = 0.03  # a bin whose score is above it is shaded ...
+    max_samples: int = 16  # ... if it is among so many of its ray with the highest scores
     # Training.
-    steps: int = 8000
+    steps: int = 4500
     dense_part: float = 0.4  # of the steps: all bins are shaded and count
-    soft_part: float = 0.25  # of the steps, then: bins count as their scores say; the rest shades sparsely
+    soft_part: float = 0.2  # of the steps, then: bins count as their scores say; the rest shades sparsely
     samples_per_step: int = 8192  # the number of rays follows from it
     rays_at_most: int = 4096  # per step
     learning_rate: float = 3e-3
