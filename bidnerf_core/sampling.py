@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.field import RadianceField, Rays, RaySamples
@@ -37,8 +37,8 @@ class Stratified:
 class Importance:
     """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` puts its weight.
 
-    The field's own intervals are kept as well, so the result has ``count`` more of them; no gradient flows through the
-    choice of place.
+    The field's own valid intervals are cut further, into ``count`` more of them; what its sampler leaves out, as an
+    occupancy grid does, stays out. No gradient flows through the choice of place.
     """
 
     field: RadianceField
@@ -46,20 +46,23 @@ class Importance:
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         with torch.no_grad():
-            rough = self.field.sampler(rays, jitter)
+            rough = _gathered(self.field.sampler(rays, jitter))
+            if rough.starts.shape[-1] == 0:
+                return rough
             weights = rendering_weights(query_samples(self.field, rays, rough).density, rough)
-            added = inverse_transform(rough, weights + 1e-5, self.count, jitter)
-            borders = torch.cat([rough.starts, rough.ends[..., -1:], added], dim=-1).sort(dim=-1).values
-        starts, ends = borders[..., :-1], borders[..., 1:]
-        return RaySamples(starts, ends, (rays.far > rays.near)[..., None].expand_as(starts))
+            weights = torch.where(rough.valid, weights + 1e-5, 0)
+            return _cut(rough, *inverse_transform(rough, weights, self.count, jitter))
 
 
 def inverse_transform(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
-) -> Float[Tensor, "*r n"]:
-    """``count`` distances distributed as ``weights``, piecewise constant over the intervals, by inverting their CDF."""
+) -> tuple[Float[Tensor, "*r n"], Int[Tensor, "*r n"]]:
+    """``count`` distances distributed as ``weights``, piecewise constant over the intervals, by inverting their CDF.
+
+    In ascending order, and with the interval in which each lies. A ray without any weight has them in its first interval.
+    """
     cdf = torch.cumsum(weights, dim=-1)
-    cdf = cdf / cdf[..., -1:]
+    cdf = cdf / cdf[..., -1:].clamp(min=torch.finfo(cdf.dtype).tiny)
     places = (torch.arange(count, dtype=cdf.dtype, device=cdf.device) + 0.5) / count
     places = places.expand(*cdf.shape[:-1], count).contiguous()
     if jitter is not None:
@@ -71,4 +74,33 @@ def inverse_transform(
     below = torch.cat([torch.zeros_like(cdf[..., :1]), cdf], dim=-1).gather(-1, index)
     width = (cdf.gather(-1, index) - below).clamp(min=torch.finfo(cdf.dtype).tiny)
     start, end = samples.starts.gather(-1, index), samples.ends.gather(-1, index)
-    return start + (end - start) * ((places - below) / width).clamp(0, 1)
+    distances = start + (end - start) * ((places - below) / width).clamp(0, 1)
+    return torch.minimum(distances, end), index
+
+
+def _gathered(samples: RaySamples) -> RaySamples:
+    """The same with valid intervals first, and without the overlaps that rounding makes."""
+    order = (~samples.valid).sort(dim=-1, stable=True).indices
+    starts, ends, valid = (part.gather(-1, order) for part in (samples.starts, samples.ends, samples.valid))
+    following = torch.where(valid, starts, torch.inf)[..., 1:]
+    following = torch.cat([following, torch.full_like(ends[..., :1], torch.inf)], dim=-1)
+    return RaySamples(starts, torch.maximum(starts, torch.minimum(ends, following)), valid)
+
+
+def _cut(rough: RaySamples, places: Float[Tensor, "*r n"], owner: Int[Tensor, "*r n"]) -> RaySamples:
+    """``rough``, gathered, with a border more at each of ``places``, which lie in the intervals ``owner``.
+
+    A piece begins at the start of an interval or at a place in it, and reaches to the next such or to the interval's end.
+    """
+    first = torch.arange(rough.starts.shape[-1], device=owner.device).expand(rough.starts.shape)
+    owner = torch.cat([owner, first], dim=-1)
+    valid = rough.valid.gather(-1, owner)
+    # Places go first: of a place and a start at the same distance, the piece from the start is the longer one.
+    starts, order = (
+        torch.cat([places, rough.starts], dim=-1).where(valid, torch.inf).sort(dim=-1, stable=True)
+    )
+    owner, valid = owner.gather(-1, order), valid.gather(-1, order)
+    following = torch.cat([starts[..., 1:], torch.full_like(starts[..., :1], torch.inf)], dim=-1)
+    ends = torch.minimum(rough.ends.gather(-1, owner), following)
+    last = rough.ends.amax(-1, keepdim=True)  # somewhere finite, for what is not valid
+    return RaySamples(starts.where(valid, last), ends.where(valid, last), valid)

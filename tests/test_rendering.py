@@ -167,7 +167,8 @@ def test_importance_sampling_gathers_where_the_weight_is() -> None:
     borders = torch.linspace(0, 8, 9)[None]
     rough = RaySamples(borders[:, :-1], borders[:, 1:], torch.ones(1, 8, dtype=torch.bool))
     weights = torch.tensor([[0, 0, 3.0, 0, 0, 1.0, 0, 0]])
-    found = inverse_transform(rough, weights, 400, None)
+    found, owner = inverse_transform(rough, weights, 400, None)
+    assert set(owner.unique().tolist()) == {2, 5}
     assert float(((found >= 2) & (found <= 3)).float().mean()) == pytest.approx(0.75, abs=0.01)
     assert float(((found >= 5) & (found <= 6)).float().mean()) == pytest.approx(0.25, abs=0.01)
     # uniform within an interval

@@ -1,0 +1,138 @@
+"""Laws of importance sampling over samplers of any kind: with gaps, with samples that are not valid, with none at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Generator
+
+from bidnerf_core.closed_fields import GaussianBlobs, HomogeneousBall
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds
+from bidnerf_core.rendering import render
+from bidnerf_core.sampling import Importance, Stratified
+from bidnerf_core.testing import samples as laws
+from bidnerf_hashgrid.occupancy import OccupancyGrid
+
+BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.05, 8.0)
+COUNT = 9
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """A field that is asked elsewhere."""
+
+    field: RadianceField
+    sampler: RaySampler
+
+    def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+        return self.field.query(positions, directions)
+
+
+def shell(rays: Rays, jitter: Generator | None = None) -> RaySamples:
+    """Invalid samples amid valid ones: nothing within half a metre of the middle."""
+    samples = Stratified(12)(rays, jitter)
+    return RaySamples(
+        samples.starts, samples.ends, samples.valid & (rays.at(samples.middles).norm(dim=-1) > 0.5)
+    )
+
+
+def apart(rays: Rays, jitter: Generator | None = None) -> RaySamples:
+    """Each interval only half as long as there is room."""
+    samples = Stratified(12)(rays, jitter)
+    return RaySamples(samples.starts, samples.middles, samples.valid)
+
+
+def grid() -> OccupancyGrid:
+    cells = OccupancyGrid(BOUNDS, 8)
+    cells.restrict(torch.rand((8, 8, 8), generator=Generator().manual_seed(0)) < 0.3)
+    return cells
+
+
+def nothing(rays: Rays, jitter: Generator | None = None) -> RaySamples:
+    none = rays.near.new_zeros((*rays.near.shape, 0))
+    return RaySamples(none, none, none.bool())
+
+
+SAMPLERS: dict[str, Callable[[], RaySampler]] = {
+    "contiguous": lambda: Stratified(12), "invalid": lambda: shell, "gaps": lambda: apart, "grid": grid,
+    "none": lambda: nothing,
+}  # fmt: skip
+
+
+def rays(count: int = 200) -> Rays:
+    generator = Generator().manual_seed(1)
+    origins = 3 * torch.nn.functional.normalize(torch.randn((count, 3), generator=generator), dim=-1)
+    targets = 0.8 * torch.randn((count, 3), generator=generator)  # some miss
+    return BOUNDS.rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1))
+
+
+def finer(sampler: RaySampler) -> Importance:
+    return Importance(Resampled(GaussianBlobs.random(), sampler), COUNT)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_the_contracts_laws_hold(name: str) -> None:
+    field = Resampled(GaussianBlobs.random(), finer(SAMPLERS[name]()))
+    for law in (laws.check_intervals, laws.check_repeatable, laws.check_rays_alone, laws.check_background):
+        law(field)
+
+
+@pytest.mark.parametrize("jittered", [False, True])
+@pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "none"])
+def test_what_was_covered_stays_covered_and_nothing_else(name: str, jittered: bool) -> None:
+    """At any distance along a ray, the cut intervals say what the rough ones say."""
+    sampler, where = SAMPLERS[name](), rays()
+    rough, cut = (
+        s(where, Generator().manual_seed(2) if jittered else None) for s in (sampler, finer(sampler))
+    )
+    share = torch.rand((200, 300), generator=Generator().manual_seed(3))
+    distances = where.near[:, None] + share * (where.far - where.near)[:, None]
+
+    def covers(samples: RaySamples) -> torch.Tensor:
+        inside = (samples.starts[:, None] <= distances[..., None]) & (
+            distances[..., None] < samples.ends[:, None]
+        )
+        return (inside & samples.valid[:, None]).sum(-1)
+
+    assert int(covers(cut).max()) == 1
+    agree = covers(rough).clamp(max=1) == covers(cut)
+    assert float(agree.float().mean()) > 0.9999  # but for rounding at borders
+
+
+@pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "none"])
+def test_there_are_so_many_more_of_them(name: str) -> None:
+    sampler, where = SAMPLERS[name](), rays()
+    rough, cut = sampler(where), finer(sampler)(where)
+    asked = rough.valid.any(-1)
+    assert bool(asked.any())
+    assert bool((cut.valid.sum(-1) == rough.valid.sum(-1) + COUNT * asked).all())
+    assert bool(cut.starts.isfinite().all() & cut.ends.isfinite().all())
+
+
+def test_borders_of_a_contiguous_sampler_are_sorted_together() -> None:
+    """Without gaps: the borders of both, in order (Mildenhall et al. 2020, section 5.2)."""
+    where = rays()
+    hits = where.far > where.near
+    rough, cut = Stratified(12)(where), finer(Stratified(12))(where)
+    borders = torch.cat([cut.starts, cut.ends[..., -1:]], dim=-1)[hits]
+    assert torch.equal(cut.starts[hits][:, 1:], cut.ends[hits][:, :-1])
+    assert bool((borders.diff(dim=-1) >= 0).all())
+    assert bool(torch.isin(rough.starts[hits], borders).all())
+
+
+def test_a_surface_in_a_grid_is_seen_where_it_is() -> None:
+    """Rough intervals that leave much out are no reason to put the surface elsewhere."""
+    ball = HomogeneousBall(0.8, 40.0)
+    where = rays(300)
+    exact = render(Resampled(ball, Stratified(4000)), where)
+    cells = OccupancyGrid(BOUNDS, 8)
+    cells.restrict((cells.centres().norm(dim=-1) - 0.8).abs() < 0.3)  # the shell, and gaps inside and out
+    rough = render(Resampled(ball, cells), where)
+    cut = render(Resampled(ball, Importance(Resampled(ball, cells), 64)), where)
+    hit = exact.opacity > 0.99
+    errors = [(found.distance - exact.distance).abs()[hit].median() for found in (cut, rough)]
+    assert int(hit.sum()) > 50
+    assert float(errors[0]) < 0.5 * float(errors[1])
