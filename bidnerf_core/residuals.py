@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.pixels import Pixels
 from bidnerf_core.rendering import Rendering
 from bidnerf_core.robust import Robust, huber
@@ -33,6 +34,10 @@ class Objective:
             return colour.mean()
         distance = masked_mean(self.depth(depth(rendering, pixels)), pixels.distance > 0)
         return (colour + self.depth_weight * distance).mean()
+
+    def on_depth_rays(self, rendering: Rendering, measured: DepthRays) -> Float[Tensor, ""]:
+        """``lambda_d mean_r rho(d)``: the depth term alone, on rays of their own."""
+        return self.depth_weight * self.depth(rendering.distance - measured.distance).mean()
 
 
 def photometric(rendering: Rendering, pixels: Pixels) -> Float[Tensor, "*p 3"]:

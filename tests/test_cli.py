@@ -644,6 +644,49 @@ def test_every_frame_that_is_named_counts(
     assert seen == [["a", "b", "c"]]
 
 
+def test_a_window_is_the_frame_and_those_before_it(
+    bidnerf: Callable[..., Outcome], shared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from bidnerf_core.cli import localize
+
+    asked: list[list[str]] = []
+    real = localize.read_views
+
+    def note(dataset: Any, split: str, names: Any) -> Any:
+        asked.append(list(names))
+        return real(dataset, split, names)
+
+    monkeypatch.setattr(localize, "read_views", note)
+    place = ["localize", shared / "map", shared / "data", *QUICK]
+    for frame, size in (("t_0002", 2), ("t_0001", 5), ("t_0001", 1)):
+        assert bidnerf(*place, "--frame", frame, "--window", size).status == 0
+    assert asked == [["t_0001", "t_0002"], ["t_0000", "t_0001"], ["t_0001"]]
+    assert_refused(
+        bidnerf(*place, "--frame", "t_0000", "t_0001", "--window", 2), 2, "--window 2 with 2 frames"
+    )
+    assert_refused(bidnerf(*place, "--frame", "t_0000", "--window", 0), 2, "--window is 0")
+    assert_refused(bidnerf(*place, "--frame", "t_9", "--window", 2), 1, "'t_9'")
+
+
+def test_points_of_a_sensor_are_heeded(bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", *QUICK, "--frame", "t_0001", "--json"]
+    points = tmp_path / "points.txt"
+    points.write_text("0 0 2.5\n0.1 0.1 2.6\n")
+    without, with_points = bidnerf(*place), bidnerf(*place, "--depth-points", points)
+    assert json.loads(without.out)["loss"] != json.loads(with_points.out)["loss"]
+    heedless = bidnerf(*place, "--depth-points", points, "--method", "inerf")
+    assert heedless.status == 0
+    assert "inerf heeds no depth" in heedless.err
+    points.write_text("far away")
+    assert_refused(bidnerf(*place, "--depth-points", points), 1, str(points), "rows of x, y, z")
+
+
+def test_inerf_takes_one_image(bidnerf: Callable[..., Outcome], shared: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", *QUICK, "--method", "inerf"]
+    assert bidnerf(*place, "--frame", "t_0000", "--pixels", "interest-points", "--no-renew").status == 0
+    assert_refused(bidnerf(*place, "--frame", "t_0000", "t_0001"), 1, "method inerf takes one image, got 2")
+
+
 def test_localize_without_json_prints_to_stdout_too(bidnerf: Callable[..., Outcome], shared: Path) -> None:
     found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0001", *QUICK)
     assert (found.status, found.err) == (0, "")

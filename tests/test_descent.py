@@ -18,7 +18,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.interest import DrawerName
 from bidnerf_core.localization import BidConfig, InerfConfig, Problem, localize, rig, single
 from bidnerf_core.localization.pivots import PivotName, pivot
-from bidnerf_core.localization.sampled import SampledLoss
+from bidnerf_core.localization.sampled import RayCounts, SampledLoss
 from bidnerf_core.localization.trail import WINDOW, Trail
 from bidnerf_core.rendering import render_image
 from bidnerf_core.rigs import orbit
@@ -127,7 +127,7 @@ def test_fixed_pixels_are_drawn_once(problem: Problem) -> None:
     objective = BidConfig().objective
     for renew in (True, False):
         generator = torch.Generator().manual_seed(0)
-        loss = SampledLoss(problem, objective, 64, "uniform", renew, None, 1.0, generator)
+        loss = SampledLoss(problem, objective, RayCounts(64), "uniform", renew, None, 1.0, generator)
         assert torch.equal(loss(problem.start), loss(problem.start)) is not renew
 
 

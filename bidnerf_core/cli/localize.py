@@ -26,13 +26,16 @@ from bidnerf_core.cli.common import (
     say,
     value_of,
 )
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.trials import plain_localization
-from bidnerf_core.localization import METHODS, Localization, find_method, rig
+from bidnerf_core.frames import View
+from bidnerf_core.localization import METHODS, InerfConfig, Localization, find_method, rig
 from bidnerf_core.localization import localize as find_pose
+from bidnerf_core.localization import window as windowed
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
 
@@ -54,6 +57,34 @@ class Beginning:
         raise InputError(f"method {method!r} needs a start; give --start POSE.json or --perturb T R")
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What the user says was seen."""
+
+    split: str
+    frames: Sequence[str]
+    window: int
+    depth_points: Path | None
+
+    def judge(self) -> None:
+        if not self.frames:
+            raise UsageError("no frame to localize; name at least one with --frame")
+        require("--window", self.window, 1)
+        if self.window > 1 and len(self.frames) > 1:
+            raise UsageError(
+                f"--window {self.window} with {len(self.frames)} frames, expected one: the last of the window"
+            )
+
+    def views(self, dataset: Dataset) -> list[View]:
+        """The frames, or the last one and those before it in the split."""
+        names = self.frames
+        if self.window > 1:
+            listed = dataset.frame_names(self.split)
+            if names[0] in listed:  # else the dataset will tell
+                names = windowed(listed, listed.index(names[0]), self.window)
+        return read_views(dataset, self.split, names)
+
+
 def run(arguments: list[str]) -> None:
     """Parse with the settings of the method that the arguments name."""
     kind = find_method(value_of("--method", arguments) or "auto").config_type
@@ -73,6 +104,15 @@ def run(arguments: list[str]) -> None:
             option("T R", "start from the true pose moved by T metres and R degrees", ""),
         ] = None,
         no_start: Annotated[Flag, one_of, option(None, "no start is known", "")] = False,
+        window: Annotated[
+            int, option("K", "take the frame and those before it in the split, K in all, as a rig")
+        ] = 1,
+        depth_points: Annotated[
+            Path | None,
+            option(
+                "FILE", "points that a sensor measured from there, metres: x y z a row, .npy, or .npz", ""
+            ),
+        ] = None,
         seed: Annotated[int, option("N", "of all that is drawn at random")] = 0,
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
         config: Any = kind(),
@@ -80,30 +120,32 @@ def run(arguments: list[str]) -> None:
         """Find the pose of a dataset's frame in a map.
 
         Several frames are taken as a rig: their relative poses come from the dataset, and the pose found is that of the
-        last one's camera. Poses are camera to world, OpenCV axes (x right, y down, z forward).
+        last one's camera. Poses are camera to world, OpenCV axes (x right, y down, z forward); so are points, unless a .npz
+        has T_camera_sensor beside them.
         """
-        names = [name for group in frame for name in group]
-        _localize(map, data, names, split, method, Beginning(start, perturb), seed, json, config)
+        seen = Seen(split, [name for group in frame for name in group], window, depth_points)
+        _localize(map, data, seen, method, Beginning(start, perturb), seed, json, config)
 
     localize.__annotations__["config"] = kind
     parse("localize", localize, arguments)
 
 
 def _localize(
-    folder: Path, data: Path, frames: Sequence[str], split: str, method: str, begin: Beginning, seed: int,
-    as_json: bool, config: Any,
-) -> None:  # fmt: skip
-    if not frames:
-        raise UsageError("no frame to localize; name at least one with --frame")
+    folder: Path, data: Path, seen: Seen, method: str, begin: Beginning, seed: int, as_json: bool, config: Any
+) -> None:
+    seen.judge()
     require("--seed", seed, 0, LARGEST_SEED)
     stored = load_map(folder)
-    views = read_views(open_dataset(data, stored.bounds.background), split, frames)
+    views = seen.views(open_dataset(data, stored.bounds.background))
+    depth_rays = None if seen.depth_points is None else read_depth_points(seen.depth_points)
+    if depth_rays is not None and isinstance(config, InerfConfig):
+        say(f"{seen.depth_points}: method inerf heeds no depth")
     truth = views[-1].T_ref_camera
     start = begin.pose(truth, method, seed)
     bare = [view.frame.name for view in views if not view.frame.has_depth]
-    if bare:
+    if bare and depth_rays is None:
         say(f"{', '.join(bare)}: no measured depth; colour only")
-    found = find_pose(rig(stored.field, stored.bounds, views, start), method, config, seed)
+    found = find_pose(rig(stored.field, stored.bounds, views, start, depth_rays), method, config, seed)
     if not bool(found.T_world_camera.matrix().isfinite().all()):
         raise InputError(f"{folder}: {found.method} came to a pose that is not finite, expected a sound map")
     error = pose_error(found.T_world_camera, truth)

@@ -3,7 +3,7 @@
 from bidnerf_core.localization.bid import BidConfig
 from bidnerf_core.localization.inerf import InerfConfig
 from bidnerf_core.localization.methods import METHODS, Method, find_method, localize
-from bidnerf_core.localization.problem import Problem, rig, single
+from bidnerf_core.localization.problem import Problem, rig, single, window
 from bidnerf_core.localization.result import Localization
 
 __all__ = [
@@ -17,4 +17,5 @@ __all__ = [
     "localize",
     "rig",
     "single",
+    "window",
 ]

@@ -16,7 +16,7 @@ from bidnerf_core.interest import DrawerName
 from bidnerf_core.localization.pivots import Pivot, PivotName, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.sampled import SampledLoss
+from bidnerf_core.localization.sampled import RayCounts, SampledLoss
 from bidnerf_core.localization.trail import AnswerName, Trail
 from bidnerf_core.residuals import Objective
 from bidnerf_core.robust import RobustName
@@ -70,13 +70,14 @@ class DescentConfig:
 
 
 def descend(
-    problem: Problem, config: DescentConfig, objective: Objective, seed: int, method: str
+    problem: Problem, config: DescentConfig, objective: Objective, depth_rays: int, seed: int, method: str
 ) -> Localization:
     """Follow Adam down the loss from ``problem.start`` (Alg. 1 of the paper, its loop test the right way round)."""
     began = time.perf_counter()
     generator = torch.Generator().manual_seed(seed)
+    counts = RayCounts(config.rays, depth_rays)
     loss = SampledLoss(
-        problem, objective, config.rays, config.pixels, config.renew, config.level, config.wide, generator
+        problem, objective, counts, config.pixels, config.renew, config.level, config.wide, generator
     )
     trail = Trail([problem.start])
     reason = _follow(loss, pivot(config.pivot, problem), config, trail)

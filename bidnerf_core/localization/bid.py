@@ -27,11 +27,13 @@ class BidConfig(DescentConfig):
     )
     depth_weight: float = 1.0  # lambda_d
     depth_loss: RobustName = "huber"  # robust loss of depth differences
+    depth_rays: int = 512  # besides, of a sensor with rays of its own, where there is one
     depth_scale: float = 0.1  # of it, in metres: about where an outlier begins
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("depth_scale", 0 < self.depth_scale <= 1e6, "a positive number, at most 1e+06")
+        self._require("depth_rays", 0 <= self.depth_rays <= 10**7, "0 to 10 million")
         self._require_one_of(depth_loss=RobustName)
         self._require_not_negative("depth_weight")
 
@@ -46,4 +48,4 @@ class BidConfig(DescentConfig):
 
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
     """Descend from ``problem.start``; pixels are drawn from ``seed``."""
-    return descend(problem, config, config.objective, seed, "bid")
+    return descend(problem, config, config.objective, config.depth_rays, seed, "bid")

@@ -38,4 +38,4 @@ def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:
     """Descend from ``problem.start`` on colour alone. Raises ``InputError`` for more than one image."""
     if len(problem.views) > 1:
         raise InputError(f"method inerf takes one image, got {len(problem.views)}; method bid takes several")
-    return descend(problem, config, config.objective, seed, "inerf")
+    return descend(problem, config, config.objective, 0, seed, "inerf")

@@ -55,5 +55,7 @@ def _middle(problem: Problem) -> Float[Tensor, "3"]:
     point = measured_middle(problem.views)
     if point is not None:
         return point
+    if problem.depth_rays is not None:
+        return problem.depth_rays.points.to(torch.float64).cpu().median(0).values
     corners = torch.tensor([problem.bounds.lower, problem.bounds.upper], dtype=torch.float64)
     return problem.start.inverse().apply(corners.mean(0))

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 
+from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.se3 import SE3
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +28,7 @@ class Problem:
     bounds: SceneBounds
     views: tuple[View, ...]
     start: SE3  # T_world_K
+    depth_rays: DepthRays | None = None  # of a lidar or the like, in the frame of the last camera
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -34,7 +39,7 @@ class Problem:
 
     @property
     def has_depth(self) -> bool:
-        return any(view.frame.has_depth for view in self.views)
+        return self.depth_rays is not None or any(view.frame.has_depth for view in self.views)
 
     @property
     def device(self) -> torch.device:
@@ -55,17 +60,38 @@ class Problem:
         return offered[number]
 
 
-def single(field: RadianceField, bounds: SceneBounds, frame: Frame, start: SE3) -> Problem:
-    """One image."""
-    return Problem(field, bounds, (View(frame, SE3.identity()),), start.to(torch.float64))
+def single(
+    field: RadianceField, bounds: SceneBounds, frame: Frame, start: SE3, depth_rays: DepthRays | None = None
+) -> Problem:
+    """One image, and what else was measured from there."""
+    return Problem(field, bounds, (View(frame, SE3.identity()),), start.to(torch.float64), depth_rays)
 
 
-def rig(field: RadianceField, bounds: SceneBounds, views: Sequence[View], start: SE3) -> Problem:
-    """Views whose poses are known in any common frame; ``start`` is for the last of them."""
+def rig(
+    field: RadianceField,
+    bounds: SceneBounds,
+    views: Sequence[View],
+    start: SE3,
+    depth_rays: DepthRays | None = None,
+) -> Problem:
+    """Views whose poses are known in any common frame; ``start`` is for the last of them, as are ``depth_rays``."""
     if not views:
         raise InputError("nothing to localize: expected at least one view")
     T_last_ref = views[-1].T_ref_camera.to(torch.float64).inverse()
     relative = tuple(
         View(v.frame, (T_last_ref @ v.T_ref_camera.to(torch.float64)).normalized()) for v in views
     )
-    return Problem(field, bounds, relative, start.to(torch.float64))
+    return Problem(field, bounds, relative, start.to(torch.float64), depth_rays)
+
+
+def window(sequence: Sequence[Item], last: int, size: int, stride: int = 1) -> tuple[Item, ...]:
+    """Item ``last`` and those before it, ``size`` of them, ``stride`` apart; fewer where the sequence begins.
+
+    Of views in the order of time, it is what ``rig`` takes for a moving window. Raises ``InputError`` where there is no
+    such item.
+    """
+    if size < 1 or stride < 1:
+        raise InputError(f"a window of {size} with stride {stride}, expected 1 or more of both")
+    if not 0 <= last < len(sequence):
+        raise InputError(f"a window up to item {last} of {len(sequence)}")
+    return tuple(sequence[i] for i in range(last, -1, -stride)[:size][::-1])

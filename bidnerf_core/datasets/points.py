@@ -1,0 +1,65 @@
+"""Files of points that a sensor measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+
+from bidnerf_core.depth_rays import DepthRays
+from bidnerf_core.errors import InputError
+from bidnerf_core.se3 import SE3
+
+EXPECTED = "expected n rows of x, y, z in metres"
+
+
+def read_depth_points(path: Path) -> DepthRays:
+    """Points (metres, OpenCV axes) as depth rays of the camera's frame.
+
+    Text (.txt, .csv, .xyz: rows of x, y, z, separated by commas or blanks; what follows on a row is not read, and ``#``
+    begins a comment) or .npy holds points of the camera's frame, seen from the camera. A .npz holds ``points`` and, for a
+    sensor of its own such as a lidar, ``T_camera_sensor`` (4x4): the points are then in the sensor's frame. Raises
+    ``InputError`` for anything else.
+    """
+    points, T_camera_sensor = _read(path)
+    if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
+        raise InputError(f"{path}: an array of shape {points.shape} and type {points.dtype}, {EXPECTED}")
+    xyz = torch.from_numpy(points[:, :3].astype(np.float64))
+    try:
+        return DepthRays.from_points(xyz, T_camera_sensor)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read(path: Path) -> tuple[np.ndarray, SE3]:
+    try:
+        if path.suffix in (".npz", ".npy"):
+            found = np.load(path, allow_pickle=False)
+            return (found, SE3.identity()) if isinstance(found, np.ndarray) else _from_archive(path, found)
+        return _from_text(path.read_text()), SE3.identity()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}), {EXPECTED}") from error
+    except (ValueError, EOFError, BadZipFile) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not a file of points ({error}), {EXPECTED}") from error
+
+
+def _from_text(text: str) -> np.ndarray:
+    rows = [line.partition("#")[0].replace(",", " ").split()[:3] for line in text.splitlines()]
+    return np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
+
+
+def _from_archive(path: Path, archive: np.lib.npyio.NpzFile) -> tuple[np.ndarray, SE3]:
+    with archive:
+        if "points" not in archive:
+            raise InputError(f"{path}: holds {', '.join(archive) or 'nothing'}, expected an array 'points'")
+        if "T_camera_sensor" not in archive:
+            return archive["points"], SE3.identity()
+        matrix = torch.from_numpy(archive["T_camera_sensor"].astype(np.float64))
+        pose = SE3.from_matrix(matrix) if matrix.shape == (4, 4) else None
+        if pose is None or not bool(pose.is_rigid()):
+            raise InputError(f"{path}: T_camera_sensor is not a rigid transform, expected 4x4")
+        return archive["points"], pose.normalized()
