@@ -1,0 +1,146 @@
+"""Depth supervision: what the term asks for, and that every backend's recipe heeds it, however few pixels were measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_adanerf import AdaNerfConfig
+from bidnerf_adanerf import backend as adanerf
+from bidnerf_core.field import Rays, RaySamples
+from bidnerf_core.frames import View
+from bidnerf_core.rendering import Rendering, render, rendering_weights
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.supervision import depth_term, supervised_loss
+from bidnerf_core.training import RayBank, RayBatch, Silent
+from bidnerf_hashgrid import backend as hashgrid
+from bidnerf_vanilla import VanillaConfig
+from bidnerf_vanilla import backend as vanilla
+
+BOUNDS = demo_object().bounds
+VANILLA = VanillaConfig(
+    layers=2, width=32, skip=1, position_frequencies=4, direction_frequencies=1, coarse_samples=16, fine_samples=8,
+    room_resolution=16, samples_per_step=2048, rays_at_most=256, learning_rate=0.01,
+)  # fmt: skip
+ADANERF = AdaNerfConfig(
+    width=32, layers=2, position_frequencies=4, oracle_width=32, oracle_layers=2, ray_points=4, ray_frequencies=2,
+    bins=16, max_samples=5, samples_per_step=4096, rays_at_most=256, learning_rate=0.02, room_resolution=16,
+)  # fmt: skip
+BACKENDS = {
+    "hashgrid": (hashgrid, tiny.config()),
+    "vanilla": (vanilla, VANILLA),
+    "adanerf": (adanerf, ADANERF),
+}
+
+
+def ray(density: torch.Tensor, measured: float) -> tuple[Rendering, RayBatch]:
+    """One ray through ten cells of half a metre, and what was measured along it."""
+    borders = torch.linspace(0, 5, 11, dtype=density.dtype)[None]
+    samples = RaySamples(borders[:, :-1], borders[:, 1:], torch.ones(1, 10, dtype=torch.bool))
+    weights = rendering_weights(density[None], samples)
+    distance = (weights * samples.middles).sum(-1)
+    rgb = torch.zeros(1, 3, dtype=density.dtype)
+    zero = density.new_zeros(1, 3)
+    batch = RayBatch(Rays(zero, zero, zero[:, 0], zero[:, 0] + 5), rgb, density.new_tensor([measured]), zero)
+    return Rendering(rgb, distance, weights.sum(-1), weights, samples), batch
+
+
+def by_density(density: torch.Tensor, measured: float) -> torch.Tensor:
+    density = density.clone().requires_grad_()
+    return torch.autograd.grad(depth_term(*ray(density, measured)), density)[0]
+
+
+def test_the_derivative_is_the_numerical_one() -> None:
+    density = torch.rand(10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda d: depth_term(*ray(d, 3.25)), density.requires_grad_(), eps=1e-6, atol=1e-8
+    )
+
+
+def test_weight_is_pulled_to_where_depth_was_measured() -> None:
+    """In thin fog, matter at the measured place lowers the term most, and the farther from it, the less it does."""
+    slope = by_density(torch.full((10,), 0.01, dtype=torch.float64), 3.25)  # the middle of cell 6
+    assert int(slope.argmin()) == 6
+    assert bool((slope < 0).all())  # any matter beats none: what a ray lacks counts as at the camera
+    assert bool((slope[:7].diff() < 0).all())
+    assert bool((slope[6:].diff() > 0).all())
+
+
+def test_matter_in_front_of_a_surface_is_removed() -> None:
+    density = torch.full((10,), 0.01, dtype=torch.float64)
+    density[6] = 50.0
+    slope = by_density(density, 3.25)
+    assert bool((slope[:6] > 0).all())
+    assert float(slope[7:].abs().max()) < 1e-9  # nobody sees what is behind it
+
+
+def test_a_wall_behind_the_measured_surface_is_moved_forward() -> None:
+    density = torch.full((10,), 0.01, dtype=torch.float64)
+    density[9] = 50.0
+    slope = by_density(density, 3.25)
+    assert int(slope.argmin()) == 6
+    assert float(slope[6]) < 0
+
+
+def test_rays_without_depth_do_not_count() -> None:
+    density = torch.full((10,), 0.3, dtype=torch.float64)
+    assert float(depth_term(*ray(density, 0.0))) == 0
+    assert float(by_density(density, 0.0).abs().max()) == 0
+    rendering, batch = ray(density, 3.25)
+    assert supervised_loss(rendering, batch, 2.0, 0.0)[0] == 0
+
+
+@dataclass(frozen=True)
+class Few:
+    """How much of a depth image is kept."""
+
+    every: int
+
+    def of(self, view: View) -> View:
+        assert view.frame.depth is not None
+        kept = torch.zeros_like(view.frame.depth).reshape(-1)
+        index = view.frame.depth.reshape(-1).nonzero()[:: self.every, 0]
+        kept[index] = view.frame.depth.reshape(-1)[index]
+        return replace(view, frame=replace(view.frame, depth=kept.reshape(view.frame.depth.shape)))
+
+
+def trained(name: str, views: Sequence[View], **changes: Any) -> Any:
+    backend, config = BACKENDS[name]
+    config = replace(config, **({"steps": 40, "carve": False} | changes))  # type: ignore[type-var]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        field = backend.build(config, BOUNDS)
+        backend.train(field, views, config, Silent())
+    return field
+
+
+def misplaced(field: Any, views: Sequence[View]) -> float:
+    """The depth term where depth was measured: mean distance of the weight from there, metres."""
+    batch = RayBank(views, BOUNDS).draw(3000, torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        return float(depth_term(render(field, batch.rays, batch.background), batch))
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_every_backend_heeds_sparse_depth(name: str) -> None:
+    """One pixel in ten with depth brings the matter of all pixels nearer to where it is."""
+    dense = tiny.views()
+    sparse = [Few(10).of(view) for view in dense]
+    assert 0 < sum(int((v.frame.depth > 0).sum()) for v in sparse) < 400  # type: ignore[operator]
+    with_depth, without = (trained(name, sparse, depth_weight=weight) for weight in (1.0, 0.0))
+    assert misplaced(with_depth, dense) < 0.9 * misplaced(without, dense)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_single_measured_pixel_and_none_are_fine(name: str) -> None:
+    one = [Few(10**6).of(view) for view in tiny.views()]
+    none = [replace(v, frame=replace(v.frame, depth=None)) for v in one]
+    for views in (one, none, [one[0], *none[1:]]):
+        for carve in (True, False):
+            field = trained(name, views, steps=4, depth_weight=1.0, carve=carve)
+            assert all(bool(p.isfinite().all()) for p in field.parameters())
