@@ -18,8 +18,9 @@ class Frame:
 
     name: str
     # rgb is in [0, 1], already over the background where there was an alpha channel; alpha is 1 where the scene covers
-    # the pixel and 0 where the background shows. All have the size of the camera's image, which is checked here.
-    rgb: Float[Tensor, "h w 3"]
+    # the pixel and 0 where the background shows. rgb has 3 channels, and all have the size of the camera's image, which is
+    # checked here.
+    rgb: Float[Tensor, "h w channels"]
     intrinsics: Intrinsics
     depth: Float[Tensor, "dh dw"] | None = None
     alpha: Float[Tensor, "ah aw"] | None = None

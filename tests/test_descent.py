@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.errors import InputError
@@ -20,9 +21,11 @@ from bidnerf_core.localization import BidConfig, InerfConfig, Problem, localize,
 from bidnerf_core.localization.pivots import PivotName, pivot
 from bidnerf_core.localization.sampled import RayCounts, SampledLoss
 from bidnerf_core.localization.trail import WINDOW, Trail
+from bidnerf_core.pixels import draw, uniform
 from bidnerf_core.rendering import render_image
 from bidnerf_core.rigs import orbit
 from bidnerf_core.se3 import SE3
+from bidnerf_hashgrid import backend as hashgrid
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
@@ -196,3 +199,14 @@ def test_bad_settings_are_told(settings: dict[str, float], told: str) -> None:
     for kind in (BidConfig, InerfConfig):
         with pytest.raises(InputError, match=told):
             kind(**settings)
+
+
+def test_rays_are_brought_to_where_the_field_computes(problem: Problem) -> None:
+    """The device "meta" stands for a GPU: it is another device, and one that every machine has."""
+    elsewhere = hashgrid.build(tiny.config(), BOUNDS).to("meta")
+    assert replace(problem, field=elsewhere).device.type == "meta"
+    assert problem.device.type == "cpu"  # a field without parameters
+    pixels = draw(problem.views, 8, uniform, torch.Generator().manual_seed(0), device="meta")
+    rays = pixels.rays(problem.start, BOUNDS)
+    parts = (pixels.origins, pixels.directions, pixels.rgb, pixels.distance, rays.origins, rays.near)
+    assert {part.device.type for part in parts} == {"meta"}
