@@ -2,90 +2,32 @@
 
     python benchmarks/localization.py MAP DATA --start bid:0.5 --trials 40 --name localization_lego_bid_0.5
 
-``--start bid:SIZE`` and ``bid-hard:SIZE`` are the protocols of the same names; ``--start METRES:DEGREES`` moves the true
-pose by exactly that much. Frames whose place in the test split is 1 modulo 5 are left out by default: settings were
+``--start`` is a protocol, with a size where it has sizes: ``bid:SIZE``, ``perturb:METRES:DEGREES``, ``inerf``. Frames whose place in the test split is 1 modulo 5 are left out by default: settings were
 tuned on them. Trials run in processes of one thread; finished ones are kept in a ``.jsonl`` beside the record, so that
-an interrupted run goes on where it stopped.
+an interrupted run goes on where it stopped. ``bidnerf evaluate`` is the same for other purposes.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
 import statistics
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from record import RESULTS, write_record
 
-from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.evaluation import protocols
-from bidnerf_core.evaluation.errors import CRITERIA, PoseError, pose_error, steps_to_success, success_rate
-from bidnerf_core.localization import find_method, localize, single
-from bidnerf_core.plain import from_plain, to_plain
-from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import Map, load_map
+from bidnerf_core.evaluation.bench import Plan, left_to_do, local_processes, planned, run_trials
+from bidnerf_core.evaluation.errors import CRITERIA, steps_to_success, success_rate
+from bidnerf_core.evaluation.results import ResultsFile, key_of
+from bidnerf_core.evaluation.trials import Trial, TrialResult, opened
+from bidnerf_core.plain import to_plain
 
 
-@dataclass(frozen=True)
-class Trial:
-    """All that a trial depends on."""
-
-    map: str
-    data: str
-    frame: str
-    start: str
-    method: str
-    config: str  # JSON
-    seed: int
-
-
-@cache
-def opened(map_folder: str, data: str) -> tuple[Map, Dataset]:
-    torch.set_num_threads(1)
-    stored = load_map(Path(map_folder))
-    return stored, open_dataset(data, stored.bounds.background)
-
-
-def start_pose(rule: str, truth: SE3, seed: int) -> SE3:
-    kind, _, size = rule.partition(":")
-    if kind == "bid":
-        return protocols.bid(truth, float(size), seed)
-    if kind == "bid-hard":
-        return protocols.bid_hard(truth, float(size), seed)
-    return protocols.perturb(truth, float(kind), float(size), seed)
-
-
-def run(trial: Trial) -> dict[str, Any]:
-    """One line of results."""
-    stored, dataset = opened(trial.map, trial.data)
-    (view,) = dataset.views("test", [trial.frame])
-    truth = view.T_ref_camera
-    config = from_plain(find_method(trial.method).config_type, json.loads(trial.config), "--config")
-    start = start_pose(trial.start, truth, trial.seed)
-    found = localize(single(stored.field, stored.bounds, view.frame, start), trial.method, config, trial.seed)
-    errors = pose_error(found.poses, truth)
-    return {
-        "frame": trial.frame,
-        "seed": trial.seed,
-        "converged": found.converged,
-        "steps": found.steps,
-        "seconds": found.seconds,
-        "loss": found.loss,
-        "peak_resident_GiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-        "translation": errors.translation.tolist(),
-        "rotation_deg": errors.rotation_deg.tolist(),
-    }
-
-
-def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(rows: list[TrialResult]) -> dict[str, Any]:
     """Rates by each criterion with Wilson intervals, steps, time, and how honest ``converged`` was."""
-    traces = [PoseError(torch.tensor(r["translation"]), torch.tensor(r["rotation_deg"])) for r in rows]
+    traces = [row.errors.as_error() for row in rows]
     result: dict[str, Any] = {"trials": len(rows)}
     for name, criterion in CRITERIA.items():
         good = [bool(criterion(trace[-1], trace[0])) for trace in traces]
@@ -93,41 +35,35 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         reached = [s for trace in traces if (s := steps_to_success(trace, criterion)) is not None]
         result[name]["median_steps_to_success"] = statistics.median(reached) if reached else None
     right = [bool(CRITERIA["5deg 0.05"](trace[-1], trace[0])) for trace in traces]
-    said = [row["converged"] for row in rows]
+    said = [row.converged for row in rows]
     result["converged_but_wrong"] = sum(s and not r for s, r in zip(said, right, strict=True))
     result["right_but_not_converged"] = sum(r and not s for s, r in zip(said, right, strict=True))
-    result["median_translation"] = statistics.median(row["translation"][-1] for row in rows)
-    result["median_rotation_deg"] = statistics.median(row["rotation_deg"][-1] for row in rows)
-    result["median_start_rotation_deg"] = statistics.median(row["rotation_deg"][0] for row in rows)
-    result["seconds_per_step"] = statistics.median(row["seconds"] / row["steps"] for row in rows)
-    result["peak_resident_GiB"] = max(row["peak_resident_GiB"] for row in rows)
+    result["median_translation"] = statistics.median(float(t.translation[-1]) for t in traces)
+    result["median_rotation_deg"] = statistics.median(float(t.rotation_deg[-1]) for t in traces)
+    result["median_start_rotation_deg"] = statistics.median(float(t.rotation_deg[0]) for t in traces)
+    result["seconds_per_step"] = statistics.median(row.seconds / max(1, row.steps) for row in rows)
+    result["peak_resident_GiB"] = max(row.peak_memory_bytes for row in rows) / 2**30
     return result
 
 
+def final(row: TrialResult) -> dict[str, Any]:
+    """A trial without its trace."""
+    error = None if row.error is None else to_plain(row.error)
+    kept = ("frame", "seed", "converged", "steps", "seconds", "loss")
+    return {name: getattr(row, name) for name in kept} | (error or {"translation": None})
+
+
 def trials(given: argparse.Namespace) -> list[Trial]:
+    protocol, *size = given.start.split(":")
     _, dataset = opened(str(given.map), str(given.data))
     names = dataset.frame_names("test")
-    kept = [n for i, n in enumerate(names) if given.all_frames or i % 5 != 1]
-    config = json.dumps(json.loads(given.config), sort_keys=True)
-    return [
-        Trial(
-            str(given.map),
-            str(given.data),
-            kept[i % len(kept)],
-            given.start,
-            given.method,
-            config,
-            given.seed + i,
+    kept = [name for place, name in enumerate(names) if given.all_frames or place % 5 != 1]
+    return planned(
+        Plan(
+            str(given.map), str(given.data), protocol, (tuple(map(float, size)),), given.method,
+            json.dumps(json.loads(given.config), sort_keys=True), given.trials, given.seed, frames=tuple(kept),
         )
-        for i in range(given.trials)
-    ]
-
-
-def finished(path: Path) -> dict[str, dict[str, Any]]:
-    if not path.exists():
-        return {}
-    lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
-    return {line["key"]: line["row"] for line in lines}
+    )  # fmt: skip
 
 
 def main() -> None:
@@ -147,24 +83,19 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--all-frames", action="store_true", help="also those that settings were tuned on")
     given = parser.parse_args()
-    partial = RESULTS / f"{given.name}.partial.jsonl"
-    done, wanted = finished(partial), trials(given)
-    stamp = load_map(given.map).info.weights  # a map trained anew starts over
-    keys = {json.dumps([asdict(t), stamp]): t for t in wanted}
-    with ProcessPoolExecutor(given.workers) as pool, partial.open("a") as file:
-        waiting = {pool.submit(run, trial): key for key, trial in keys.items() if key not in done}
-        for count, future in enumerate(as_completed(waiting), 1):
-            done[waiting[future]] = future.result()
-            file.write(json.dumps({"key": waiting[future], "row": future.result()}) + "\n")
-            file.flush()
-            print(f"{count}/{len(waiting)}", end="\r", flush=True)
-    rows = [done[key] for key in keys]
-    settings = to_plain(
-        from_plain(find_method(given.method).config_type, json.loads(given.config), "--config")
-    )
+    wanted, partial = trials(given), RESULTS / f"{given.name}.partial.jsonl"
+    with ResultsFile(partial) as file, local_processes(given.workers) as pool:
+        left = len(left_to_do(wanted, file))
+        run_trials(wanted, file, pool, given.workers, lambda row: print(".", end="", flush=True))
+        print(f" {left} trials done")
+        rows = [file.results[key_of(trial)] for trial in wanted]
     results = {"map": given.map.name, "data": given.data.name, "start": given.start, "method": given.method}
-    final = [{k: (v[-1] if isinstance(v, list) else v) for k, v in row.items()} for row in rows]
-    record = {**results, "settings": settings, "summary": summary(rows), "rows": final}
+    record = {
+        **results,
+        "settings": rows[0].settings,
+        "summary": summary(rows),
+        "rows": [final(row) for row in rows],
+    }
     print(write_record(given.name, record, given.seed))
     print(json.dumps(summary(rows), indent=1))
     partial.unlink()

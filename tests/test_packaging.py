@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -134,5 +135,6 @@ def test_what_is_required_is_pinned() -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines if "==" in line}
     extras = PROJECT["optional-dependencies"]
-    required = [*PROJECT["dependencies"], *extras["dev"], *extras["plots"]]
-    assert {entry.partition(">")[0].lower().replace("_", "-") for entry in required} <= pinned
+    required = [*PROJECT["dependencies"], *extras["dev"], *extras["plots"], *extras["cluster"]]
+    names = {re.split(r"[\[>]", entry)[0] for entry in required}
+    assert {name.lower().replace("_", "-") for name in names} <= pinned

@@ -97,6 +97,7 @@ class Protocol:
     trials: int = 24  # of each size, where no other number is asked for
     seed: int = 0
     plan: Callable[[int, int, int], list[Case]] | None = None  # by frames, trials and seed
+    fixed: bool = False  # it chooses from all frames of a split, and of none else
 
     def cases(self, frames: int, trials: int, seed: int) -> list[Case]:
         """The trials of one size. More of them begin with the same ones."""
@@ -155,6 +156,7 @@ PROTOCOLS = {
         trials=parallel_inversion.TRIALS,
         seed=parallel_inversion.SEED,
         plan=parallel_inversion.plan,
+        fixed=True,
     ),
     "perturb": Protocol(
         "off by exactly so much, in random directions",

@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.protocols import find_protocol
@@ -36,8 +37,8 @@ Rows: TypeAlias = tuple[tuple[float, ...], ...]
 class Trial:
     """All that a trial depends on."""
 
-    map: str  # folder
-    data: str  # folder
+    map: str  # folder, or demo:NAME
+    data: str  # folder, or demo:NAME
     frames: tuple[str, ...]  # a rig's views, one for a single image; the pose sought is the last one's
     protocol: str = "bid"  # which starts
     size: tuple[float, ...] = ()  # how far off they are, in the protocol's terms
@@ -45,10 +46,16 @@ class Trial:
     config: str = "{}"  # JSON of the method's settings that differ from its defaults
     seed: int = 0  # of the start, and of all that the method draws
     split: str = "test"
+    device: str = "cpu"  # that the field computes on
 
     @property
     def frame(self) -> str:
         return self.frames[-1]
+
+    @property
+    def portable(self) -> Trial:
+        """The same with the names of folders only: it is one trial wherever they are."""
+        return replace(self, map=_name(self.map), data=_name(self.data))
 
 
 @dataclass(frozen=True)
@@ -92,13 +99,13 @@ class TrialResult:
     peak_memory_bytes: int  # of the process during the trial: memory resident, or of the GPU
     settings: dict[str, Any]  # of the method, all of them
     weights: str  # which training of the map
-    trial: Trial
+    trial: Trial  # with the names of folders only
 
 
 def run_trial(trial: Trial) -> TrialResult:
     """Localize once. Raises ``InputError`` where the trial cannot be: a bad name, a method that needs what is not there."""
     with one_thread():
-        stored, dataset = opened(trial.map, trial.data)
+        stored, dataset = opened(trial.map, trial.data, trial.device)
         views = dataset.views(trial.split, trial.frames)
         truth, start = views[-1].T_ref_camera, start_of(trial, views, dataset)
         settings = settings_of(trial.method, trial.config)
@@ -138,9 +145,12 @@ def one_thread() -> Iterator[None]:
 
 
 @lru_cache(maxsize=4)
-def opened(map_folder: str, data: str) -> tuple[Map, Dataset]:
-    """Both are read once a process."""
-    stored = load_map(Path(map_folder))
+def opened(map_folder: str, data: str, device: str = "cpu") -> tuple[Map, Dataset]:
+    """Folders, or closed-form scenes by name. Both are read once a process."""
+    where = _device(device)
+    stored = closed_form_map(map_folder) if is_closed_form(map_folder) else load_map(Path(map_folder), where)
+    if is_closed_form(data):
+        return stored, closed_form_data(data)
     return stored, open_dataset(data, stored.bounds.background)
 
 
@@ -173,9 +183,23 @@ def _result(
         "peak_memory_bytes": peak_memory_bytes(),
         "settings": to_plain(settings),
         "weights": stored.info.weights,
-        "trial": to_plain(trial),
+        "trial": to_plain(trial.portable),
     }
     return from_plain(TrialResult, plain | more, "result")
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise InputError(f"no device {name!r}, expected one as cpu or cuda") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device {name!r}: torch finds no CUDA here, expected cpu")
+    return device
+
+
+def _name(folder: str) -> str:
+    return folder if is_closed_form(folder) else Path(folder).resolve().name
 
 
 def _off(error: PoseError) -> Off | None:

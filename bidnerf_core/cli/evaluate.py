@@ -1,0 +1,174 @@
+"""``bidnerf evaluate``."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from bidnerf_core.cli.common import LARGEST_SEED, Names, UsageError, option, parse, require, say, value_of
+from bidnerf_core.cli.trial_progress import TrialProgress
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.bench import (
+    Plan,
+    changed_settings,
+    left_to_do,
+    local_processes,
+    planned,
+    run_trials,
+    share,
+)
+from bidnerf_core.evaluation.cluster import dask_executor
+from bidnerf_core.evaluation.protocols import PROTOCOLS, Size
+from bidnerf_core.evaluation.provenance import command_line, note_run, provenance
+from bidnerf_core.evaluation.results import ResultsFile
+from bidnerf_core.evaluation.trials import Trial
+from bidnerf_core.localization import METHODS, find_method
+
+Place = Annotated[str, tyro.conf.Positional]
+
+
+def run(arguments: list[str]) -> None:
+    """Parse with the settings of the method that the arguments name."""
+    kind = find_method(value_of("--method", arguments) or "auto").config_type
+
+    def evaluate(
+        map: Annotated[Place, option("MAP", "folder of a map, or demo:blobs")],
+        data: Annotated[
+            str | None,
+            tyro.conf.Positional,
+            option("[DATA]", "folder of a dataset, or demo:object, demo:room, demo:blobs", ""),
+        ] = None,
+        *,
+        out: Annotated[
+            Path, option("RESULTS.jsonl", "file of results; what it holds already is not run again")
+        ],
+        protocol: Annotated[str, option("NAME", "where to start: " + ", ".join(PROTOCOLS))] = "bid",
+        size: Annotated[
+            tuple[str, ...],
+            option("SIZE...", "how far off: e_t, or METRES:DEGREES for perturb", "the protocol's"),
+        ] = (),
+        method: Annotated[str, option("NAME", f"auto, {', '.join(METHODS)}")] = "auto",
+        trials: Annotated[int | None, option("N", "of each size", "the protocol's, 24 or 25")] = None,
+        seed: Annotated[
+            int | None, option("S", "of all that is drawn at random", "the protocol's, 0")
+        ] = None,
+        split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
+        frame: Annotated[Names, option("NAME...", "try only these frames", "all of the split")] = (),
+        images: Annotated[int, option("K", "images at once, a sequence around the object")] = 1,
+        angle: Annotated[float, option("DEGREES", "between neighbours of a sequence")] = 15.0,
+        device: Annotated[str, option("NAME", "what the field computes on: cpu, cuda ...")] = "cpu",
+        workers: Annotated[
+            int | None, option("N", "processes, of one thread each", "one a core; one on a GPU")
+        ] = None,
+        dask: Annotated[
+            str | None, option("ADDRESS", "of a dask scheduler, to run on its workers", "")
+        ] = None,
+        shards: Annotated[int, option("N", "split the trials into so many parts ...")] = 1,
+        shard: Annotated[int, option("I", "... and run this one, from 0")] = 0,
+        config: Any = kind(),
+    ) -> None:
+        """Localize many frames from wrong starts; one JSON line a trial.
+
+        What was finished is kept whatever happens: the same command goes on where it stopped. 'bidnerf report' makes
+        tables and figures of the results.
+        """
+        _check(trials, seed, images, angle, workers, shards, shard)
+        names = tuple(name for group in frame for name in group) or None
+        plan = Plan(
+            map, data or _own_data(map), protocol, _sizes(size), method, changed_settings(method, config),
+            trials, seed, split, names, images, angle, device,
+        )  # fmt: skip
+        mine = share(planned(plan), shard, shards)
+        _evaluate(mine, out, workers, dask, command_line("bidnerf evaluate", arguments))
+
+    evaluate.__annotations__["config"] = kind
+    parse("evaluate", evaluate, arguments)
+
+
+def _evaluate(trials: list[Trial], out: Path, workers: int | None, dask: str | None, command: str) -> None:
+    with ResultsFile(out) as file:
+        todo = left_to_do(trials, file)
+        if len(todo) < len(trials):
+            say(f"{out}: {len(trials) - len(todo)} of {len(trials)} trials are there already")
+        if todo:
+            with _executor(workers, dask, len(todo), todo[0].device == "cpu") as (executor, at_once, what):
+                note_run(out, provenance(command, what))
+                _run(todo, file, executor, at_once)
+        file.put_in_order(trials)
+    print(f"{len(trials)} trials in {out}; 'bidnerf report {out}' shows them")
+
+
+def _run(todo: list[Trial], file: ResultsFile, executor: Executor, at_once: int) -> None:
+    with TrialProgress(len(todo), at_once) as progress:
+        try:
+            run_trials(todo, file, executor, at_once, progress.done, lambda: progress.stopping)
+        except BrokenProcessPool as error:
+            raise InputError(
+                f"a worker process ended by itself (is there enough memory for {at_once} of them?); "
+                f"finished trials are kept in {file.path}, the same command goes on"
+            ) from error
+    if progress.count < len(todo):
+        say(f"stopped; {len(todo) - progress.count} trials are left, the same command goes on")
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _executor(
+    workers: int | None, dask: str | None, trials: int, on_cpu: bool
+) -> Iterator[tuple[Executor, int, str]]:
+    """What runs trials, how many it is given at once, and its description."""
+    if dask is not None:
+        if workers is not None:
+            raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
+        with dask_executor(dask) as (executor, threads):
+            yield executor, 2 * threads, f"dask, {threads} threads"
+        return
+    count = min(workers or (cores() if on_cpu else 1), trials)
+    executor = local_processes(count)
+    try:
+        yield executor, count, f"{count} local process{'es' if count > 1 else ''} of one thread"
+    except BaseException:
+        for process in multiprocessing.active_children():  # what they are at is lost anyhow
+            process.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def cores() -> int:
+    """That this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _sizes(given: tuple[str, ...]) -> tuple[Size, ...] | None:
+    """One number as 0.5, or several as 0.2:10."""
+    try:
+        return tuple(tuple(float(number) for number in size.split(":")) for size in given) or None
+    except ValueError as error:
+        raise UsageError(f"--size is {' '.join(given)}, expected numbers as 0.5, or 0.2:10") from error
+
+
+def _own_data(map: str) -> str:
+    if not map.startswith("demo:"):
+        raise UsageError(f"no DATA beside map {map}; only closed-form maps bring their own")
+    return map
+
+
+def _check(
+    trials: int | None, seed: int | None, images: int, angle: float, workers: int | None, shards: int, shard: int
+) -> None:  # fmt: skip
+    require("--trials", 1 if trials is None else trials, 1)
+    require("--seed", seed or 0, 0, LARGEST_SEED)
+    require("--images", images, 1, 1000)
+    require("--angle", angle, 0.01, 360)
+    require("--workers", 1 if workers is None else workers, 1, 10_000)
+    require("--shards", shards, 1)
+    require("--shard", shard, 0, shards - 1)

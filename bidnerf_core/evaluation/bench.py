@@ -1,0 +1,208 @@
+"""Many trials: planned from a protocol, run by any executor, each kept as soon as it is done."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing import connection, get_context, parent_process
+from typing import Any
+
+import torch
+
+from bidnerf_core.datasets import Dataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.closed_form_data import ClosedFormData
+from bidnerf_core.evaluation.protocols import Size, find_protocol
+from bidnerf_core.evaluation.results import ResultsFile, key_of
+from bidnerf_core.evaluation.sequences import sequence
+from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, run_trial, settings_of
+from bidnerf_core.localization import find_method
+from bidnerf_core.plain import to_plain
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be tried. ``trials`` of each size; none stands for what the protocol does by itself."""
+
+    map: str
+    data: str
+    protocol: str = "bid"
+    sizes: tuple[Size, ...] | None = None
+    method: str = "auto"
+    config: str = "{}"  # JSON, see Trial
+    trials: int | None = None
+    seed: int | None = None
+    split: str = "test"
+    frames: tuple[str, ...] | None = None  # only these
+    images: int = 1  # of a sequence around the object ...
+    angle: float = 15.0  # ... so many degrees apart
+    device: str = "cpu"
+
+
+def planned(plan: Plan) -> list[Trial]:
+    """All trials, in the order of the results. Raises ``InputError`` for what cannot be tried."""
+    _, dataset = opened(plan.map, plan.data, plan.device)
+    protocol = find_protocol(plan.protocol)
+    settings_of(plan.method, plan.config)
+    names = dataset.frame_names(plan.split)
+    rigs = _rigs(plan, dataset, names)
+    sizes = protocol.sizes if plan.sizes is None else plan.sizes
+    for size in sizes:
+        protocol.check_size(size)
+    if protocol.fixed and (plan.frames is not None or len(rigs) < len(names)):
+        raise InputError(f"protocol {plan.protocol!r} has its own frames, expected one image and all frames")
+    count = protocol.trials if plan.trials is None else plan.trials
+    cases = protocol.cases(len(rigs), count, protocol.seed if plan.seed is None else plan.seed)
+    return [
+        Trial(
+            plan.map, plan.data, rigs[place], plan.protocol, size, plan.method, plan.config, seed, plan.split
+        )
+        for size in sizes
+        for place, seed in cases
+    ]
+
+
+def changed_settings(method: str, settings: Any) -> str:
+    """JSON of those that differ from the method's defaults."""
+    usual, given = to_plain(find_method(method).config_type()), to_plain(settings)
+    return json.dumps({k: v for k, v in given.items() if v != usual[k]}, sort_keys=True)
+
+
+def left_to_do(trials: Sequence[Trial], file: ResultsFile) -> list[Trial]:
+    """Those that the file does not hold. Raises ``InputError`` where it holds one of another map or other defaults."""
+    for trial in trials:
+        known = file.results.get(key_of(trial))
+        if known is not None:
+            _check_same(trial, known, file)
+    return [trial for trial in trials if key_of(trial) not in file.results]
+
+
+def run_trials(
+    trials: Sequence[Trial],
+    file: ResultsFile,
+    executor: Executor,
+    at_once: int,
+    told: Callable[[TrialResult], None] = lambda result: None,
+    stopping: Callable[[], bool] = lambda: False,
+) -> None:
+    """Run what ``file`` does not hold and keep each result as it comes.
+
+    At most ``at_once`` trials are under way, so that little is lost by a kill. Once ``stopping`` says so, no new one is
+    begun. A trial that fails ends the run with its error, after those under way are kept.
+    """
+    waiting, under_way = iter(left_to_do(trials, file)), set[Future[TrialResult]]()
+    failed: BaseException | None = None
+    while True:
+        while len(under_way) < at_once and failed is None and not stopping():
+            trial = next(waiting, None)
+            if trial is None:
+                break
+            under_way.add(executor.submit(run_in_worker, trial))
+        if not under_way:
+            break
+        done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+        for future in done:
+            error = future.exception()
+            if error is not None:
+                failed = failed or error
+                continue
+            file.add(future.result())
+            told(future.result())
+    if failed is not None:
+        raise failed
+
+
+def share(trials: Sequence[Trial], number: int, shards: int) -> list[Trial]:
+    """The part of one machine among several: every ``shards``-th trial."""
+    if not 0 <= number < shards:
+        raise InputError(f"shard is {number}, expected 0 to {shards - 1}")
+    return list(trials[number::shards])
+
+
+def run_in_worker(trial: Trial) -> TrialResult:
+    """In a process that does nothing else: one thread for good."""
+    torch.set_num_threads(1)
+    return run_trial(trial)
+
+
+class InThisProcess(Executor):
+    """Runs what it is given at once."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def local_processes(count: int) -> Executor:
+    """Processes of one thread each that end when this one does, however it ends."""
+    if count == 1:
+        return InThisProcess()
+    return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=prepare_worker)
+
+
+def prepare_worker() -> None:
+    """Ctrl-C is for the parent; a worker whose parent is gone goes too."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+def _follow_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+def _check_same(trial: Trial, known: TrialResult, file: ResultsFile) -> None:
+    stored, _ = opened(trial.map, trial.data, trial.device)
+    advice = "name another --out, or remove the file to begin anew"
+    if known.weights != stored.info.weights:
+        raise InputError(
+            f"{file.path}: holds results of another training of map {trial.map} "
+            f"({known.weights}, expected {stored.info.weights}); {advice}"
+        )
+    settings = to_plain(settings_of(trial.method, trial.config))
+    for name, value in settings.items():
+        if known.settings.get(name) != value:
+            found = known.settings.get(name)
+            raise InputError(f"{file.path}: was made with {name} {found}, expected {value}; {advice}")
+
+
+def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...]]:
+    """For each frame that may be tried, the names of its views."""
+    for name in plan.frames or ():
+        if name not in names:
+            raise InputError(f"{plan.data}: split {plan.split!r} has no frame {name!r}")
+    kept = names if plan.frames is None else [name for name in names if name in plan.frames]
+    if plan.images == 1:
+        return [(name,) for name in kept]
+    if isinstance(dataset, ClosedFormData):
+        return [dataset.sequence(name, plan.images, plan.angle) for name in kept]
+    rigs = list(_found_sequences(plan, dataset, names, kept))
+    if not rigs:
+        raise InputError(
+            f"{plan.data}: no frame of split {plan.split!r} ends a sequence of {plan.images} frames "
+            f"{plan.angle:g} degrees apart around what the cameras look at"
+        )
+    return rigs
+
+
+def _found_sequences(
+    plan: Plan, dataset: Dataset, names: list[str], kept: list[str]
+) -> Iterator[tuple[str, ...]]:
+    poses = [view.T_ref_camera for view in dataset.views(plan.split)]
+    for name in kept:
+        places = sequence(poses, names.index(name), plan.images, plan.angle)
+        if places is not None:
+            yield tuple(names[place] for place in places)

@@ -1,0 +1,36 @@
+"""Trials on a cluster: dask's workers behind the executor that every bench takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+
+from bidnerf_core.errors import InputError
+
+PATIENCE = "20s"
+"""To reach the scheduler."""
+
+
+@contextmanager
+def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
+    """An executor of the scheduler at ``address``, and how many trials its workers run at once.
+
+    Workers need this package, the same backends, and the maps and data under the same paths. Peak memory is told per
+    process: give each worker one thread (``dask worker --nthreads 1``) where it is to be that of one trial.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError("--dask needs dask, which is missing: pip install 'bidnerf[cluster]'") from error
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        raise InputError(
+            f"no dask scheduler at {address} ({error}), expected one as tcp://host:8786"
+        ) from error
+    with client:
+        threads = sum(client.nthreads().values())
+        if threads == 0:
+            raise InputError(f"the dask scheduler at {address} has no workers, expected at least one")
+        yield client.get_executor(), threads

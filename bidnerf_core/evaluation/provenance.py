@@ -1,0 +1,142 @@
+"""What it takes to make results again: the command, the code, the machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import bidnerf_core
+from bidnerf_core.errors import InputError
+from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.storage import write_file
+
+VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Of one run."""
+
+    date: str  # UTC, when it began
+    command: str
+    commit: str | None  # of the checkout that the code was run from
+    dirty: bool  # whether files of that checkout had changes
+    cpu: str
+    cores: int | None
+    gpu: str | None
+    memory_bytes: int | None
+    system: str
+    python: str
+    versions: dict[str, str]
+    workers: str  # what ran the trials
+
+
+def provenance(command: str, workers: str) -> Provenance:
+    """Of the run that begins now."""
+    return Provenance(
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        command=command,
+        commit=git("rev-parse", "--verify", "HEAD") or None,
+        dirty=bool(git("status", "--porcelain", "--untracked-files=no", "--", "bidnerf_core", "backends")),
+        cpu=cpu_model(),
+        cores=os.cpu_count(),
+        gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        memory_bytes=_memory(),
+        system=f"{platform.system()} {platform.machine()}",
+        python=platform.python_version(),
+        versions={name: found for name in VERSIONS if (found := _version(name))},
+        workers=workers,
+    )
+
+
+def command_line(name: str, arguments: list[str]) -> str:
+    """As a shell takes it."""
+    return shlex.join([*name.split(), *arguments])
+
+
+def beside(results: Path) -> Path:
+    """The file that tells of the runs behind a file of results."""
+    return results.with_suffix(".meta.json")
+
+
+def note_run(results: Path, run: Provenance) -> None:
+    """Add to what is known of the file; a run that went on where another stopped is told as well."""
+    runs = [*read_runs(results), run]
+    write_file(beside(results), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
+
+
+def read_runs(results: Path) -> list[Provenance]:
+    """Of a file of results, first to last; none where nothing is known."""
+    path = beside(results)
+    if not path.is_file():
+        return []
+    expected = "expected what 'bidnerf evaluate' writes beside its results"
+    try:
+        found: Any = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON ({error}), {expected}") from error
+    if not isinstance(found, dict) or not isinstance(found.get("runs"), list):
+        raise InputError(f"{path}: no list of runs, {expected}")
+    return [from_plain(Provenance, run, str(path)) for run in found["runs"]]
+
+
+def git(*arguments: str) -> str:
+    """Output of a git command where this package is; nothing where there is no checkout of it, or no git."""
+    root = Path(bidnerf_core.__file__).resolve().parents[1]
+    if not (root / ".git").exists():  # installed, perhaps inside of some other project
+        return ""
+    try:
+        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return done.stdout.strip()
+
+
+def cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
+def _memory() -> int | None:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # not everywhere
+        return None
+
+
+def _version(name: str) -> str | None:
+    if name == "torch":  # its build says more than its distribution
+        return str(torch.__version__)
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def script_command() -> str:
+    """Of a script: paths relative to the checkout; of a path outside of it, only the name is kept."""
+    root = Path(bidnerf_core.__file__).resolve().parents[1]
+    return shlex.join(["python", *(_without_local_path(word, root) for word in sys.argv)])
+
+
+def _without_local_path(argument: str, root: Path) -> str:
+    option, equals, value = argument.rpartition("=")
+    path = Path(value)
+    if path.is_absolute():
+        value = str(path.relative_to(root)) if path.is_relative_to(root) else path.name
+    return option + equals + value
