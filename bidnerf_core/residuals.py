@@ -13,7 +13,7 @@ from bidnerf_core.pixels import Pixels
 from bidnerf_core.rendering import Rendering
 from bidnerf_core.robust import Robust, huber
 
-__all__ = ["Objective", "depth", "huber", "masked_mean", "objective", "photometric"]
+__all__ = ["Objective", "depth", "free_space", "huber", "masked_mean", "objective", "photometric"]
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,9 @@ class Objective:
     colour: Robust
     depth: Robust  # its scale is in metres
     depth_weight: float
+    free_space_weight: float = (
+        0.0  # of matter that is rendered more than the scale of depth before what was measured
+    )
 
     def __call__(self, rendering: Rendering, pixels: Pixels) -> Float[Tensor, ""]:
         """``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6), for pixels of shape (views, pixels).
@@ -30,14 +33,26 @@ class Objective:
         The colour term sums rho over the three channels; the depth term is a mean over the rays where depth was measured.
         """
         colour = self.colour(photometric(rendering, pixels)).sum(-1).mean(-1)
-        if self.depth_weight == 0:
+        if not self.heeds_depth:
             return colour.mean()
         distance = masked_mean(self.depth(depth(rendering, pixels)), pixels.distance > 0)
-        return (colour + self.depth_weight * distance).mean()
+        loss = (colour + self.depth_weight * distance).mean()
+        return loss + self._in_front(rendering, pixels.distance)
 
     def on_depth_rays(self, rendering: Rendering, measured: DepthRays) -> Float[Tensor, ""]:
-        """``lambda_d mean_r rho(d)``: the depth term alone, on rays of their own."""
-        return self.depth_weight * self.depth(rendering.distance - measured.distance).mean()
+        """``lambda_d mean_r rho(d)``: the depth terms alone, on rays of their own."""
+        loss = self.depth_weight * self.depth(rendering.distance - measured.distance).mean()
+        return loss + self._in_front(rendering, measured.distance)
+
+    @property
+    def heeds_depth(self) -> bool:
+        return self.depth_weight > 0 or self.free_space_weight > 0
+
+    def _in_front(self, rendering: Rendering, distance: Float[Tensor, "*k p"]) -> Float[Tensor, ""] | float:
+        if self.free_space_weight == 0:
+            return 0.0
+        found = self.depth(free_space(rendering, distance, self.depth.scale))
+        return self.free_space_weight * masked_mean(found, distance > 0).mean()
 
 
 def photometric(rendering: Rendering, pixels: Pixels) -> Float[Tensor, "*p 3"]:
@@ -48,6 +63,16 @@ def photometric(rendering: Rendering, pixels: Pixels) -> Float[Tensor, "*p 3"]:
 def depth(rendering: Rendering, pixels: Pixels) -> Float[Tensor, "*p"]:
     """Rendered minus measured distance, metres; 0 where nothing was measured."""
     return torch.where(pixels.distance > 0, rendering.distance - pixels.distance, 0)
+
+
+def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:
+    """How far, on average over the ray, its weight lies before the measured ``distance`` less ``margin``: metres.
+
+    A sensor that measured depth saw nothing before it. Unlike an error of the mean distance, this is not content with
+    matter on both sides. 0 where nothing was measured.
+    """
+    before = (distance[..., None] - margin - rendering.samples.middles).clamp(min=0)
+    return (rendering.weights * before).sum(-1)
 
 
 def masked_mean(values: Float[Tensor, "*k p"], mask: Bool[Tensor, "*k p"]) -> Float[Tensor, "*k"]:

@@ -29,13 +29,15 @@ class BidConfig(DescentConfig):
     depth_loss: RobustName = "huber"  # robust loss of depth differences
     depth_rays: int = 512  # besides, of a sensor with rays of its own, where there is one
     depth_scale: float = 0.1  # of it, in metres: about where an outlier begins
+    free_space_weight: float = 0.0  # of matter that is rendered farther than that before what was measured
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("depth_scale", 0 < self.depth_scale <= 1e6, "a positive number, at most 1e+06")
         self._require("depth_rays", 0 <= self.depth_rays <= 10**7, "0 to 10 million")
         self._require_one_of(depth_loss=RobustName)
-        self._require_not_negative("depth_weight")
+        for name in ("depth_weight", "free_space_weight"):
+            self._require_not_negative(name)
 
     @property
     def objective(self) -> Objective:
@@ -43,6 +45,7 @@ class BidConfig(DescentConfig):
             Robust(self.colour_loss, self.colour_scale),
             Robust(self.depth_loss, self.depth_scale),
             self.depth_weight,
+            self.free_space_weight,
         )
 
 

@@ -54,7 +54,7 @@ class SampledLoss:
     def _drawn(self) -> tuple[Pixels, DepthRays | None]:
         problem, chance = self._problem, self._generator
         pixels = draw(problem.views, self._counts.pixels, self._drawer, chance, device=problem.device)
-        if problem.depth_rays is None or self._objective.depth_weight == 0 or self._counts.depth_rays == 0:
+        if problem.depth_rays is None or not self._objective.heeds_depth or self._counts.depth_rays == 0:
             return pixels, None
         return pixels, problem.depth_rays.drawn(self._counts.depth_rays, chance, device=problem.device)
 
