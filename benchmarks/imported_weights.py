@@ -6,7 +6,7 @@
 The checkpoint is imported twice with the plugin's own command: as its README has it, for the PSNR of both levels on test
 images averaged over 2 x 2 pixels; and with ``--box`` and fewer samples a ray, for poses found by ``bid`` from starts of
 protocol ``bid``, in every combination of coarse and fine level with RGB and RGB-D, from the same starts. An RGB image
-has no depth at all, so that its pivot comes from the scene's box. One thread; finished trials are kept in a ``.jsonl``
+has no depth at all, so that its pivot comes from the scene's box. One thread; what is finished is kept in a ``.jsonl``
 beside the record, so that an interrupted run goes on where it stopped.
 """
 
@@ -16,6 +16,7 @@ import argparse
 import json
 import statistics
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ from bidnerf_nerf_pytorch.command import main as import_command
 
 LEVELS = {"coarse": 0, "fine": 1}
 CELLS = [(level, sensor) for level in LEVELS for sensor in ("RGB-D", "RGB")]
-DESCENT = BidConfig(rays=384, max_steps=150, decay_steps=60)  # what one thread affords
+DESCENT = BidConfig(rays=256, max_steps=150, decay_steps=60)  # what one thread affords
 SHRINK = 2  # of images, for their PSNR
 
 
@@ -61,22 +62,52 @@ def shrunk(frame: Frame) -> Frame:
     return Frame(frame.name, rgb, frame.intrinsics.scaled(1 / SHRINK))
 
 
-def seen(stored: Map, views: list[View], picture: Path | None) -> dict[str, Any]:
-    """PSNR of each level; the first view is drawn."""
-    quality: dict[str, list[float]] = {level: [] for level in LEVELS}
-    for number, view in enumerate(views):
-        frame = shrunk(view.frame)
-        images = [
-            render_image(level, frame.intrinsics, view.T_ref_camera, stored.bounds)
-            for level in levels(stored.field)
-        ]
-        for level, image in zip(LEVELS, images, strict=True):
-            quality[level].append(float(psnr(image.rgb, frame.rgb, 1.0)))
-        if number == 0 and picture is not None:
-            row = {"real": frame.rgb, **dict(zip(LEVELS, (image.rgb for image in images), strict=True))}
-            row["depth, fine"] = depth_to_rgb(images[-1].depth)
-            iio.imwrite(picture, np.concatenate([tile(image, name) for name, image in row.items()], axis=1))
-        print(f"{frame.name}: " + ", ".join(f"{k} {v[-1]:.2f} dB" for k, v in quality.items()), flush=True)
+class Kept:
+    """Results by key, in a file of one line each."""
+
+    def __init__(self, path: Path) -> None:
+        lines = path.read_text().splitlines() if path.exists() else []
+        self.path = path
+        self.rows = {
+            line["key"]: line["row"] for line in map(json.loads, (x for x in lines if x.endswith("}")))
+        }
+
+    def get(self, key: list[Any], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        text = json.dumps(key)
+        if text not in self.rows:
+            self.rows[text] = make()
+            with self.path.open("a") as file:
+                file.write(json.dumps({"key": text, "row": self.rows[text]}) + "\n")
+        return self.rows[text]
+
+
+def seen(stored: Map, view: View, picture: Path | None) -> dict[str, float]:
+    """PSNR of each level; drawn where a file is named."""
+    frame = shrunk(view.frame)
+    images = [
+        render_image(level, frame.intrinsics, view.T_ref_camera, stored.bounds)
+        for level in levels(stored.field)
+    ]
+    if picture is not None:
+        row = {"real": frame.rgb, **dict(zip(LEVELS, (image.rgb for image in images), strict=True))}
+        row["depth, fine"] = depth_to_rgb(images[-1].depth)
+        iio.imwrite(picture, np.concatenate([tile(image, name) for name, image in row.items()], axis=1))
+    found = {n: float(psnr(i.rgb, frame.rgb, 1.0)) for n, i in zip(LEVELS, images, strict=True)}
+    print(
+        f"{frame.name}: " + ", ".join(f"{name} {value:.2f} dB" for name, value in found.items()), flush=True
+    )
+    return found
+
+
+def image_quality(stored: Map, dataset: Dataset, given: argparse.Namespace, kept: Kept) -> dict[str, Any]:
+    """Of frames spread evenly over the test split; the first is drawn."""
+    names = dataset.frame_names("test")
+    rows = []
+    for number, name in enumerate(names[:: max(1, len(names) // given.frames)][: given.frames]):
+        (view,) = dataset.views("test", [name])
+        picture = given.picture if number == 0 else None
+        rows.append(kept.get([given.checkpoint.name, name], lambda v=view, p=picture: seen(stored, v, p)))
+    quality = {level: [row[level] for row in rows] for level in LEVELS}
     return {
         level: {"frames": len(q), "psnr_mean_dB": statistics.fmean(q), "psnr_lowest_dB": min(q)}
         for level, q in quality.items()
@@ -98,26 +129,22 @@ def trial(stored: Map, view: View, level: str, sensor: str, seed: int, size: flo
     }  # fmt: skip
 
 
-def all_trials(stored: Map, dataset: Dataset, given: argparse.Namespace) -> list[dict[str, Any]]:
+def all_trials(stored: Map, dataset: Dataset, given: argparse.Namespace, kept: Kept) -> list[dict[str, Any]]:
     """Start by start, so that an interrupted run has the same starts in every cell."""
     names = [n for i, n in enumerate(dataset.frame_names("test")) if i % 5 != 1]  # those were tuned on
-    partial = RESULTS / f"{given.name}.partial.jsonl"
-    lines = partial.read_text().splitlines() if partial.exists() else []
-    done = {line["key"]: line["row"] for line in map(json.loads, (x for x in lines if x.endswith("}")))}
     rows = []
-    with partial.open("a") as file:
-        for number in range(given.trials):
-            seed, name = given.seed + number, names[number % len(names)]
-            (view,) = dataset.views("test", [name])
-            for level, sensor in CELLS:
-                settings = [to_plain(DESCENT), given.box, given.samples, given.size]
-                key = json.dumps([given.checkpoint.name, name, seed, level, sensor, settings])
-                if key not in done:
-                    done[key] = trial(stored, view, level, sensor, seed, given.size)
-                    file.write(json.dumps({"key": key, "row": done[key]}) + "\n")
-                    file.flush()
-                    print(f"{number + 1}/{given.trials} {told(done[key])}", flush=True)
-                rows.append(done[key])
+    for number in range(given.trials):
+        seed, name = given.seed + number, names[number % len(names)]
+        (view,) = dataset.views("test", [name])
+        for level, sensor in CELLS:
+            key = [given.checkpoint.name, name, seed, level, sensor, to_plain(DESCENT), given.box]
+            rows.append(
+                kept.get(
+                    [*key, given.samples, given.size],
+                    lambda v=view, lv=level, sn=sensor, sd=seed: trial(stored, v, lv, sn, sd, given.size),
+                )
+            )
+            print(f"{number + 1}/{given.trials} {told(rows[-1])}", flush=True)
     return rows
 
 
@@ -165,8 +192,8 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--name", required=True, help="of the record")
-    parser.add_argument("--frames", type=int, default=25, help="for PSNR, evenly among the test split")
-    parser.add_argument("--trials", type=int, default=24, help="starts, each tried in four ways")
+    parser.add_argument("--frames", type=int, default=10, help="for PSNR, evenly among the test split")
+    parser.add_argument("--trials", type=int, default=20, help="starts, each tried in four ways")
     parser.add_argument("--size", type=float, default=0.5, help="of protocol bid")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--box", type=float, nargs=6, default=[-0.75, -1.25, -0.7, 0.75, 1.25, 1.15])
@@ -179,10 +206,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         plain, quick = imported(given, Path(folder))
     dataset = open_dataset(given.data, plain.bounds.background)
-    names = dataset.frame_names("test")
-    shown = dataset.views("test", names[:: max(1, len(names) // given.frames)][: given.frames])
-    quality = seen(plain, shown, given.picture)
-    rows = all_trials(quick, dataset, given)
+    kept = Kept(RESULTS / f"{given.name}.partial.jsonl")
+    rows = all_trials(quick, dataset, given, kept)
+    quality = image_quality(plain, dataset, given, kept)
     cells = {cell: [r for r in rows if (r["level"], r["sensor"]) == cell] for cell in CELLS}
     differences = {
         f"{' '.join(a)} against {' '.join(b)}": difference(cells[a], cells[b])
@@ -199,7 +225,7 @@ def main() -> None:
     }  # fmt: skip
     print(write_record(given.name, results, given.seed))
     print(json.dumps({"quality": quality, **results["cells"]}, indent=1))
-    (RESULTS / f"{given.name}.partial.jsonl").unlink()
+    kept.path.unlink()
 
 
 if __name__ == "__main__":
