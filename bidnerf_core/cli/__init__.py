@@ -20,6 +20,7 @@ COMMANDS = {
     "render": "images and depth of a map from a dataset's poses",
     "localize": "find the pose of images in a map",
     "evaluate": "localize many frames from wrong starts, one JSON line a trial",
+    "compare": "the same starts in several maps: success, steps, time, memory",
 }
 
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141

@@ -1,0 +1,176 @@
+"""``bidnerf compare``."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.table import Table
+
+from bidnerf_core.cli.common import (
+    LARGEST_SEED,
+    Flag,
+    Names,
+    UsageError,
+    option,
+    output_folder,
+    parse,
+    print_json,
+    print_table,
+    require,
+    say,
+    value_of,
+)
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.comparison import USUAL, Comparison, MapRow, compare, plan
+from bidnerf_core.evaluation.comparison_figure import comparison_figure
+from bidnerf_core.evaluation.errors import CRITERIA
+from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol
+from bidnerf_core.evaluation.trial_process import Measured
+from bidnerf_core.evaluation.trials import Trial
+from bidnerf_core.localization import METHODS, find_method
+from bidnerf_core.plain import to_plain
+from bidnerf_core.storage import load_info, write_file
+
+Folders = Annotated[
+    tuple[Path, ...],
+    tyro.conf.Positional,
+    option("MAP... DATA", "folders of maps, and last that of a dataset of what they show", ""),
+]
+
+
+def run(arguments: list[str]) -> None:
+    """Parse with the settings of the method that the arguments name."""
+    kind = find_method(value_of("--method", arguments) or "auto").config_type
+
+    def compare(
+        folders: Folders,
+        out: Annotated[
+            Path | None, option("DIR", "write compare.json, compare.png and compare.svg there", "")
+        ] = None,
+        split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
+        frame: Annotated[Names, option("NAME...", "names of frames to try", "all of the split")] = (),
+        protocol: Annotated[str, option("NAME", f"of the starts: {', '.join(PROTOCOLS)}")] = "bid",
+        size: Annotated[
+            tuple[float, ...],
+            option("E...", "how far off the starts are, in the protocol's terms", "its first"),
+        ] = (),
+        trials: Annotated[int | None, option("N", "how many starts", "the protocol's")] = None,
+        method: Annotated[str, option("NAME", f"auto, {', '.join(METHODS)}")] = "auto",
+        seed: Annotated[int | None, option("N", "of the starts and the descents", "the protocol's")] = None,
+        json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
+        overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
+        config: Any = kind(),
+    ) -> None:
+        """Find the same frames from the same starts in several maps, and compare success, time and memory.
+
+        Each map has a process of its own, and the maps take turns at each start.
+        """
+        if len(folders) < 2:
+            raise UsageError(
+                f"{len(folders)} folders given, expected one of a map or more, then that of a dataset"
+            )
+        *maps, data = map(str, folders)
+        chosen = find_protocol(protocol)
+        usual = Trial(
+            "", data, ("",), protocol, size or chosen.sizes[0], method,
+            jsonlib.dumps(to_plain(config)), chosen.seed if seed is None else seed, split,
+        )  # fmt: skip
+        names = [name for group in frame for name in group]
+        found = _compare(maps, usual, names, trials, out, overwrite)
+        if json:
+            print_json(to_plain(replace(found, results=())))
+        else:
+            _print(found)
+
+    compare.__annotations__["config"] = kind
+    parse("compare", compare, arguments)
+
+
+def _compare(
+    maps: Sequence[str], usual: Trial, names: Sequence[str], trials: int | None, out: Path | None, overwrite: bool
+) -> Comparison:  # fmt: skip
+    """Everything that can be judged is judged before the work begins."""
+    require("--trials", 1 if trials is None else trials, 1)
+    require("--seed", usual.seed, 0, LARGEST_SEED)
+    dataset = open_dataset(usual.data)
+    known = dataset.frame_names(usual.split)
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(
+            f"{usual.data}: no frame {unknown[0]!r} in split {usual.split!r}, expected names of its frames"
+        )
+    for folder in maps:
+        load_info(Path(folder))
+    planned = plan(usual, maps, names, trials)
+    if out is None:
+        return compare(planned, _Progress())
+    with output_folder(out, overwrite):
+        found = compare(planned, _Progress())
+        _write(found, out)
+    return found
+
+
+class _Progress:
+    """A line on stderr for each trial."""
+
+    def __call__(self, done: int, total: int, measured: Measured) -> None:
+        result = measured.result
+        error = result.error
+        off = f"{error.translation:.3f} m, {error.rotation_deg:.2f} deg" if error else "not finite"
+        name = Path(result.trial.map).name
+        say(f"{done}/{total}  {result.frame} in {name}: {off}, {result.steps} steps, {result.seconds:.1f} s")
+
+
+def _write(found: Comparison, out: Path) -> None:
+    write_file(out / "compare.json", (jsonlib.dumps(to_plain(found), allow_nan=False) + "\n").encode())
+    try:
+        comparison_figure([out / "compare.png", out / "compare.svg"], found)
+        say(f"look at {out / 'compare.png'}")
+    except InputError as error:  # matplotlib is an extra
+        say(str(error))
+
+
+def _print(found: Comparison) -> None:
+    size = ":".join(f"{x:g}" for x in found.size)
+    print(
+        f"{found.trials} starts of {found.protocol} {size} on {found.data}/{found.split}, method {found.method}"
+    )
+    table = Table("", *(row.map for row in found.rows), box=None, pad_edge=False)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, cell in LINES.items():
+        table.add_row(name, *map(cell, found.rows))
+    print_table(table)
+    print(f"success: how many, and Wilson's 95 % interval; to success: median of the starts that met {USUAL}")
+
+
+def _rate(row: MapRow, criterion: str) -> str:
+    rate = row.success[criterion].rate
+    return f"{rate.successes}/{rate.trials} ({100 * rate.low:.0f}-{100 * rate.high:.0f} %)"
+
+
+def _known(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+LINES: dict[str, Callable[[MapRow], str]] = {
+    "backend": lambda row: row.backend,
+    **{f"success {name}": partial(_rate, criterion=name) for name in CRITERIA},
+    "median error, m": lambda row: _known(row.translation, 4),
+    "median error, deg": lambda row: _known(row.rotation_deg, 2),
+    "steps": lambda row: f"{row.steps:g}",
+    "steps to success": lambda row: _known(row.success[USUAL].steps, 0),
+    "ms a step": lambda row: f"{row.ms_per_step:.1f}",
+    "ms to success": lambda row: _known(row.success[USUAL].milliseconds, 0),
+    "peak memory, MiB": lambda row: f"{row.peak_memory_bytes / 2**20:.0f}",
+    "samples a ray": lambda row: f"{row.samples_per_ray:.1f}",
+    "map, MiB": lambda row: f"{row.map_bytes / 2**20:.1f}",
+}
+"""The table, line by line; a map has a column."""
