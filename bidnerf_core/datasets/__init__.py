@@ -1,4 +1,4 @@
-"""Readers of posed images from disk. All conversions of convention happen in here, once."""
+"""Readers of posed images from disk, and a writer. All conversions of convention happen in here, once."""
 
 from __future__ import annotations
 
@@ -8,9 +8,18 @@ from typing import Protocol, runtime_checkable
 
 from bidnerf_core.datasets.dataset import Background, Dataset, ReadingProgress
 from bidnerf_core.datasets.transforms import TransformsReader
+from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError
 
-__all__ = ["READERS", "Background", "Dataset", "Reader", "ReadingProgress", "open_dataset"]
+__all__ = [
+    "READERS",
+    "Background",
+    "Dataset",
+    "Reader",
+    "ReadingProgress",
+    "open_dataset",
+    "write_transforms",
+]
 
 
 @runtime_checkable

@@ -82,7 +82,10 @@ def _draw_times(axes: Any, comparison: Comparison) -> None:
         axes.step([0.0, *times, max([longest, *times])], [*shares, shares[-1]], where="post",
                   color=_colour(place), label=row.map, linewidth=1.8)  # fmt: skip
     axes.set(
-        ylim=(0, 1.02), xlabel="seconds", ylabel="share of starts", title=f"{' '.join(_words(USUAL).split())}, after so long"
+        ylim=(0, 1.02),
+        xlabel="seconds",
+        ylabel="share of starts",
+        title=f"{' '.join(_words(USUAL).split())}, after so long",
     )
     axes.set_xlim(left=0)
     axes.grid(alpha=0.25)

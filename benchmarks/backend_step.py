@@ -1,0 +1,141 @@
+"""One step of ``bid`` on maps of any backends, in one run: time, samples a ray, size of the map.
+
+    python benchmarks/backend_step.py DATA MAP... --name backend_step_lego
+
+All maps render the same 2048 rays of a test frame from the same pose, 0.1 m from the truth, at the level that ``bid`` uses,
+with the gradient to the pose (forward and backward). They take turns, so that whatever else the machine does disturbs all
+alike; medians. Where a level's sampler only leaves out samples of another one (the vanilla field does that by its grid of
+free space), the step without skipping is timed as well, as ``MAP dense``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from record import write_record
+
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.evaluation.comparison import labels, map_bytes
+from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.field import FieldValues, RadianceField, RaySampler
+from bidnerf_core.localization import BidConfig, Problem, single
+from bidnerf_core.pixels import draw, uniform
+from bidnerf_core.rendering import render
+from bidnerf_core.residuals import objective
+from bidnerf_core.storage import load_map
+
+SETTINGS = BidConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class Everywhere:
+    """A level that is asked wherever ``sampler`` says."""
+
+    level: RadianceField
+    sampler: RaySampler
+
+    def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+        return self.level.query(positions, directions)
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """What is timed, and what is told of it."""
+
+    problem: Problem
+    level: RadianceField
+    about: dict[str, Any]
+
+
+def variants(folders: list[Path], data: Path) -> dict[str, Variant]:
+    found: dict[str, Variant] = {}
+    for name, folder in zip(labels([str(f) for f in folders]), folders, strict=True):
+        stored = load_map(folder)
+        dataset = open_dataset(data, stored.bounds.background)
+        (view,) = dataset.views("test", dataset.frame_names("test")[:1])
+        start = perturb(view.T_ref_camera, 0.1, 2.0, seed=0)
+        problem = single(stored.field, stored.bounds, view.frame, start)
+        level = problem.level(SETTINGS.level)
+        about = {
+            "backend": stored.info.backend,
+            "map_MiB": map_bytes(folder) / 2**20,
+            "config": stored.info.config,
+        }
+        found[name] = Variant(problem, level, about)
+        inner = getattr(level.sampler, "sampler", None)
+        if isinstance(inner, RaySampler):
+            found[f"{name} dense"] = Variant(problem, Everywhere(level, inner), about)
+    return found
+
+
+def step(variant: Variant, seed: int) -> tuple[float, float]:
+    """Seconds, and samples a ray."""
+    problem = variant.problem
+    began = time.perf_counter()
+    pixels = draw(problem.views, SETTINGS.rays, uniform, torch.Generator().manual_seed(seed))
+    delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    rays = pixels.rays(problem.start.retract(delta), problem.bounds)
+    rendering = render(variant.level, rays, problem.bounds.background)
+    objective(rendering, pixels, SETTINGS.huber_delta, SETTINGS.depth_weight).backward()
+    return time.perf_counter() - began, float(rendering.samples.valid.sum()) / SETTINGS.rays
+
+
+def measured(found: dict[str, Variant], repeats: int) -> dict[str, Any]:
+    """In turns; the first round warms up."""
+    times: dict[str, list[float]] = {name: [] for name in found}
+    samples: dict[str, list[float]] = {name: [] for name in found}
+    for seed in range(repeats + 1):
+        for name, variant in found.items():
+            seconds, count = step(variant, seed)
+            if seed:
+                times[name].append(1000 * seconds)
+                samples[name].append(count)
+    dense = [name for name in found if name.endswith(" dense")]
+    return {
+        name: {
+            **variant.about,
+            "ms": statistics.median(times[name]),
+            "ms_each": times[name],
+            "samples_per_ray": statistics.fmean(samples[name]),
+            "times_faster_than": {
+                other: faster(times[name], times[other]) for other in dense if other != name
+            },
+        }
+        for name, variant in found.items()
+    }
+
+
+def faster(mine: list[float], others: list[float]) -> float:
+    """Median over the turns."""
+    return statistics.median(b / a for a, b in zip(mine, others, strict=True))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path)
+    parser.add_argument("maps", type=Path, nargs="+")
+    parser.add_argument("--name", required=True, help="of the record")
+    parser.add_argument("--repeats", type=int, default=9)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    found = measured(variants(given.maps, given.data), given.repeats)
+    print(write_record(given.name, {"rays": SETTINGS.rays, "level": SETTINGS.level, "steps": found}, seed=0))
+    for name, row in found.items():
+        than = ", ".join(
+            f"{ratio:.2f} times as fast as {other}" for other, ratio in row["times_faster_than"].items()
+        )
+        print(
+            f"{name}: {row['ms']:.0f} ms, {row['samples_per_ray']:.1f} samples a ray, {row['map_MiB']:.1f} MiB; {than}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""Views as a folder that the readers read: ``transforms_train.json`` and its like, images, depth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets.transforms_json import METRES_PER_DEPTH_UNIT, SPLITS, file_of
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+
+OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # of camera axes: y and z turn round
+LENS = ("k1", "k2", "p1", "p2", "k3")
+LARGEST = 65535
+
+
+def write_transforms(
+    folder: Path, splits: Mapping[str, Sequence[View]], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> None:  # fmt: skip
+    """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bit) and ``depth/SPLIT/NAME.png`` (16 bit).
+
+    ``background`` is what lies behind a frame that has an alpha channel, to be taken out of its colour. Depth is kept to
+    the millimetre where that reaches far enough. Raises ``InputError`` for an unknown split, a name that comes twice, and
+    for a lens of more than five coefficients.
+    """
+    for split, views in splits.items():
+        if split not in SPLITS:
+            raise InputError(f"{folder}: split {split!r} cannot be written, expected {', '.join(SPLITS)}")
+        names = [view.frame.name for view in views]
+        if len(set(names)) != len(names):
+            raise InputError(
+                f"{folder}: two frames of split {split!r} have one name, expected different ones"
+            )
+        frames = [_written(folder, split, view, background) for view in views]
+        (folder / file_of(split)).write_text(json.dumps({"frames": frames}, indent=1, allow_nan=False))
+
+
+def _written(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
+    """The entry of one frame, whose images are written."""
+    frame = view.frame
+    T_world_camera = view.T_ref_camera.to(torch.float64).matrix()
+    entry: dict[str, Any] = {
+        "file_path": f"images/{split}/{frame.name}.png",
+        "transform_matrix": (T_world_camera * T_world_camera.new_tensor(OPENCV_TO_OPENGL)).tolist(),
+        **_camera(frame),
+    }
+    _write(folder / entry["file_path"], _colours(frame, background))
+    if frame.depth is not None:
+        unit = max(METRES_PER_DEPTH_UNIT, float(frame.depth.max()) / LARGEST)
+        entry |= {"depth_file_path": f"depth/{split}/{frame.name}.png", "depth_unit_scale_factor": unit}
+        steps = (frame.depth.double() / unit).round().clamp(0, LARGEST)
+        _write(folder / entry["depth_file_path"], steps.cpu().numpy().astype(np.uint16))
+    return entry
+
+
+def _camera(frame: Frame) -> dict[str, float]:
+    camera: Intrinsics = frame.intrinsics
+    if len(camera.distortion) > len(LENS):
+        found = len(camera.distortion)
+        raise InputError(f"frame {frame.name}: lens of {found} coefficients, expected at most {len(LENS)}")
+    sizes = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return {
+        **sizes,
+        "w": camera.width,
+        "h": camera.height,
+        **dict(zip(LENS, camera.distortion, strict=False)),
+    }
+
+
+def _colours(frame: Frame, background: tuple[float, float, float]) -> np.ndarray:
+    """RGB, or straight (not premultiplied) RGBA where the frame has alpha."""
+    colours = frame.rgb.detach().cpu()
+    if frame.alpha is not None:
+        cover = frame.alpha.detach().cpu()[..., None]
+        straight = (colours - (1 - cover) * colours.new_tensor(background)) / cover.clamp(min=1e-3)
+        colours = torch.cat([straight, cover], dim=-1)
+    return (colours.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def _write(path: Path, pixels: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(path, pixels)
