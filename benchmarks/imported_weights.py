@@ -42,7 +42,7 @@ from bidnerf_nerf_pytorch.command import main as import_command
 
 LEVELS = {"coarse": 0, "fine": 1}
 CELLS = [(level, sensor) for level in LEVELS for sensor in ("RGB-D", "RGB")]
-DESCENT = BidConfig(rays=256, max_steps=150, decay_steps=60)  # what one thread affords
+DESCENT = BidConfig(rays=1024)  # half as many as usual: what one thread affords
 SHRINK = 2  # of images, for their PSNR
 
 
@@ -198,7 +198,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--box", type=float, nargs=6, default=[-0.75, -1.25, -0.7, 0.75, 1.25, 1.15])
     parser.add_argument(
-        "--samples", type=int, nargs=2, default=[32, 16], help="coarse, fine, for localization"
+        "--samples", type=int, nargs=2, default=[24, 16], help="coarse, fine, for localization"
     )
     parser.add_argument("--picture", type=Path, help="file for a real image beside what the map shows")
     given = parser.parse_args()

@@ -26,12 +26,13 @@ from bidnerf_core.cli.common import (
     say,
     value_of,
 )
-from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.bench import changed_settings
+from bidnerf_core.evaluation.closed_form_data import is_closed_form
 from bidnerf_core.evaluation.comparison import USUAL, Comparison, MapRow, compare, plan
 from bidnerf_core.evaluation.comparison_figure import comparison_figure
 from bidnerf_core.evaluation.errors import CRITERIA
-from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol
+from bidnerf_core.evaluation.protocols import PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.trial_process import Measured
 from bidnerf_core.evaluation.trials import Trial
 from bidnerf_core.localization import METHODS, find_method
@@ -39,7 +40,7 @@ from bidnerf_core.plain import to_plain
 from bidnerf_core.storage import load_info, write_file
 
 Folders = Annotated[
-    tuple[Path, ...],
+    tuple[str, ...],
     tyro.conf.Positional,
     option("MAP... DATA", "folders of maps, and last that of a dataset of what they show", ""),
 ]
@@ -58,9 +59,9 @@ def run(arguments: list[str]) -> None:
         frame: Annotated[Names, option("NAME...", "names of frames to try", "all of the split")] = (),
         protocol: Annotated[str, option("NAME", f"of the starts: {', '.join(PROTOCOLS)}")] = "bid",
         size: Annotated[
-            tuple[float, ...],
-            option("E...", "how far off the starts are, in the protocol's terms", "its first"),
-        ] = (),
+            str | None,
+            option("SIZE", "how far off: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
+        ] = None,
         trials: Annotated[int | None, option("N", "how many starts", "the protocol's")] = None,
         method: Annotated[str, option("NAME", f"auto, {', '.join(METHODS)}")] = "auto",
         seed: Annotated[int | None, option("N", "of the starts and the descents", "the protocol's")] = None,
@@ -76,11 +77,11 @@ def run(arguments: list[str]) -> None:
             raise UsageError(
                 f"{len(folders)} folders given, expected one of a map or more, then that of a dataset"
             )
-        *maps, data = map(str, folders)
+        *maps, data = folders
         chosen = find_protocol(protocol)
         usual = Trial(
-            "", data, ("",), protocol, size or chosen.sizes[0], method,
-            jsonlib.dumps(to_plain(config)), chosen.seed if seed is None else seed, split,
+            "", data, ("",), protocol, chosen.sizes[0] if size is None else read_size(size), method,
+            changed_settings(method, config), chosen.seed if seed is None else seed, split,
         )  # fmt: skip
         names = [name for group in frame for name in group]
         found = _compare(maps, usual, names, trials, out, overwrite)
@@ -93,22 +94,23 @@ def run(arguments: list[str]) -> None:
     parse("compare", compare, arguments)
 
 
+def read_size(given: str) -> Size:
+    try:
+        return tuple(float(number) for number in given.split(":"))
+    except ValueError as error:
+        raise UsageError(f"--size is {given}, expected numbers as 0.5, or 0.2:10") from error
+
+
 def _compare(
     maps: Sequence[str], usual: Trial, names: Sequence[str], trials: int | None, out: Path | None, overwrite: bool
 ) -> Comparison:  # fmt: skip
     """Everything that can be judged is judged before the work begins."""
     require("--trials", 1 if trials is None else trials, 1)
     require("--seed", usual.seed, 0, LARGEST_SEED)
-    dataset = open_dataset(usual.data)
-    known = dataset.frame_names(usual.split)
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise InputError(
-            f"{usual.data}: no frame {unknown[0]!r} in split {usual.split!r}, expected names of its frames"
-        )
-    for folder in maps:
-        load_info(Path(folder))
     planned = plan(usual, maps, names, trials)
+    for folder in maps:
+        if not is_closed_form(folder):
+            load_info(Path(folder))
     if out is None:
         return compare(planned, _Progress())
     with output_folder(out, overwrite):

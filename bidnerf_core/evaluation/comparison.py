@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.closed_form_data import closed_form_data, is_closed_form
 from bidnerf_core.evaluation.errors import CRITERIA, Rate, steps_to_success, success_rate
 from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.evaluation.trial_process import Measured, TrialProcess
@@ -77,7 +78,9 @@ def plan(usual: Trial, maps: Sequence[str], names: Sequence[str], count: int | N
         raise InputError(f"maps: {', '.join(maps)}: one is named twice, expected different ones")
     protocol = find_protocol(usual.protocol)
     protocol.check_size(usual.size)
-    frames = list(names) or open_dataset(usual.data).frame_names(usual.split)
+    if protocol.fixed and names:
+        raise InputError(f"protocol {usual.protocol!r} has its own frames, expected no others to be named")
+    frames = _known(usual, names)
     cases = protocol.cases(len(frames), protocol.trials if count is None else count, usual.seed)
     return [
         [replace(usual, map=m, frames=(frames[place],), seed=seed) for m in maps] for place, seed in cases
@@ -147,7 +150,22 @@ def labels(maps: Sequence[str]) -> list[str]:
 
 def map_bytes(folder: Path) -> int:
     """Of the description and the weights; not of what an interrupted training keeps for itself."""
+    if is_closed_form(str(folder)):
+        return 0
     return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))
+
+
+def _known(usual: Trial, names: Sequence[str]) -> list[str]:
+    """The frames to choose from, of which each is there."""
+    data = usual.data
+    dataset = closed_form_data(data) if is_closed_form(data) else open_dataset(data)
+    known = dataset.frame_names(usual.split)
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise InputError(
+            f"{data}: no frame {missing[0]!r} in split {usual.split!r}, expected names of its frames"
+        )
+    return list(names) or known
 
 
 def _ms_per_step(result: TrialResult) -> float:
