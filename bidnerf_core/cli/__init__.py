@@ -21,6 +21,7 @@ COMMANDS = {
     "localize": "find the pose of images in a map",
     "evaluate": "localize many frames from wrong starts, one JSON line a trial",
     "compare": "the same starts in several maps: success, steps, time, memory",
+    "report": "tables, figures and tests of an evaluation, as one page",
 }
 
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141

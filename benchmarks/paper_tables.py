@@ -1,0 +1,154 @@
+"""The tables of BID-NeRF (Csehi and Jozsa 2023) and the protocol of iNeRF, on given maps, with settings for a CPU.
+
+    python benchmarks/paper_tables.py DATA --map MAP [--map MAP ...] --out FOLDER [--part table1 table2 inerf]
+
+- ``table1``: fine or coarse x RGB or RGB-D, one image, e_t 0.5, 0.8 and 1.2 together;
+- ``table2``: 1 image, 8 images 15 degrees apart, 8 and wide sampling, at e_t 0.9, 1.7 and 3.4;
+- ``inerf``: ``bid`` and ``inerf`` from iNeRF's starts.
+
+All cells of a part share the frames, the starts, the number of rays and of steps, and settings of their method but those
+compared. The rays are fewer than the paper's 2048. ``bid`` turns about the middle of the measured depth by default: in
+``table1``, where cells without depth must not profit from it, all cells turn about the origin of the world. Each part
+and map has a file of results in FOLDER, safe against any kill: the same command goes on where it stopped. When a part
+is complete, its record is written beside it; ``bidnerf report FOLDER/table1_*.jsonl`` draws it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from record import RESULTS, write_record
+
+from bidnerf_core.cli.trial_progress import TrialProgress
+from bidnerf_core.evaluation.bench import Plan, left_to_do, local_processes, planned, run_trials
+from bidnerf_core.evaluation.groups import Group, grouped
+from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
+from bidnerf_core.evaluation.results import ResultsFile, key_of
+from bidnerf_core.evaluation.summary import comparisons, summarize
+from bidnerf_core.evaluation.trials import Trial
+
+Settings = dict[str, Any]
+
+PAPER = {
+    "table1": {"RGB-D fine": 87.5, "RGB-D coarse": 95.83, "RGB fine": 25.0, "RGB coarse": 75.0},
+    "table2": {
+        "1 image": {"0.9": 87.5, "1.7": 50.0, "3.4": 0.0},
+        "8 images": {"0.9": 87.5, "1.7": 87.5, "3.4": 25.0},
+        "8 images, wide": {"0.9": 87.5, "1.7": 75.0, "3.4": 25.0},
+    },
+    "inerf": {"bid": 95.0, "inerf, translation": 38.0, "inerf, rotation": 42.0},
+}
+"""Percent, as printed there."""
+
+WORLD_RATE = 0.02
+"""Of steps about the origin, metres and radians: a turn there moves the camera by its distance as well."""
+
+
+def table1(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
+    """``trials`` of all three sizes together."""
+    each = -(-(trials or 24) // 3)
+    plan = replace(base, protocol="bid", sizes=((0.5,), (0.8,), (1.2,)), trials=each)
+    common = {"pivot": "world", "learning_rate": WORLD_RATE} | common
+    return [
+        replace(plan, config=_json(common | {"depth_weight": depth, "level": level}))
+        for depth in (1.0, 0.0)
+        for level in (0, None)
+    ]
+
+
+def table2(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
+    plan = replace(base, protocol="bid", sizes=((0.9,), (1.7,), (3.4,)), trials=trials or 16)
+    ending = sequence_ends(plan)  # one image is the last of the eight: the same frames for all
+    return [
+        replace(plan, config=_json(common), frames=ending),
+        replace(plan, config=_json(common), images=8),
+        replace(plan, config=_json(common | {"wide": 2.0}), images=8),
+    ]
+
+
+def inerf(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
+    plan = replace(base, protocol="inerf", trials=trials or 25)
+    return [replace(plan, method=method, config=_json(common)) for method in ("bid", "inerf")]
+
+
+PARTS: dict[str, Callable[[Plan, Settings, int | None], list[Plan]]] = {
+    "table1": table1,
+    "table2": table2,
+    "inerf": inerf,
+}
+
+
+def sequence_ends(plan: Plan) -> tuple[str, ...]:
+    """Frames that a sequence of eight ends with."""
+    every = planned(replace(plan, images=8, trials=10_000, sizes=((0.9,),)))
+    return tuple(dict.fromkeys(trial.frame for trial in every))
+
+
+def run_part(trials: Sequence[Trial], path: Path, workers: int) -> list[Group]:
+    """Groups of the results, when all are there."""
+    with ResultsFile(path) as file:
+        todo = left_to_do(trials, file)
+        if todo:
+            note_run(path, provenance(script_command(), f"{workers} local processes of one thread"))
+            with local_processes(workers) as pool, TrialProgress(len(todo), workers) as progress:
+                run_trials(todo, file, pool, workers, progress.done, lambda: progress.stopping)
+        if left_to_do(trials, file):
+            raise SystemExit(f"stopped; {path} is kept, the same command goes on")
+        file.put_in_order(trials)
+        return grouped([file.results[key_of(trial)] for trial in trials])
+
+
+def as_record(groups: Sequence[Group]) -> dict[str, Any]:
+    """Rates by each criterion, costs, and p values of each pair, by size and over all of them."""
+    cells = [
+        {
+            "map": group.situation.map,
+            "start": group.situation.start,
+            "condition": group.label,
+            **asdict(summarize(group.results)),
+        }
+        for group in groups
+    ]
+    pairs = [asdict(pair) | {"criterion": c} for c in ("10%", "5deg 0.05") for pair in comparisons(groups, c)]
+    return {"cells": cells, "settings": [g.results[0].settings for g in groups], "pairs": pairs}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data")
+    parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--part", nargs="+", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--rays", type=int, default=512)
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--config", default="{}", help="JSON of other settings, for all cells")
+    parser.add_argument("--trials", type=int, help="a cell; default 24, 16 of each size, 25")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--device", default="cpu")
+    given = parser.parse_args()
+    common = {"rays": given.rays, "max_steps": given.steps} | json.loads(given.config)
+    for part in given.part:
+        for folder in given.map:
+            base = Plan(folder, given.data, seed=given.seed, device=given.device)
+            plans = PARTS[part](base, common, given.trials)
+            trials = [trial for plan in plans for trial in planned(plan)]
+            name = f"{part}_{trials[0].portable.map.replace(':', '_')}"
+            groups = run_part(trials, given.out / f"{name}.jsonl", given.workers)
+            results = {"paper_percent": PAPER[part], "common_settings": common, **as_record(groups)}
+            print(write_record(name, results, given.seed, given.out))
+
+
+def _json(settings: Settings) -> str:
+    return json.dumps(settings, sort_keys=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,259 @@
+"""The page of a report: one HTML file with everything in it, for a browser without a network."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bidnerf_core.evaluation.errors import CRITERIA
+from bidnerf_core.evaluation.groups import Group, Situation, situations
+from bidnerf_core.evaluation.plots import NAMES
+from bidnerf_core.evaluation.provenance import Provenance
+from bidnerf_core.evaluation.summary import Comparison, Judged, comparisons, summarize
+
+CSS = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 Georgia, "Times New Roman", serif; color: #222; background: #fff;
+  max-width: 62rem; margin: 3rem auto; padding: 0 1.5rem; }
+h1 { font-size: 1.7rem; font-weight: normal; margin: 0 0 .2rem; }
+h2 { font-size: 1.2rem; margin: 2.6rem 0 .6rem; }
+p { max-width: 44rem; margin: .4rem 0; }
+.small { color: #555; font-size: .88rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font: .84rem/1.35 "Helvetica Neue", Arial, sans-serif; width: 100%;
+  font-variant-numeric: tabular-nums; border-top: 1.5px solid #222; border-bottom: 1.5px solid #222; margin: .8rem 0; }
+th { font-weight: 600; text-align: right; vertical-align: bottom; padding: .35rem .6rem; border-bottom: 1px solid #222; }
+td { text-align: right; padding: .28rem .6rem; vertical-align: top; }
+th.text, td.text { text-align: left; min-width: 9rem; }
+tr.section td { text-align: left; font-weight: 600; padding-top: .8rem; border-top: 1px solid #ccc; }
+tr.section:first-child td { border-top: none; padding-top: .4rem; }
+td .sub { display: block; color: #666; font-size: .88em; white-space: nowrap; }
+td.low { font-weight: 600; }
+figure { margin: 1.2rem 0; }
+figure img { width: 100%; height: auto; }
+figcaption { font-size: .88rem; color: #444; max-width: 48rem; }
+pre { font: .78rem/1.45 ui-monospace, "DejaVu Sans Mono", monospace; background: #f6f6f4; padding: .7rem .9rem;
+  white-space: pre-wrap; overflow-wrap: anywhere; margin: .4rem 0 .8rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; font-size: .88rem; margin: .4rem 0; }
+dt { color: #666; } dd { margin: 0; overflow-wrap: anywhere; }
+@media print { body { margin: 0; max-width: none; } h2 { break-after: avoid; } figure { break-inside: avoid; } }
+"""
+
+
+@dataclass(frozen=True)
+class Figure:
+    file: Path  # SVG
+    caption: str
+
+
+def page(
+    title: str,
+    groups: Sequence[Group],
+    figures: Sequence[Figure],
+    runs: Sequence[tuple[str, Sequence[Provenance]]],
+    criterion: str,
+) -> str:
+    """``runs``: for each file of results its name and what is known of how it was made."""
+    trials = sum(len(g.results) for g in groups if g.situation.size is not None)
+    body = [
+        f"<h1>{_text(title)}</h1>",
+        f'<p class="small">{_opening(groups, trials)}</p>',
+        "<h2>Success</h2>",
+        _rates(groups),
+        _notes(groups),
+        *[_figure(figure) for figure in figures],
+        "<h2>Speed and accuracy</h2>",
+        _costs(groups),
+        *_tests(groups, criterion),
+        "<h2>How this was made</h2>",
+        *[_made(name, known) for name, known in runs],
+    ]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{_text(title)}</title><style>{CSS}</style></head>\n<body>\n"
+        + "\n".join(body)
+        + "\n</body></html>\n"
+    )
+
+
+def _opening(groups: Sequence[Group], trials: int) -> str:
+    maps = list(dict.fromkeys(_map_name(s) for s in situations(groups)))
+    return f"{trials} trials, map{'s' if len(maps) > 1 else ''} {_text('; '.join(maps))}."
+
+
+def _map_name(s: Situation) -> str:
+    return f"{s.map} ({s.weights.partition('.')[0]}) on {s.data}/{s.split}"
+
+
+def _rates(groups: Sequence[Group]) -> str:
+    heads = [("start and method", True), ("n", False), *((NAMES[name], False) for name in CRITERIA)]
+    rows = []
+    for situation in situations(groups):
+        rows.append(_section(situation, groups, 2 + len(CRITERIA)))
+        for group in (g for g in groups if g.situation == situation):
+            summary = summarize(group.results)
+            cells = [_rate(judged) for judged in summary.criteria.values()]
+            rows.append(_row([_text(group.label), str(summary.trials), *cells]))
+    return _table(heads, rows)
+
+
+def _rate(judged: Judged | None) -> str:
+    if judged is None:
+        return "&ndash;"
+    rate = judged.rate
+    return (
+        f"{rate.rate * 100:.1f} %"
+        f'<span class="sub">{rate.successes}/{rate.trials}, {rate.low * 100:.0f} to {rate.high * 100:.0f} %</span>'
+    )
+
+
+def _notes(groups: Sequence[Group]) -> str:
+    pooled = any(g.situation.size is None for g in groups)
+    together = " &ldquo;All sizes&rdquo; takes the trials of all sizes together." if pooled else ""
+    return (
+        '<p class="small">Share of trials, successes of n, and Wilson&rsquo;s 95 % interval. Errors are the distance of camera '
+        "centres, in the map&rsquo;s units (metres in a room), and the geodesic angle. What all conditions of a method have in "
+        f"common is not in their names; it is in each line of the results.{together}</p>"
+    )
+
+
+def _costs(groups: Sequence[Group]) -> str:
+    heads = [
+        ("start and method", True),
+        *(
+            (name, False)
+            for name in (
+                "translation error", "rotation error", "steps to 10 %", "steps to 5°, 0.05",
+                "ms a step", "s a trial", "memory (MiB)", "converged, but wrong", "right, but not converged",
+            )
+        ),
+    ]  # fmt: skip
+    rows = []
+    for situation in situations(groups):
+        rows.append(_section(situation, groups, len(heads)))
+        for group in (g for g in groups if g.situation == situation):
+            s = summarize(group.results)
+            rows.append(
+                _row([
+                    _text(group.label), f"{s.translation:.4f}", f"{s.rotation_deg:.2f}°", _steps(s.criteria["10%"]),
+                    _steps(s.criteria["5deg 0.05"]), f"{s.milliseconds_per_step:.1f}", f"{s.seconds:.1f}",
+                    f"{s.peak_memory_bytes / 2**20:.0f}", str(s.converged_but_wrong), str(s.right_but_not_converged),
+                ])
+            )  # fmt: skip
+    note = (
+        '<p class="small">Medians over trials: errors at the end over all trials, steps to success over those that '
+        "succeeded. Memory is the most of any trial&rsquo;s process. &ldquo;Converged&rdquo; is the method&rsquo;s own word, &ldquo;right&rdquo; is "
+        "5° and 0.05.</p>"
+    )
+    return _table(heads, rows) + note
+
+
+def _steps(judged: Judged | None) -> str:
+    return "&ndash;" if judged is None or judged.median_steps is None else f"{judged.median_steps:g}"
+
+
+def _tests(groups: Sequence[Group], criterion: str) -> list[str]:
+    found = {s: comparisons([g for g in groups if g.situation == s], criterion) for s in situations(groups)}
+    count = sum(map(len, found.values()))
+    if count == 0:
+        return []
+    heads = [
+        ("pair", True), ("successes", False), ("rates: p", False), ("median steps", False),
+        ("steps: U", False), ("steps: p", False), ("all trials: p", False),
+    ]  # fmt: skip
+    rows = []
+    for situation, pairs in found.items():
+        if pairs:
+            rows.append(_section(situation, groups, len(heads)))
+            rows += [_pair(pair) for pair in pairs]
+    note = (
+        f'<p class="small">Success: {_text(NAMES[criterion])}. Rates: Fisher&rsquo;s exact test. Steps: Mann-Whitney U of the '
+        "first group, over trials that succeeded; &ldquo;all trials&rdquo; is the same test with a failure slower than any success. "
+        f"All are two-sided; p values are not corrected for the number of pairs, {count}. Those under 0.05 "
+        "are bold.</p>"
+    )
+    return ["<h2>Differences</h2>", _table(heads, rows), note]
+
+
+def _pair(pair: Comparison) -> str:
+    good = " : ".join(f"{s}/{n}" for s, n in zip(pair.successes, pair.trials, strict=True))
+    steps = " : ".join("&ndash;" if s is None else f"{s:g}" for s in pair.median_steps)
+    u = "&ndash;" if pair.steps_u is None else f"{pair.steps_u:g}"
+    names = f"{_text(pair.first)} <i>against</i> {_text(pair.second)}"
+    return _row([names, good, pair.rates_p, steps, u, pair.steps_p, pair.all_p])
+
+
+def _made(name: str, runs: Sequence[Provenance]) -> str:
+    if not runs:
+        return f'<p class="small">{_text(name)}: nothing is recorded of how it was made.</p>'
+    last = runs[-1]
+    commits = list(dict.fromkeys(_commit(run) for run in runs))
+    machines = list(dict.fromkeys(_machine(run) for run in runs))
+    versions = ", ".join(f"{k} {v}" for k, v in {**last.versions, "Python": last.python}.items())
+    facts = {
+        "file": name,
+        "began": runs[0].date if len(runs) == 1 else f"{runs[0].date}, last run {last.date}",
+        "commit": "; ".join(commits),
+        "machine": "; ".join(machines),
+        "run by": "; ".join(dict.fromkeys(run.workers for run in runs)),
+        "versions": versions,
+    }
+    listed = "".join(f"<dt>{_text(k)}</dt><dd>{_text(v)}</dd>" for k, v in facts.items())
+    commands = "\n".join(dict.fromkeys(run.command for run in runs))
+    return f"<dl>{listed}</dl><pre>{_text(commands)}</pre>"
+
+
+def _commit(run: Provenance) -> str:
+    if run.commit is None:
+        return "unknown (not run from a checkout)"
+    return run.commit + (", with local changes" if run.dirty else "")
+
+
+def _machine(run: Provenance) -> str:
+    memory = "" if run.memory_bytes is None else f", {run.memory_bytes / 2**30:.0f} GiB"
+    gpu = "no GPU" if run.gpu is None else run.gpu
+    return f"{run.cpu}, {run.cores} cores{memory}, {gpu}, {run.system}"
+
+
+def _section(situation: Situation, groups: Sequence[Group], columns: int) -> str:
+    several = len({(s.map, s.weights) for s in situations(groups)}) > 1
+    name = f"{situation.map}: {situation.start}" if several else situation.start
+    return f'<tr class="section"><td colspan="{columns}">{_text(name)}</td></tr>'
+
+
+def _row(cells: Sequence[str | float | None]) -> str:
+    return "<tr>" + "".join(_cell(cell, place == 0) for place, cell in enumerate(cells)) + "</tr>"
+
+
+def _cell(cell: str | float | None, text: bool) -> str:
+    if isinstance(cell, str):
+        return f'<td class="text">{cell}</td>' if text else f"<td>{cell}</td>"
+    if cell is None:
+        return "<td>&ndash;</td>"
+    shown = "&lt; 0.001" if cell < 0.001 else f"{cell:.3f}"
+    return f'<td class="low">{shown}</td>' if cell < 0.05 else f"<td>{shown}</td>"
+
+
+def _table(heads: Sequence[tuple[str, bool]], rows: Sequence[str]) -> str:
+    top = "".join(
+        f'<th class="text">{_text(h)}</th>' if text else f"<th>{_text(h)}</th>" for h, text in heads
+    )
+    return (
+        f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+    )
+
+
+def _figure(figure: Figure) -> str:
+    data = base64.b64encode(figure.file.read_bytes()).decode()
+    return (
+        f'<figure><img alt="{_text(figure.caption)}" src="data:image/svg+xml;base64,{data}">'
+        f"<figcaption>{_text(figure.caption)}</figcaption></figure>"
+    )
+
+
+def _text(words: str) -> str:
+    return html.escape(words)

@@ -1,0 +1,211 @@
+"""Reports: how results are put side by side, what is said of them, and the page."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import pytest
+from scipy.stats import mannwhitneyu
+
+from bidnerf_core.cli import main
+from bidnerf_core.evaluation.errors import success_rate
+from bidnerf_core.evaluation.groups import grouped, situations
+from bidnerf_core.evaluation.plots import Figures
+from bidnerf_core.evaluation.provenance import note_run, provenance
+from bidnerf_core.evaluation.results import as_line
+from bidnerf_core.evaluation.summary import NEVER, compare, comparisons, steps_of, summarize
+from bidnerf_core.evaluation.trials import Off, Trace, Trial, TrialResult
+
+STEPS = 10
+
+
+def result(seed: int, reached: int | None, size: float = 0.5, **settings: Any) -> TrialResult:
+    """Of a trial that comes under every bar at step ``reached``, if at all."""
+    far = STEPS + 1 if reached is None else reached
+    moved = (*(size for _ in range(far)), *(0.001 for _ in range(STEPS + 1 - far)))
+    turned = tuple(12.0 if x == size else 0.1 for x in moved)
+    protocol, images = settings.pop("protocol", "bid"), settings.pop("images", 1)
+    start = None if protocol == "none" else Off(moved[0], turned[0])
+    sizes, config = () if protocol == "none" else (size,), json.dumps(settings)
+    trial = Trial("house", "photos", ("a",) * images, protocol, sizes, "bid", config, seed)
+    return TrialResult(
+        None, reached is not None, STEPS, 2.0, None, 0.1, "fog", "bid", Off(moved[-1], turned[-1]), "a", seed,
+        start, Trace(moved, turned), "done", 2**30, {"rays": 64, "level": 0, **settings}, "weights-1", trial,
+    )  # fmt: skip
+
+
+def write(path: Path, *results: TrialResult) -> Path:
+    path.write_bytes(b"".join(map(as_line, results)))
+    return path
+
+
+@pytest.fixture
+def results() -> list[TrialResult]:
+    """Two conditions at two sizes; the second is slower and fails at the larger size."""
+    quick = [result(s, 2 + s % 3, size) for size in (1.2, 0.5) for s in range(6)]
+    slow = [
+        result(s, None if size > 1 else 6 + s % 4, size, level=None) for size in (0.5, 1.2) for s in range(6)
+    ]
+    return [*quick, *slow]
+
+
+def test_groups_are_named_by_what_differs(results: list[TrialResult]) -> None:
+    groups = grouped(results)
+    assert [g.situation.start for g in groups] == [
+        "bid 0.5", "bid 0.5", "bid 1.2", "bid 1.2", "bid, all sizes", "bid, all sizes",
+    ]  # fmt: skip
+    assert {g.label for g in groups} == {"bid, level 0", "bid, level none"}
+    assert [len(g.results) for g in groups] == [6, 6, 6, 6, 12, 12]
+    assert [g.label for g in grouped(results[:6])] == ["bid"]
+    rigs = grouped([result(0, 1), result(0, 1, images=8)])
+    assert [g.label for g in rigs] == ["bid, 1 image", "bid, 8 images"]
+    other = dataclasses.replace(result(0, 1), weights="weights-2")
+    assert len(situations(grouped([result(0, 1), other]))) == 2
+
+
+def test_a_summary_counts(results: list[TrialResult]) -> None:
+    by_name = {(g.situation.start, g.label): summarize(g.results) for g in grouped(results)}
+    slow = by_name["bid, all sizes", "bid, level none"]
+    judged = slow.criteria["10%"]
+    assert judged is not None
+    assert (judged.rate.successes, judged.rate.trials) == (6, 12)
+    assert judged.rate == success_rate(6, 12)
+    assert judged.median_steps == 7
+    assert (slow.milliseconds_per_step, slow.seconds, slow.trials) == (200, 2, 12)
+    assert slow.translation == pytest.approx((0.001 + 1.2) / 2)
+    assert (slow.converged_but_wrong, slow.right_but_not_converged) == (0, 0)
+    lied = dataclasses.replace(result(0, None), converged=True)
+    assert summarize([lied]).converged_but_wrong == 1
+
+
+def test_without_a_start_there_is_no_share_of_its_error() -> None:
+    summary = summarize([result(s, 2, protocol="none") for s in range(3)])
+    assert summary.criteria["10%"] is None
+    assert summary.criteria["5deg 0.05"] is not None
+
+
+def test_comparisons_agree_with_scipy(results: list[TrialResult]) -> None:
+    near, far, both = comparisons(grouped(results), "10%")
+    quick, slow = ([float(r.errors.translation.index(0.001)) for r in rows]
+                   for rows in (results[6:12], results[12:18]))  # fmt: skip
+    test = mannwhitneyu(quick, slow, alternative="two-sided")
+    assert (near.steps_u, near.steps_p) == (test.statistic, test.pvalue)
+    assert near.rates_p == 1
+    assert near.steps_p is not None
+    assert near.steps_p < 0.05
+    assert (far.steps_u, far.steps_p) == (None, None)
+    assert far.rates_p == pytest.approx(1 / 462)  # 2 of choose(12, 6)
+    assert (both.trials, both.successes) == ((12, 12), (12, 6))
+    assert both.all_p < 0.05
+
+
+def test_failures_are_slower_than_any_success_and_equal_among_themselves() -> None:
+    (a, b) = grouped([result(0, 3), result(1, None), result(0, None, level=1), result(1, None, level=1)])
+    assert steps_of(a.results, "10%") == [3, NEVER]
+    assert compare(a, b, "10%").all_p == pytest.approx(compare(b, a, "10%").all_p)
+    assert compare(b, b, "10%").all_p == 1
+    assert compare(a, a, "10%").all_p == pytest.approx(1)
+
+
+class Page(HTMLParser):
+    """Collects what a page would fetch, its pictures, and its text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+        self.pictures: list[str] = []
+        self.text, self.open = "", 0
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.open += tag not in ("meta", "img", "br")
+        for name, value in attributes:
+            if name in ("src", "href"):
+                kind = (
+                    self.pictures if (value or "").startswith("data:image/svg+xml;base64,") else self.fetched
+                )
+                kind.append(value or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        self.open -= 1
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def read(folder: Path) -> Page:
+    page = Page()
+    page.feed((folder / "index.html").read_text())
+    return page
+
+
+def test_the_page_needs_nothing_beside_it(
+    tmp_path: Path, results: list[TrialResult], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write(tmp_path / "r.jsonl", *results)
+    note_run(file, provenance("bidnerf evaluate 'a <map>' photos", "2 local processes"))
+    assert main(["report", str(file), "--out", str(tmp_path / "out"), "--title", "Mine & yours"]) == 0
+    page = read(tmp_path / "out")
+    assert page.fetched == []
+    assert page.open == 0, "an element is not closed"
+    assert "url(" not in (tmp_path / "out" / "index.html").read_text()
+    assert len(page.pictures) == 5
+    for picture in page.pictures:
+        ET.fromstring(base64.b64decode(picture.partition(",")[2]))
+    for said in (
+        "Mine & yours", "24 trials", "bidnerf evaluate 'a <map>' photos", "2 local processes", "bid, level none",
+        "100.0 %6/6, 61 to 100 %", "50.0 %6/12, 25 to 75 %", "Fisher",
+    ):  # fmt: skip
+        assert said in page.text
+    for name in ("rates", "steps", "share", "translation", "rotation"):
+        assert iio.imread(tmp_path / "out" / f"{name}.png").std() > 1
+        assert (tmp_path / "out" / f"{name}.svg").stat().st_size > 2000
+    out = capsys.readouterr().out
+    assert re.search(r"bid, all sizes *\n.*\n  bid, level none +12 +50 % +50 % +50 %", out)
+
+
+def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:
+    lost = dataclasses.replace(
+        result(0, None, protocol="none"), error=None, errors=Trace((None, None), (None, None)), steps=0
+    )
+    file = write(tmp_path / "r.jsonl", lost)
+    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 0
+    assert "nothing is recorded of how it was made" in read(tmp_path / "out").text
+
+
+def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
+    first, second = (Figures(grouped(results), tmp_path / name, "10%").steps() for name in ("a", "b"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(None, "cannot be read"), (b"", "no finished trial"), (b"hello\n", "line 1: not JSON")],
+)
+def test_a_file_without_results_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes | None, said: str
+) -> None:
+    file = tmp_path / "r.jsonl"
+    if content is not None:
+        file.write_bytes(content)
+    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert said in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_side_file_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], results: list[TrialResult]
+) -> None:
+    file = write(tmp_path / "r.jsonl", *results)
+    (tmp_path / "r.meta.json").write_text(json.dumps({"runs": 3}))
+    assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
+    assert "no list of runs" in capsys.readouterr().err
