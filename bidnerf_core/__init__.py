@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import os
+from importlib.metadata import entry_points
 
 # Threads of OpenMP that wait should sleep. On cores that other work shares, spinning was measured to make training
 # more than ten times slower. It must be said before torch is loaded, and a user's own setting goes first.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# torch and typeguard (of the command line's parser) look for plugins among all entry points as they are imported: one
+# malformed file of any package would fail that. Where there is one, they do without.
+try:
+    entry_points(group="bidnerf.backends")
+except Exception:
+    os.environ.setdefault("TORCH_DEVICE_BACKEND_AUTOLOAD", "0")
+    os.environ.setdefault("TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
