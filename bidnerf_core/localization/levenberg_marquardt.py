@@ -80,7 +80,7 @@ def solve(system: System, damping: Float[Tensor, "h"]) -> Float[Tensor, "h 6"]:
     eye = torch.eye(6, dtype=scaled.dtype, device=scaled.device)
     factor, failed = torch.linalg.cholesky_ex(scaled + (damping[:, None, None] + ROUNDING) * eye)
     delta = -unit * torch.cholesky_solve((unit * system.gradient)[..., None], factor)[..., 0]
-    sound = (failed == 0) & delta.isfinite().all(-1)
+    sound = (failed == 0) & (diagonal >= 0).all(-1) & delta.isfinite().all(-1)
     return torch.where(sound[:, None], delta, 0)
 
 
