@@ -68,6 +68,8 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
     assert planned(Plan(BLOBS, BLOBS, seed=5))[0].seed == 5
     few = planned(Plan(BLOBS, BLOBS, sizes=((0.9,),), trials=5, frames=("0003", "0007")))
     assert sorted({t.frame for t in few}) == ["0003", "0007"]
+    (odd,) = planned(Plan(BLOBS, BLOBS, sizes=((0.1,),), trials=1, device="cpu:0", depth=False))
+    assert (odd.device, odd.depth) == ("cpu:0", False)
     parallel = planned(Plan(BLOBS, BLOBS, "parallel"))
     assert [t.seed for t in parallel] == list(range(1234, 1259))
     assert len({t.frame for t in parallel[:5]}) == 1

@@ -67,6 +67,9 @@ def test_groups_are_named_by_what_differs(results: list[TrialResult]) -> None:
     assert [g.label for g in grouped(results[:6])] == ["bid"]
     rigs = grouped([result(0, 1), result(0, 1, images=8)])
     assert [g.label for g in rigs] == ["bid, 1 image", "bid, 8 images"]
+    blind = result(0, 1)
+    blind = dataclasses.replace(blind, trial=dataclasses.replace(blind.trial, depth=False))
+    assert [g.label for g in grouped([result(0, 1), blind])] == ["bid, RGB-D", "bid, RGB"]
     other = dataclasses.replace(result(0, 1), weights="weights-2")
     assert len(situations(grouped([result(0, 1), other]))) == 2
 

@@ -103,6 +103,15 @@ def test_a_rig_is_judged_by_its_last_camera(trial: Trial) -> None:
     assert result.trial.frames == ("t_0000", "t_0002")
 
 
+def test_a_trial_without_depth_is_given_none(trial: Trial, tmp_path: Path) -> None:
+    """Whatever the weight of depth: as if the data had none."""
+    tiny.write_dataset(tmp_path / "data", depth=False)
+    blind = timeless(run_trial(dataclasses.replace(trial, depth=False)))
+    bare = timeless(run_trial(dataclasses.replace(trial, data=str(tmp_path / "data"))))
+    assert blind.T_world_camera == bare.T_world_camera
+    assert blind.T_world_camera != run_trial(trial).T_world_camera
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -64,6 +64,7 @@ def run(arguments: list[str]) -> None:
         frame: Annotated[Names, option("NAME...", "try only these frames", "all of the split")] = (),
         images: Annotated[int, option("K", "images at once, a sequence around the object")] = 1,
         angle: Annotated[float, option("DEGREES", "between neighbours of a sequence")] = 15.0,
+        depth: Annotated[bool, option(None, "give the method the measured depth, where there is any")] = True,
         device: Annotated[str, option("NAME", "what the field computes on: cpu, cuda ...")] = "cpu",
         workers: Annotated[
             int | None, option("N", "processes, of one thread each", "one a core; one on a GPU")
@@ -84,7 +85,7 @@ def run(arguments: list[str]) -> None:
         names = tuple(name for group in frame for name in group) or None
         plan = Plan(
             map, data or _own_data(map), protocol, _sizes(size), method, changed_settings(method, config),
-            trials, seed, split, names, images, angle, device,
+            trials, seed, split, names, images, angle, device, depth,
         )  # fmt: skip
         mine = share(planned(plan), shard, shards)
         _evaluate(mine, out, workers, dask, command_line("bidnerf evaluate", arguments))

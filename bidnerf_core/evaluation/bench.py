@@ -41,6 +41,7 @@ class Plan:
     images: int = 1  # of a sequence around the object ...
     angle: float = 15.0  # ... so many degrees apart
     device: str = "cpu"
+    depth: bool = True  # measured depth, where there is any
 
 
 def planned(plan: Plan) -> list[Trial]:
@@ -59,7 +60,17 @@ def planned(plan: Plan) -> list[Trial]:
     cases = protocol.cases(len(rigs), count, protocol.seed if plan.seed is None else plan.seed)
     return [
         Trial(
-            plan.map, plan.data, rigs[place], plan.protocol, size, plan.method, plan.config, seed, plan.split
+            map=plan.map,
+            data=plan.data,
+            frames=rigs[place],
+            protocol=plan.protocol,
+            size=size,
+            method=plan.method,
+            config=plan.config,
+            seed=seed,
+            split=plan.split,
+            device=plan.device,
+            depth=plan.depth,
         )
         for size in sizes
         for place, seed in cases

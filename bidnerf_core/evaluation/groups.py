@@ -39,10 +39,11 @@ class Condition:
     images: int
     backend: str
     device: str
+    depth: bool
 
     def facts(self) -> dict[str, Any]:
         """What tells conditions apart, by name."""
-        own = {"images": self.images, "backend": self.backend, "device": self.device}
+        own = {"images": self.images, "depth": self.depth, "backend": self.backend, "device": self.device}
         return {"method": self.method, **own, **json.loads(self.settings)}
 
 
@@ -74,8 +75,9 @@ def situation_of(result: TrialResult) -> Situation:
 
 
 def condition_of(result: TrialResult) -> Condition:
-    settings = json.dumps(result.settings, sort_keys=True)
-    return Condition(result.method, settings, len(result.trial.frames), result.backend, result.trial.device)
+    trial, settings = result.trial, json.dumps(result.settings, sort_keys=True)
+    images = len(trial.frames)
+    return Condition(result.method, settings, images, result.backend, trial.device, trial.depth)
 
 
 def labels(conditions: Sequence[Condition]) -> dict[Condition, str]:
@@ -123,6 +125,8 @@ def _rank(situation: Situation) -> tuple[bool, tuple[float, ...]]:
 def _said(name: str, value: Any) -> str:
     if name == "images":
         return f"{value} image{'s' if value != 1 else ''}"
+    if name == "depth":
+        return "RGB-D" if value else "RGB"
     if name in ("backend", "device"):
         return str(value)
     shown = f"{value:g}" if isinstance(value, float) else "none" if value is None else str(value).lower()

@@ -47,6 +47,7 @@ class Trial:
     seed: int = 0  # of the start, and of all that the method draws
     split: str = "test"
     device: str = "cpu"  # that the field computes on
+    depth: bool = True  # whether the method is given the measured depth
 
     @property
     def frame(self) -> str:
@@ -107,6 +108,8 @@ def run_trial(trial: Trial) -> TrialResult:
     with one_thread():
         stored, dataset = opened(trial.map, trial.data, trial.device)
         views = dataset.views(trial.split, trial.frames)
+        if not trial.depth:
+            views = [View(replace(view.frame, depth=None), view.T_ref_camera) for view in views]
         truth, start = views[-1].T_ref_camera, start_of(trial, views, dataset)
         settings = settings_of(trial.method, trial.config)
         if start is None:
