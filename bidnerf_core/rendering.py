@@ -63,7 +63,16 @@ def render(
     jitter: Generator | None = None,
 ) -> Rendering:
     """Colour, distance and opacity of each ray; differentiable in the field's parameters and in the rays."""
-    samples = field.sampler(rays, jitter)
+    return render_samples(field, rays, field.sampler(rays, jitter), background)
+
+
+def render_samples(
+    field: RadianceField,
+    rays: Rays,
+    samples: RaySamples,
+    background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
+) -> Rendering:
+    """The same from ``samples`` of the rays that were chosen already."""
     values = query_samples(field, rays, samples)
     weights = rendering_weights(values.density, samples)
     opacity = weights.sum(-1)

@@ -52,6 +52,15 @@ LOSSES: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "huber": huber, "l2": l2, "l1": l1, "cauchy": cauchy, "geman-mcclure": geman_mcclure,
 }  # fmt: skip
 
+WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
+    "huber": lambda r, c: c / r.abs().clamp(min=c),
+    "l2": lambda r, c: torch.ones_like(r),
+    "l1": lambda r, c: c / r.abs().clamp(min=1e-6 * c),
+    "cauchy": lambda r, c: 1 / (1 + 0.5 * (r / c) ** 2),
+    "geman-mcclure": lambda r, c: (1 + 0.25 * (r / c) ** 2) ** -2,
+}
+"""``rho'(r) / r`` of each; that of ``l1``, which has no end at 0, stops short of it."""
+
 
 @dataclass(frozen=True)
 class Robust:
@@ -66,3 +75,7 @@ class Robust:
 
     def __call__(self, residual: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
         return LOSSES[self.name](residual, self.scale)
+
+    def weight(self, residual: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
+        """``rho'(r) / r``: what a square must count for to pull as this loss does (Holland and Welsch 1977)."""
+        return WEIGHTS[self.name](residual, self.scale)

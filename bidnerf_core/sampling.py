@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
+from torch.nn.functional import pad
 
-from bidnerf_core.field import RadianceField, Rays, RaySamples
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples
 from bidnerf_core.rendering import query_samples, rendering_weights
 
 
@@ -31,6 +32,50 @@ class Stratified:
         distances = near + (far - near) * borders
         valid = (far > near).expand(*rays.near.shape, self.count)
         return RaySamples(distances[..., :-1], distances[..., 1:], valid)
+
+
+@dataclass(frozen=True, eq=False)
+class AroundDepth:
+    """``count`` equal intervals within ``reach`` metres of the distance that was measured along each ray.
+
+    For a pose that is nearly right, they are where all the matter is that the ray meets; of a pose that is not, they
+    say that there is none. Where nothing was measured (distance 0), ``otherwise`` decides.
+    """
+
+    distance: Float[Tensor, "*r"]  # metres along the rays that it is asked about
+    reach: float
+    count: int
+    otherwise: RaySampler
+
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        measured = self.distance > 0
+        near = torch.maximum(rays.near, self.distance - self.reach)
+        far = torch.minimum(rays.far, self.distance + self.reach)
+        window = replace(rays, near=near, far=torch.maximum(near, far))
+        rest = replace(rays, far=torch.where(measured, rays.near, rays.far))  # none left of what was measured
+        return _either(measured, Stratified(self.count)(window, jitter), self.otherwise(rest, jitter))
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """A field that is asked where ``sampler`` says, in place of its own."""
+
+    field: RadianceField
+    sampler: RaySampler
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        return self.field.query(positions, directions)
+
+
+def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:
+    """Rays of one and of the other, as wide as the wider of the two."""
+    width = max(yes.starts.shape[-1], no.starts.shape[-1])
+
+    def filled(part: Tensor) -> Tensor:
+        return pad(part, (0, width - part.shape[-1]))
+
+    pairs = ((yes.starts, no.starts), (yes.ends, no.ends), (yes.valid, no.valid))
+    return RaySamples(*(torch.where(which[..., None], filled(a), filled(b)) for a, b in pairs))
 
 
 @dataclass(frozen=True)

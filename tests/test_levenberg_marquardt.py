@@ -68,6 +68,7 @@ def test_the_cost_never_rises_and_what_is_not_better_is_taken_back() -> None:
     """From far away, where full steps overshoot."""
     found = descend(evaluate, starts(32, spread=0.8), 25, damping=1e-6)
     costs = torch.stack([evaluate(found.poses[i]).cost for i in range(26)])
+    assert torch.equal(costs, found.costs)
     assert bool((costs.diff(dim=0) <= 0).all())
     refused = ~found.accepted
     assert bool(refused.any())

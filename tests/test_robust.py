@@ -24,6 +24,15 @@ def test_the_derivative_is_the_numerical_one(name: RobustName) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_weighted_squares_pull_as_the_loss_does(name: RobustName) -> None:
+    rho = Robust(name, SCALE)
+    residual = torch.tensor([-30.0, -0.29, -0.01, 0.1, 0.31, 1.0], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(rho(residual).sum(), residual)
+    torch.testing.assert_close(rho.weight(residual) * residual, slope)
+    assert bool(rho.weight(torch.zeros(3, dtype=torch.float64)).isfinite().all())
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_even_least_at_zero_and_growing(name: RobustName) -> None:
     rho = Robust(name, SCALE)
     residual = torch.linspace(0, 5, 200, dtype=torch.float64)

@@ -35,6 +35,7 @@ class Descent:
     system: System
     accepted: Bool[Tensor, "s h"]  # which steps lowered the cost
     poses: SE3  # (s + 1, h)
+    costs: Float[Tensor, "t h"]  # of them
     settled: Bool[Tensor, "h"]  # which poses came to where a step is shorter than ``stop``
 
 
@@ -55,7 +56,7 @@ def descend(
     T, system = start, evaluate(start)
     factor = torch.full_like(system.cost, damping)
     settled = torch.zeros_like(system.cost, dtype=torch.bool)
-    accepted, poses = [], [T]
+    accepted, poses, costs = [], [T], [system.cost]
     for _ in range(steps):
         delta = solve(system, factor)
         trial = retract(T, delta)
@@ -66,10 +67,11 @@ def descend(
         factor = torch.where(better, factor / 4, factor * 6).clamp(LEAST, MOST)
         accepted.append(better)
         poses.append(T)
+        costs.append(system.cost)
         if stop and bool(settled.all()):
             break
     history = torch.stack(accepted) if accepted else torch.zeros((0, len(settled))).to(settled)
-    return Descent(T, system, history, SE3.stack(poses), settled)
+    return Descent(T, system, history, SE3.stack(poses), torch.stack(costs), settled)
 
 
 def solve(system: System, damping: Float[Tensor, "h"]) -> Float[Tensor, "h 6"]:

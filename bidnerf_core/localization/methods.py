@@ -8,7 +8,9 @@ from typing import Any
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.bid import BidConfig, bid
+from bidnerf_core.localization.bid_lm import BidLmConfig, bid_lm
 from bidnerf_core.localization.inerf import InerfConfig, inerf
+from bidnerf_core.localization.inerf_lm import InerfLmConfig, inerf_lm
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 
@@ -25,6 +27,8 @@ class Method:
 METHODS = {
     "bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)"),
     "inerf": Method(inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)"),
+    "bid-lm": Method(bid_lm, BidLmConfig, "second-order steps on colour and depth, from coarse to fine"),
+    "inerf-lm": Method(inerf_lm, InerfLmConfig, "second-order steps on colour alone, from coarse to fine"),
 }
 
 AUTO = "bid"

@@ -30,11 +30,21 @@ class Pivot:
         """
         return 1.0 if self.T_camera_pivot is None else max(1.0, float(self.T_camera_pivot.translation.norm()))
 
-    def moved(self, T: SE3, delta: Float[Tensor, "6"]) -> SE3:
-        """``T`` after the update ``delta``; differentiable in it."""
+    def moved(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
+        """``T``, or each of many, after the update ``delta``; differentiable in it."""
         if self.T_camera_pivot is None:
             return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
+
+    def at(self, T: SE3) -> SE3:
+        """T_world_pivot: the frame in which ``moved`` makes its right update, for poses with any leading axes."""
+        return T @ (T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot)
+
+    def at_camera(self, T: SE3, covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
+        """The covariance of an update here as one of a right update of ``T`` (Sola et al. 2018, eq. 54)."""
+        T_camera_pivot = T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot
+        carried = T_camera_pivot.adjoint()
+        return carried @ covariance @ carried.mT
 
 
 def pivot(name: PivotName, problem: Problem) -> Pivot:
