@@ -9,6 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 REQUIREMENTS := pyproject.toml constraints.txt
 DEMO_OUT := demo-out
+PARALLEL := -n logical --dist loadfile # a process a core, of one thread each
 
 # The first interpreter that runs and is recent enough; override with `make PYTHON=...`.
 PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
@@ -27,7 +28,7 @@ demo: $(VENV)/.installed-plots ## train a small scene, find poses in it, draw th
 	@$(BIN)/bidnerf demo --out $(DEMO_OUT)
 
 test: $(VENV)/.installed-dev ## all tests; ARGS="-k se3" for some
-	@$(BIN)/python -m pytest $(ARGS)
+	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 check: lint types arrows ## everything that is checked without running the code
 
