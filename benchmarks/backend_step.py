@@ -82,7 +82,7 @@ def step(variant: Variant, seed: int) -> tuple[float, float]:
     delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     rays = pixels.rays(problem.start.retract(delta), problem.bounds)
     rendering = render(variant.level, rays, problem.bounds.background)
-    objective(rendering, pixels, SETTINGS.huber_delta, SETTINGS.depth_weight).backward()
+    objective(rendering, pixels, SETTINGS.colour_scale, SETTINGS.depth_weight).backward()
     return time.perf_counter() - began, float(rendering.samples.valid.sum()) / SETTINGS.rays
 
 
