@@ -30,12 +30,14 @@ from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.plain import from_plain, to_plain
 from bidnerf_core.registry import load_backend
+from bidnerf_core.se3 import SE3
+from bidnerf_core.surface import SurfaceMap, surface_from_tensors, surface_tensors
 from bidnerf_core.training import TrainingState
 
 FORMAT = "bidnerf map"
 VERSION = 1
 DESCRIPTION = "map.json"
-TENSORS = r"(weights|training)-\d{8,}-[0-9a-f]{8}\.safetensors"
+TENSORS = r"(weights|training|surface)-\d{8,}-[0-9a-f]{8}\.safetensors"
 OURS = re.compile(rf"{TENSORS}|\.({TENSORS}|map\.json)\.[0-9a-f]{{8}}")
 """Names that a save may leave behind; whatever else is in the folder is not ours to remove."""
 
@@ -63,6 +65,7 @@ class MapInfo:
     cameras: tuple[StoredCamera, ...] = ()
     weights: str = ""  # file names
     training: str | None = None  # what resuming needs; dropped when training is complete
+    surface: str | None = None  # baked from these weights
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
     version: int = VERSION
@@ -74,6 +77,7 @@ class Map:
 
     info: MapInfo
     field: RadianceField
+    surface: SurfaceMap | None = None  # none where it was not baked
 
     @property
     def bounds(self) -> SceneBounds:
@@ -105,7 +109,8 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
 def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     """Write one whole map; what an earlier save left is removed once the new one stands."""
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
-    info = replace(info, weights=f"weights-{name}", training=None if info.complete else f"training-{name}")
+    training = None if info.complete else f"training-{name}"
+    info = replace(info, weights=f"weights-{name}", training=training, surface=None)
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -116,6 +121,31 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     finally:
         _sweep(folder)
     return info
+
+
+def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
+    """Add a surface that was baked from map ``of`` to it, in place of the one that it had.
+
+    Raises ``InputError`` where another training has replaced that map meanwhile.
+    """
+    if load_info(folder).weights != of.weights:
+        raise InputError(f"{folder}: was trained anew while its surface was baked; bake it again")
+    info = replace(load_info(folder), surface=f"surface-{of.step:08d}-{secrets.token_hex(4)}.safetensors")
+    description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
+    try:
+        write_file(folder / str(info.surface), tensors_to_bytes(surface_tensors(surface)))
+        write_file(folder / DESCRIPTION, description)
+    finally:
+        _sweep(folder)
+    return info
+
+
+def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
+    """With T_world_camera, float64."""
+    return [
+        (c.intrinsics, SE3.from_matrix(torch.tensor(c.T_world_camera, dtype=torch.float64)))
+        for c in info.cameras
+    ]
 
 
 def load_info(folder: Path) -> MapInfo:
@@ -134,21 +164,34 @@ def load_info(folder: Path) -> MapInfo:
     if found.get("version") != VERSION:
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; train the map anew")
     info = from_plain(MapInfo, found, str(path))
-    for name in (info.weights, info.training):
+    for name in (info.weights, info.training, info.surface):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
     return info
 
 
-def load_map(folder: Path, device: torch.device | str = "cpu") -> Map:
-    """The map in ``folder``, its field built by its backend and frozen."""
-    info, tensors = _read(folder)
+def load_map(folder: Path, device: torch.device | str = "cpu", surface: bool = True) -> Map:
+    """The map in ``folder``, its field built by its backend and frozen, on ``device``; the surface stays on the CPU.
+
+    ``surface``: whether to read that as well.
+    """
+    info, tensors, baked = _read(folder, surface)
     field, _ = build_field(load_backend(info.backend), info, str(folder / DESCRIPTION))
     _check_weights(field, tensors, folder / info.weights)
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
-    return Map(info, field)
+    return Map(info, field, baked)
+
+
+def load_surface(path: Path) -> SurfaceMap:
+    """Raises ``InputError`` where the file does not hold what ``surface_tensors`` gives."""
+    tensors = read_tensors(path)
+    try:
+        return surface_from_tensors(tensors)
+    except (KeyError, ValueError) as error:
+        why = f"no tensor {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{path}: not a baked surface ({why}); bake it anew with 'bidnerf bake'") from error
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
@@ -160,15 +203,17 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
     return TrainingState(info.step, weights, read_tensors(folder / info.training))
 
 
-def _read(folder: Path) -> tuple[MapInfo, dict[str, Tensor]]:
-    """Description and weights that belong together, even while a training replaces them."""
+def _read(folder: Path, surface: bool) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None]:
+    """Description, weights and surface that belong together, even while a training replaces them."""
     info = load_info(folder)
     while True:
         try:
-            return info, read_tensors(folder / info.weights)
+            weights = read_tensors(folder / info.weights)
+            baked = load_surface(folder / info.surface) if surface and info.surface is not None else None
+            return info, weights, baked
         except InputError:
             before, info = info, load_info(folder)
-            if info.weights == before.weights:
+            if (info.weights, info.surface) == (before.weights, before.surface):
                 raise
 
 
@@ -212,7 +257,7 @@ def _sweep(folder: Path) -> None:
     """Remove what saves left that ``map.json`` does not name: earlier ones, and those that did not come to their end."""
     try:
         found = json.loads((folder / DESCRIPTION).read_bytes())
-        kept = {found.get("weights"), found.get("training")}
+        kept = {found.get("weights"), found.get("training"), found.get("surface")}
     except FileNotFoundError:
         kept = set()
     except (OSError, ValueError, AttributeError):  # damaged: nothing tells what is of use

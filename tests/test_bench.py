@@ -28,7 +28,7 @@ from bidnerf_core.evaluation.trials import Trial, TrialResult, run_trial
 from bidnerf_core.localization import METHODS
 from bidnerf_core.rigs import look_at, orbit
 
-QUICK = ["--rays", "16", "--max-steps", "2", "--workers", "1"]
+QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
 BLOBS = "demo:blobs"
 Evaluate = Callable[..., tuple[int, str]]
 
@@ -152,7 +152,9 @@ def test_closed_form_sequences_are_rendered_at_the_angle_asked_for() -> None:
     for first, second in itertools.pairwise(views):
         assert float(pose_error(first.T_ref_camera, second.T_ref_camera).rotation_deg) == pytest.approx(15)
     assert all(view.frame.has_depth for view in views)
-    trials = planned(Plan(BLOBS, BLOBS, sizes=((0.9,),), config=blob_trial().config, trials=2, images=3))
+    trials = planned(
+        Plan(BLOBS, BLOBS, sizes=((0.9,),), method="bid", config=blob_trial().config, trials=2, images=3)
+    )
     assert len(run_trial(trials[0]).trial.frames) == 3
     with pytest.raises(InputError, match="no frame '0024'"):
         data.views("test", ["0024"])

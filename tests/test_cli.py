@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("backends_listed_once")
 LOCALIZE_KEYS = {
     "T_world_camera", "converged", "steps", "seconds", "covariance", "loss", "backend", "method", "error",
 }  # fmt: skip
-QUICK = ["--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64"]
+QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64"]
 Edit = Callable[[Path], None]
 
 
@@ -607,7 +607,8 @@ def strict(text: str) -> Any:
 def test_localize_prints_the_object_that_was_agreed_on(
     frames: list[str], bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
 ) -> None:
-    localize = ["localize", shared / "map", shared / "data", "--json", "--max-steps", "3", "--rays", "64"]
+    quick = ["--method", "bid", "--max-steps", "3", "--rays", "64"]
+    localize = ["localize", shared / "map", shared / "data", "--json", *quick]
     outcome = bidnerf(*localize, "--perturb", "0.1", "5", "--frame", *frames)
     assert outcome.status == 0, outcome.err
     found = strict(outcome.out)
@@ -718,7 +719,7 @@ def test_no_start_is_refused_by_methods_that_need_one(bidnerf: Callable[..., Out
     found = bidnerf(
         "localize", shared / "map", shared / "data", "--frame", "t_0000", "--no-start", "--method", "bid"
     )
-    assert_refused(found, 1, "'bid' needs a start", "--perturb T R")
+    assert_refused(found, 1, "'bid' needs a start", "give one, or take method 'auto'")
 
 
 def test_backends_are_listed(bidnerf: Callable[..., Outcome]) -> None:
@@ -831,7 +832,7 @@ def test_a_stopped_training_goes_on_as_if_nothing_had_happened(
     info = load_info(interrupted)
     assert (info.step, info.complete) == (tiny.STEPS // 2, False)
     assert bidnerf("info", interrupted).status == 0
-    resumed = bidnerf("train", shared / "data", "--out", interrupted, "--resume")
+    resumed = bidnerf("train", shared / "data", "--out", interrupted, "--resume", "--no-bake")
     assert (resumed.status, resumed.out) == (0, "")
     assert f"going on from step {tiny.STEPS // 2}" in resumed.err
     assert load_info(interrupted).complete
@@ -847,7 +848,8 @@ def test_a_training_resumes_over_the_background_that_it_began_with(
     with monkeypatch.context() as patch:
         stop_at(patch, 5)
         assert bidnerf(*train, "--out", tmp_path / "half").status == 130
-    assert bidnerf("train", shared / "data", "--out", tmp_path / "half", "--resume").status == 0
+    resume = ["train", shared / "data", "--resume", "--no-bake"]
+    assert bidnerf(*resume, "--out", tmp_path / "half").status == 0
     assert_same_map(tmp_path / "half", tmp_path / "whole")
 
 
@@ -940,7 +942,7 @@ def test_ctrl_c_saves_and_resuming_loses_nothing(
         "bidnerf train: interrupted",
     ]
     assert 0 < info.step < LONG
-    assert bidnerf(*train, "--resume").status == 0
+    assert bidnerf(*train, "--resume", "--no-bake").status == 0
     assert_same_map(out, whole)
 
 
@@ -975,7 +977,7 @@ def test_a_training_that_is_killed_again_and_again_still_comes_to_its_end(
 
         for _ in range(3):
             before = (out / "map.json").read_bytes() if out.exists() else None
-            tell(train + ("--resume" if before else " ".join(tiny.options(LONG))))
+            tell(train + ("--resume --no-bake" if before else " ".join(tiny.options(LONG))))
             child = int(process.stdout.readline())
             wait_for(
                 lambda before=before: (
@@ -989,7 +991,7 @@ def test_a_training_that_is_killed_again_and_again_still_comes_to_its_end(
             stored = load_map(out)
             assert not stored.info.complete, "raise LONG: it came to its end before it was killed"
             steps.append(stored.info.step)
-        tell(train + "--resume")
+        tell(train + "--resume --no-bake")
         process.stdout.readline()
         assert int(process.stdout.readline()) == 0
         process.stdin.close()

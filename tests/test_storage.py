@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+import baked
 import tiny
 from bidnerf_core import storage
 from bidnerf_core.closed_fields import HomogeneousBall
@@ -27,9 +28,11 @@ from bidnerf_core.storage import (
     load_map,
     load_state,
     save_map,
+    save_surface,
     stored_cameras,
     write_file,
 )
+from bidnerf_core.surface import SurfaceMap, surface_tensors
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
 from tiny import backends_listed_once  # noqa: F401
@@ -297,3 +300,79 @@ def test_a_backend_that_builds_something_else_is_told(
     monkeypatch.setattr(type(chosen), "build", lambda *_: HomogeneousBall(1.0, 1.0))
     with pytest.raises(InputError, match=r"built a HomogeneousBall, expected an nn\.Module"):
         load_map(tmp_path)
+
+
+# The baked surface is kept beside the weights that it shows.
+
+
+def with_surface(folder: Path, surface: SurfaceMap, complete: bool = True) -> MapInfo:
+    return save_surface(folder, save_map(folder, info(complete=complete), state()), surface)
+
+
+def test_a_surface_comes_back_as_it_was(tmp_path: Path) -> None:
+    saved = with_surface(tmp_path, baked.toy(), complete=False)
+    loaded = load_map(tmp_path)
+    assert loaded.info == saved
+    assert loaded.surface is not None
+    assert_equal(surface_tensors(loaded.surface), surface_tensors(baked.toy()))
+    assert isinstance(loaded.field, nn.Module)
+    assert_equal(loaded.field.state_dict(), state().field)
+    assert names(tmp_path) == {"map.json", saved.weights, saved.training, saved.surface}
+    assert load_map(tmp_path, surface=False).surface is None
+
+
+def test_a_new_surface_replaces_the_old_one_and_training_drops_it(tmp_path: Path) -> None:
+    first = with_surface(tmp_path, baked.patch())
+    second = save_surface(tmp_path, first, baked.toy())
+    assert names(tmp_path) == {"map.json", second.weights, second.surface}
+    assert second.surface != first.surface
+    trained = save_map(tmp_path, second, state(6))
+    assert trained.surface is None
+    assert load_map(tmp_path).surface is None
+    assert names(tmp_path) == {"map.json", trained.weights}
+
+
+def test_a_surface_of_other_weights_is_refused(tmp_path: Path) -> None:
+    before = save_map(tmp_path, info(complete=True), state())
+    after = save_map(tmp_path, info(complete=True), state())
+    with pytest.raises(InputError, match="trained anew while"):
+        save_surface(tmp_path, before, baked.toy())
+    assert load_info(tmp_path) == after
+    assert names(tmp_path) == {"map.json", after.weights}
+
+
+def test_a_surface_that_cannot_be_written_leaves_the_map(tmp_path: Path) -> None:
+    saved = with_surface(tmp_path, baked.patch())
+    for raised in outcomes(lambda: save_surface(tmp_path, load_info(tmp_path), baked.patch()), FULL):
+        found = load_map(tmp_path)
+        assert found.surface is not None
+        assert names(tmp_path) == {"map.json", saved.weights, found.info.surface}
+        if raised is not None:
+            assert str(raised.filename).startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"\x80\x04.", "expected a safetensors file"),
+        (None, "no such file"),
+        ({"rgb": torch.ones(2, 3)}, "bake it anew"),
+    ],
+    ids=["no tensors", "missing", "other tensors"],
+)
+def test_a_damaged_surface_is_named(content: Any, said: str, tmp_path: Path) -> None:
+    saved = with_surface(tmp_path, baked.patch())
+    path = tmp_path / str(saved.surface)
+    if content is None:
+        path.unlink()
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        storage.write_file(path, storage.tensors_to_bytes(content))
+    with pytest.raises(InputError, match=said) as told:
+        load_map(tmp_path)
+    assert str(path) in str(told.value)
+    assert "\n" not in str(told.value)
+    assert load_map(tmp_path, surface=False).surface is None
+    save_surface(tmp_path, load_info(tmp_path), baked.patch())  # which mends it
+    assert load_map(tmp_path).surface is not None

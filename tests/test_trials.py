@@ -51,7 +51,7 @@ def test_a_line_has_what_localize_prints_and_more(
     line = to_plain(run_trial(trial))
     capsys.readouterr()
     assert main(["localize", str(folder / "map"), str(folder / "data"), "--frame", "t_0001", "--json",
-                 "--perturb", "0.1", "5", "--max-steps", "2", "--rays", "32"]) == 0  # fmt: skip
+                 "--method", "bid", "--perturb", "0.1", "5", "--max-steps", "2", "--rays", "32"]) == 0  # fmt: skip
     assert json.loads(capsys.readouterr().out).keys() <= line.keys()
     assert json.loads(json.dumps(line, allow_nan=False)) == line
     assert line["frame"] == "t_0001"
@@ -121,7 +121,8 @@ def test_a_trial_without_depth_is_given_none(trial: Trial, tmp_path: Path) -> No
         ({"config": '{"rays": 0}'}, "rays is 0"),
         ({"config": "{"}, "not JSON"),
         ({"config": '{"ray": 1}'}, "did you mean 'rays'"),
-        ({"protocol": "none", "size": ()}, "needs a start"),
+        ({"protocol": "none", "size": ()}, "'bid' needs a start"),
+        ({"protocol": "none", "size": (), "method": "auto", "config": "{}"}, "the map has no surface"),
         ({"method": "magic"}, "method 'magic'"),
         ({"frames": ("nope",)}, "no frame 'nope'"),
     ],

@@ -54,7 +54,8 @@ def options(steps: int = STEPS) -> list[str]:
     chosen = config(steps)
     names = ("width", "geometry_features", "grid_resolution", "coarse_levels", "steps", "samples_per_step")
     plain |= {name: getattr(chosen, name) for name in (*names, "rays_at_most", "prune_from", "prune_every")}
-    return [word for name, value in plain.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    words = [word for name, value in plain.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    return [*words, "--no-bake"]
 
 
 def views(count: int = 6, seed: int = 0) -> list[View]:

@@ -16,6 +16,7 @@ COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
     "backends": "the installed kinds of field",
     "train": "make a map from a dataset",
+    "bake": "the surface of a map, which localization without a start needs; train does it as well",
     "info": "describe a map",
     "render": "images and depth of a map from a dataset's poses",
     "localize": "find the pose of images in a map",

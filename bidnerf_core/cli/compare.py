@@ -48,7 +48,7 @@ Folders = Annotated[
 
 def run(arguments: list[str]) -> None:
     """Parse with the settings of the method that the arguments name."""
-    kind = find_method(value_of("--method", arguments) or "auto").config_type
+    kind = find_method(value_of("--method", arguments) or "bid").config_type
 
     def compare(
         folders: Folders,
@@ -63,7 +63,7 @@ def run(arguments: list[str]) -> None:
             option("SIZE", "how far off: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
         ] = None,
         trials: Annotated[int | None, option("N", "how many starts", "the protocol's")] = None,
-        method: Annotated[str, option("NAME", f"auto, {', '.join(METHODS)}")] = "auto",
+        method: Annotated[str, option("NAME", ", ".join(METHODS))] = "bid",
         seed: Annotated[int | None, option("N", "of the starts and the descents", "the protocol's")] = None,
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,

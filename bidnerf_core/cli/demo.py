@@ -104,7 +104,9 @@ def _demonstrated(
         raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has") from error
     with timed(f"trained on {len(seen)} views of the closed-form scene"):
         try:
-            train_map(chosen, backend, seen, config, out / "map", scene.name, scene.bounds.background)
+            train_map(
+                chosen, backend, seen, config, out / "map", scene.name, scene.bounds.background, baked=False
+            )
         except TrainingStopped as stopped:
             raise KeyboardInterrupt from stopped
     stored = load_map(out / "map")

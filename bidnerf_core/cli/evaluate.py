@@ -55,7 +55,7 @@ def run(arguments: list[str]) -> None:
             tuple[str, ...],
             option("SIZE...", "how far off: e_t, or METRES:DEGREES for perturb", "the protocol's"),
         ] = (),
-        method: Annotated[str, option("NAME", f"auto, {', '.join(METHODS)}")] = "auto",
+        method: Annotated[str, option("NAME", ", ".join(METHODS))] = "auto",
         trials: Annotated[int | None, option("N", "of each size", "the protocol's, 24 or 25")] = None,
         seed: Annotated[
             int | None, option("S", "of all that is drawn at random", "the protocol's, 0")

@@ -40,6 +40,7 @@ def describe(folder: Path) -> dict[str, Any]:
         "seconds": round(info.seconds, 1),
         "levels": len(levels(stored.field)),
         "parameters": parameters,
+        "surfels": 0 if stored.surface is None else len(stored.surface.surfels),
         "bytes": sum(file.stat().st_size for file in folder.iterdir() if file.is_file()),
         "bounds": to_plain(info.bounds),
         "config": info.config,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as jsonlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Annotated, Any
 
 import torch
 import tyro
+from torch import Tensor
 
 from bidnerf_core.cli.common import (
     LARGEST_SEED,
@@ -49,12 +51,10 @@ class Beginning:
     file: Path | None
     perturb: tuple[float, float] | None  # metres, degrees
 
-    def pose(self, truth: SE3, method: str, seed: int) -> SE3:
+    def pose(self, truth: SE3, seed: int) -> SE3 | None:
         if self.file is not None:
             return read_pose(self.file)
-        if self.perturb is not None:
-            return protocols.perturb(truth, *self.perturb, seed)
-        raise InputError(f"method {method!r} needs a start; give --start POSE.json or --perturb T R")
+        return None if self.perturb is None else protocols.perturb(truth, *self.perturb, seed)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def run(arguments: list[str]) -> None:
         data: DataFolder,
         frame: Annotated[Names, option("NAME...", "names of frames, the stems of their image files")],
         split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
-        method: Annotated[str, option("NAME", f"auto, {', '.join(METHODS)}")] = "auto",
+        method: Annotated[str, option("NAME", ", ".join(METHODS))] = "auto",
         start: Annotated[
             Path | None, one_of, option("POSE.json", "file with a 4x4 T_world_camera to start from", "")
         ] = None,
@@ -141,18 +141,21 @@ def _localize(
     if depth_rays is not None and isinstance(config, InerfConfig):
         say(f"{seen.depth_points}: method inerf heeds no depth")
     truth = views[-1].T_ref_camera
-    start = begin.pose(truth, method, seed)
+    start = begin.pose(truth, seed)
     bare = [view.frame.name for view in views if not view.frame.has_depth]
     if bare and depth_rays is None:
         say(f"{', '.join(bare)}: no measured depth; colour only")
-    found = find_pose(rig(stored.field, stored.bounds, views, start, depth_rays), method, config, seed)
+    problem = rig(stored.field, stored.bounds, views, start, depth_rays, stored.surface)
+    found = find_pose(problem, method, config, seed)
+    if depth_rays is not None and found.method == "auto":
+        say(f"{seen.depth_points}: method auto took the depth of the images instead; --method bid takes both")
     if not bool(found.T_world_camera.matrix().isfinite().all()):
         raise InputError(f"{folder}: {found.method} came to a pose that is not finite, expected a sound map")
     error = pose_error(found.T_world_camera, truth)
     if as_json:
         print_json(plain_localization(found, stored.info.backend, error))
     else:
-        _print(found, views[-1].frame.name, pose_error(start, truth), error)
+        _print(found, views[-1].frame.name, None if start is None else pose_error(start, truth), error)
 
 
 def read_pose(path: Path) -> SE3:
@@ -175,14 +178,22 @@ def read_pose(path: Path) -> SE3:
     return pose.normalized()
 
 
-def _print(found: Localization, name: str, before: PoseError, after: PoseError) -> None:
+def _print(found: Localization, name: str, before: PoseError | None, after: PoseError) -> None:
     print(f"{name}: {'converged' if found.converged else 'NOT converged'} ({found.reason})")
-    print(f"  start error  {_shown(before)}")
+    print(f"  start error  {'no start' if before is None else _shown(before)}")
     print(f"  final error  {_shown(after)}")
-    print(f"  {found.steps} steps, {found.seconds:.1f} s, loss {found.loss:.5f}, method {found.method}")
+    if found.covariance is not None:
+        print(f"  by itself    {_sure(found.covariance)}")
+    print(f"  {found.steps} steps, {found.seconds:.2f} s, loss {found.loss:.5f}, method {found.method}")
     for row in found.T_world_camera.matrix().tolist():
         print("  " + " ".join(f"{value: .6f}" for value in row))
 
 
 def _shown(error: PoseError) -> str:
     return f"{float(error.translation):.4f} m, {float(error.rotation_deg):.3f} deg"
+
+
+def _sure(covariance: Tensor) -> str:
+    """One standard deviation, as the method itself has it."""
+    translation, rotation = (float(part.sum().clamp(min=0).sqrt()) for part in covariance.diagonal().split(3))
+    return f"{translation:.4f} m, {math.degrees(rotation):.3f} deg (one standard deviation)"

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from bidnerf_core.backend import Backend
 from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.cli.bake import bake_map
 from bidnerf_core.cli.common import (
     DEFAULT_BACKEND,
     DataFolder,
@@ -28,6 +29,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.plain import to_plain
 from bidnerf_core.registry import load_backend
 from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
+from bidnerf_core.surface import BakeConfig
 from bidnerf_core.training import TrainingStopped
 
 
@@ -51,6 +53,7 @@ def run(arguments: list[str]) -> None:
         checkpoint_every: Annotated[
             float, option("SECONDS", "how much work an interruption may cost")
         ] = CHECKPOINT_SECONDS,
+        no_bake: Annotated[Flag, option(None, "do without the surface; 'bidnerf bake' adds it", "")] = False,
         config: Any = kind(),
     ) -> None:
         """Make a map of a dataset.
@@ -65,10 +68,10 @@ def run(arguments: list[str]) -> None:
             if resume:
                 info = load_interrupted(out)
                 _check_unchanged(out, info, named, kind(), config)
-                _resume(info, data, out, split, background, checkpoint_every)
+                _resume(info, data, out, split, background, checkpoint_every, not no_bake)
             else:
                 with output_folder(out, overwrite):
-                    _start(chosen, name, data, out, split, background, config, checkpoint_every)
+                    _start(chosen, name, data, out, split, background, config, checkpoint_every, not no_bake)
         except TrainingStopped as stopped:
             say(f"{out}: saved after step {stopped.step}; the same with --resume goes on from there")
             raise KeyboardInterrupt from stopped
@@ -79,14 +82,14 @@ def run(arguments: list[str]) -> None:
 
 def train_map(
     backend: Backend, name: str, views: Sequence[View], config: Any, out: Path, data: str,
-    background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS, baked: bool = True,
 ) -> None:  # fmt: skip
     """A new map in folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
     bounds = estimate_bounds(views, background)
     settings = to_plain(config, "config")
     info = MapInfo(name, settings, bounds, 0, False, data, cameras=stored_cameras(views))
     with output_folder(out, overwrite=True):
-        _run(backend, info, out, views, checkpoint_seconds)
+        _run(backend, info, out, views, checkpoint_seconds, baked)
 
 
 def load_interrupted(out: Path) -> MapInfo:
@@ -125,18 +128,20 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
 
 def _start(
     backend: Backend, name: str, data: Path, out: Path, split: str, background: str | None, config: Any,
-    checkpoint_seconds: float,
+    checkpoint_seconds: float, baked: bool,
 ) -> None:  # fmt: skip
     dataset = open_dataset(data, background)
     views = read_views(dataset, split)
     if not any(view.frame.has_depth for view in views):
         say(f"{data}: no measured depth in split {split!r}; training on colour only")
-    train_map(backend, name, views, config, out, data.resolve().name, dataset.background, checkpoint_seconds)
+    train_map(
+        backend, name, views, config, out, data.resolve().name, dataset.background, checkpoint_seconds, baked
+    )
 
 
 def _resume(
-    info: MapInfo, data: Path, out: Path, split: str, background: str | None, checkpoint_seconds: float
-) -> None:
+    info: MapInfo, data: Path, out: Path, split: str, background: str | None, checkpoint_seconds: float, baked: bool
+) -> None:  # fmt: skip
     dataset = open_dataset(data, info.bounds.background if background is None else background)
     if dataset.background != info.bounds.background:
         raise UsageError(f"{out}: was begun over background {info.bounds.background}, got {background!r}")
@@ -147,12 +152,12 @@ def _resume(
             f" {info.data!r} unchanged"
         )
     with output_folder(out, overwrite=True):
-        _run(load_backend(info.backend), info, out, views, checkpoint_seconds)
+        _run(load_backend(info.backend), info, out, views, checkpoint_seconds, baked)
 
 
 def _run(
-    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], checkpoint_seconds: float
-) -> None:
+    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], checkpoint_seconds: float, baked: bool
+) -> None:  # fmt: skip
     field, config = build_field(backend, info, str(out))
     state = load_state(out, info, field) if info.step else None
     if state is not None:
@@ -160,4 +165,9 @@ def _run(
     with StoredTraining(out, info, state, getattr(config, "steps", 0), checkpoint_seconds) as report:
         backend.train(field, views, config, report)
         report.finish(field)
+    if baked:
+        try:
+            bake_map(out, views, BakeConfig())
+        except InputError as error:  # the map itself is sound
+            say(f"{out}: no surface baked: {error}")
     say(f"{out}: map of {info.data}, {sum(f.stat().st_size for f in out.iterdir()) / 2**20:.1f} MiB")

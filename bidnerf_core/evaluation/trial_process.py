@@ -78,7 +78,7 @@ def samples_per_ray(trial: Trial) -> float:
     level = problem.level(getattr(settings_of(trial.method, trial.config), "level", None))
     pixels = draw(problem.views, RAYS, uniform, torch.Generator().manual_seed(trial.seed))
     with torch.no_grad():
-        samples = level.sampler(pixels.rays(problem.start, problem.bounds))
+        samples = level.sampler(pixels.rays(problem.start_for(trial.method), problem.bounds))
     return float(samples.valid.sum()) / RAYS
 
 

@@ -112,10 +112,9 @@ def run_trial(trial: Trial) -> TrialResult:
             views = [View(replace(view.frame, depth=None), view.T_ref_camera) for view in views]
         truth, start = views[-1].T_ref_camera, start_of(trial, views, dataset)
         settings = settings_of(trial.method, trial.config)
-        if start is None:
-            raise InputError(f"method {trial.method!r} needs a start, protocol {trial.protocol!r} gives none")
         forget_peak_memory()
-        found = localize(rig(stored.field, stored.bounds, views, start), trial.method, settings, trial.seed)
+        problem = rig(stored.field, stored.bounds, views, start, surface=stored.surface)
+        found = localize(problem, trial.method, settings, trial.seed)
         return _result(trial, stored, found, start, truth, settings)
 
 

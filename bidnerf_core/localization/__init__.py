@@ -1,5 +1,6 @@
 """Finding poses: ``localize`` and its parts."""
 
+from bidnerf_core.localization.auto import AutoConfig
 from bidnerf_core.localization.bid import BidConfig
 from bidnerf_core.localization.bid_lm import BidLmConfig
 from bidnerf_core.localization.inerf import InerfConfig
@@ -10,6 +11,7 @@ from bidnerf_core.localization.result import Localization
 
 __all__ = [
     "METHODS",
+    "AutoConfig",
     "BidConfig",
     "BidLmConfig",
     "InerfConfig",

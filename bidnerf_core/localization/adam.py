@@ -74,12 +74,13 @@ def descend(
 ) -> Localization:
     """Follow Adam down the loss from ``problem.start`` (Alg. 1 of the paper, its loop test the right way round)."""
     began = time.perf_counter()
+    start = problem.start_for(method)
     generator = torch.Generator().manual_seed(seed)
     counts = RayCounts(config.rays, depth_rays)
     loss = SampledLoss(
         problem, objective, counts, config.pixels, config.renew, config.level, config.wide, generator
     )
-    trail = Trail([problem.start])
+    trail = Trail([start])
     reason = _follow(loss, pivot(config.pivot, problem), config, trail)
     T, mean = trail.answer(config.answer)
     return Localization(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.localization.auto import AutoConfig, auto
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.bid_lm import BidLmConfig, bid_lm
 from bidnerf_core.localization.inerf import InerfConfig, inerf
@@ -25,20 +26,18 @@ class Method:
 
 
 METHODS = {
+    "auto": Method(auto, AutoConfig, "search and alignment on the baked surface; no start needed"),
     "bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)"),
     "inerf": Method(inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)"),
     "bid-lm": Method(bid_lm, BidLmConfig, "second-order steps on colour and depth, from coarse to fine"),
     "inerf-lm": Method(inerf_lm, InerfLmConfig, "second-order steps on colour alone, from coarse to fine"),
 }
 
-AUTO = "bid"
-"""What ``auto`` stands for."""
-
 
 def find_method(name: str) -> Method:
-    chosen = METHODS.get(AUTO if name == "auto" else name)
+    chosen = METHODS.get(name)
     if chosen is None:
-        raise InputError(f"method {name!r} is unknown, expected auto or one of {', '.join(sorted(METHODS))}")
+        raise InputError(f"method {name!r} is unknown, expected one of {', '.join(sorted(METHODS))}")
     return chosen
 
 

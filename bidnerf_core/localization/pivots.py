@@ -61,11 +61,13 @@ def pivot(name: PivotName, problem: Problem) -> Pivot:
 
 
 def _middle(problem: Problem) -> Float[Tensor, "3"]:
-    """Of what was measured or, failing that, of the scene: in the last camera's frame."""
+    """Of what was measured or, failing that, of the scene: in the last camera's frame. Where nothing tells, the camera."""
     point = measured_middle(problem.views)
     if point is not None:
         return point
     if problem.depth_rays is not None:
         return problem.depth_rays.points.to(torch.float64).cpu().median(0).values
+    if problem.start is None:
+        return torch.zeros(3, dtype=torch.float64)
     corners = torch.tensor([problem.bounds.lower, problem.bounds.upper], dtype=torch.float64)
     return problem.start.inverse().apply(corners.mean(0))

@@ -13,6 +13,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.se3 import SE3
+from bidnerf_core.surface import SurfaceMap
 
 Item = TypeVar("Item")
 
@@ -27,15 +28,23 @@ class Problem:
     field: RadianceField
     bounds: SceneBounds
     views: tuple[View, ...]
-    start: SE3  # T_world_K
+    start: SE3 | None  # T_world_K; none where nothing is known of it
     depth_rays: DepthRays | None = None  # of a lidar or the like, in the frame of the last camera
+    surface: SurfaceMap | None = None  # baked from the field; on the CPU, wherever the field is
 
     def __post_init__(self) -> None:
         if not self.views:
             raise InputError("nothing to localize: expected at least one view")
-        for what, pose in (("start", self.start), *((v.frame.name, v.T_ref_camera) for v in self.views)):
+        known = [] if self.start is None else [("start", self.start)]
+        for what, pose in (*known, *((v.frame.name, v.T_ref_camera) for v in self.views)):
             if not bool(pose.is_rigid().all()):
                 raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
+
+    def start_for(self, method: str) -> SE3:
+        """The start, for a method that cannot do without one."""
+        if self.start is None:
+            raise InputError(f"method {method!r} needs a start; give one, or take method 'auto'")
+        return self.start
 
     @property
     def has_depth(self) -> bool:
@@ -61,27 +70,37 @@ class Problem:
 
 
 def single(
-    field: RadianceField, bounds: SceneBounds, frame: Frame, start: SE3, depth_rays: DepthRays | None = None
+    field: RadianceField,
+    bounds: SceneBounds,
+    frame: Frame,
+    start: SE3 | None,
+    depth_rays: DepthRays | None = None,
+    surface: SurfaceMap | None = None,
 ) -> Problem:
     """One image, and what else was measured from there."""
-    return Problem(field, bounds, (View(frame, SE3.identity()),), start.to(torch.float64), depth_rays)
+    return Problem(field, bounds, (View(frame, SE3.identity()),), _exact(start), depth_rays, surface)
 
 
 def rig(
     field: RadianceField,
     bounds: SceneBounds,
     views: Sequence[View],
-    start: SE3,
+    start: SE3 | None,
     depth_rays: DepthRays | None = None,
+    surface: SurfaceMap | None = None,
 ) -> Problem:
     """Views whose poses are known in any common frame; ``start`` is for the last of them, as are ``depth_rays``."""
     if not views:
         raise InputError("nothing to localize: expected at least one view")
-    T_last_ref = views[-1].T_ref_camera.to(torch.float64).inverse()
+    T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
     relative = tuple(
-        View(v.frame, (T_last_ref @ v.T_ref_camera.to(torch.float64)).normalized()) for v in views
+        View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views
     )
-    return Problem(field, bounds, relative, start.to(torch.float64), depth_rays)
+    return Problem(field, bounds, relative, _exact(start), depth_rays, surface)
+
+
+def _exact(pose: SE3 | None) -> SE3 | None:
+    return None if pose is None else pose.to("cpu", torch.float64)
 
 
 def window(sequence: Sequence[Item], last: int, size: int, stride: int = 1) -> tuple[Item, ...]:

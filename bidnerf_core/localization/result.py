@@ -21,7 +21,9 @@ class Localization:
     seconds: float
     loss: float
     method: str
-    poses: SE3  # (steps + 1): the start, then the pose after each step
+    poses: (
+        SE3  # (steps + 1): the start, or the hypothesis that led to the answer, then the pose after each step
+    )
     losses: Float[Tensor, "s"]  # after the start and before each step
     covariance: Float[Tensor, "6 6"] | None = (
         None  # of a right update: translation in metres, rotation in radians

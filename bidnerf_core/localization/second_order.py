@@ -103,7 +103,9 @@ def second_order(
 ) -> Localization:
     """From ``problem.start`` through all stages."""
     began = time.perf_counter()
-    start = cloud(problem.start, config.poses, config.spread_translation, config.spread_rotation, seed)
+    start = cloud(
+        problem.start_for(method), config.poses, config.spread_translation, config.spread_rotation, seed
+    )
     found = refine(problem, start, stages(config, depth), settings, Generator().manual_seed(seed))
     converged, reason = verdict(found, config)
     return Localization(

@@ -1,0 +1,87 @@
+"""``bidnerf bake``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bidnerf_core.cli.common import MapFolder, console, option, parse, read_views, say
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+from bidnerf_core.storage import cameras_of, load_info, load_map, save_surface
+from bidnerf_core.surface import BakeConfig, bake
+
+SPEAK_EVERY = 10.0
+"""Seconds, where nobody sees a bar."""
+
+
+def run(arguments: list[str]) -> None:
+    """Parse."""
+    parse("bake", _bake, arguments)
+
+
+def _bake(
+    map: MapFolder,
+    data: Annotated[
+        Path | None,
+        option("DATA", "dataset whose measured depth is taken where there is some", "rendered depth only"),
+    ] = None,
+    split: Annotated[str, option("NAME", "which of the dataset's splits")] = "train",
+    config: BakeConfig = BakeConfig(),
+) -> None:
+    """Find the surface that a map shows, and store it in the map.
+
+    Depth is rendered from where the training images were taken; what several of these views agree on is kept. With
+    --data, views with measured depth are taken as they are instead.
+    """
+    background = load_info(map).bounds.background
+    views = [] if data is None else read_views(open_dataset(data, background), split)
+    bake_map(map, views, config)
+
+
+def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
+    """Bake the map in ``folder``; of ``views``, those with measured depth take the place of rendered ones."""
+    began = time.monotonic()
+    stored = load_map(folder, surface=False)  # which may be damaged, and is to be replaced
+    measured = [view for view in views if view.frame.has_depth]
+    cameras = [] if measured else cameras_of(stored.info)
+    if not (measured or cameras):
+        raise InputError(
+            f"{folder}: knows no place to see it from; give --data with measured depth, or train it anew"
+        )
+    with _progress() as report:
+        surface = bake(stored.field, stored.bounds, cameras, measured, config, report)
+    save_surface(folder, stored.info, surface)
+    source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
+    say(
+        f"{folder}: surface of {len(surface.surfels)} pieces from {source} views, {time.monotonic() - began:.1f} s"
+    )
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    """A bar, or a line now and then."""
+    columns = (
+        TextColumn("baking"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} views"),
+        TimeRemainingColumn(),
+    )
+    spoke = time.monotonic()
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("baking", total=None)
+
+        def report(done: int, total: int) -> None:
+            nonlocal spoke
+            bar.update(task, completed=done, total=total)
+            if not console.is_terminal and time.monotonic() - spoke > SPEAK_EVERY:
+                spoke = time.monotonic()
+                say(f"baking: view {done}/{total}")
+
+        yield report

@@ -1,0 +1,90 @@
+"""Method ``auto``: find the pose on the baked surface, with a start or without one, and say whether to believe it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import torch
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization.alignment import Cloud
+from bidnerf_core.localization.bid import BidConfig, bid
+from bidnerf_core.localization.clouds import measured_cloud
+from bidnerf_core.localization.hypotheses import hypotheses
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.search import Found, score, search
+from bidnerf_core.localization.verdict import Bars, Evidence, covariance, evidence
+from bidnerf_core.surface import SurfaceMap
+
+LEAST_POINTS = 50
+"""With fewer there is no shape to recognise."""
+
+
+@dataclass(frozen=True)
+class AutoConfig:
+    """Settings of method ``auto``."""
+
+    points: int = 2000  # of the measured pixels, at most
+    hypotheses: int = 256  # that a round of the search begins with
+    rounds: int = 3  # of search, each with fresh hypotheses, until an answer is believed
+
+    def __post_init__(self) -> None:
+        for name, least, most in (
+            ("points", LEAST_POINTS, 10**6), ("hypotheses", 8, 10**5), ("rounds", 1, 100)
+        ):  # fmt: skip
+            if not least <= getattr(self, name) <= most:
+                raise InputError(f"{name} is {getattr(self, name)}, expected {least} to {most}")
+
+
+def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
+    """Search and align where there is measured depth and a baked surface; descend as ``bid`` does where there is not.
+
+    Raises ``InputError`` where that needs a start and there is none.
+    """
+    began = time.perf_counter()
+    generator = torch.Generator().manual_seed(seed)
+    if problem.surface is None:
+        return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
+    cloud = measured_cloud(problem, config.points, generator)
+    if len(cloud) < LEAST_POINTS:
+        return _descended(problem, seed, f"{len(cloud)} pixels have depth, expected {LEAST_POINTS} or more")
+    with torch.no_grad():
+        found, speaks, doubt = _searched(problem, problem.surface, cloud, config, generator)
+        spread = covariance(problem.surface, cloud, found.T, len(problem.views))
+        losses = score(problem.surface, cloud.first(200), found.path)
+    return Localization(
+        T_world_camera=found.T.normalized(),
+        converged=doubt is None,
+        reason=doubt or f"{speaks.alike:.0%} of the measured points have place and colour of the surface",
+        steps=len(losses) - 1,
+        seconds=time.perf_counter() - began,
+        loss=found.score,
+        method="auto",
+        poses=found.path,
+        losses=losses[:-1],
+        covariance=spread,
+    )
+
+
+def _searched(
+    problem: Problem, surface: SurfaceMap, cloud: Cloud, config: AutoConfig, generator: torch.Generator
+) -> tuple[Found, Evidence, str | None]:
+    """Rounds of search until an answer is believed; else the best of them, and what speaks against it."""
+    answers: list[Found] = []
+    while True:
+        pool = hypotheses(surface, cloud, problem.start, config.hypotheses, generator)
+        answers.append(search(surface, cloud, pool))
+        best = min(answers, key=lambda found: found.score)
+        speaks = evidence(surface, cloud, best)
+        doubt = speaks.doubt(Bars())
+        if doubt is None or len(answers) == config.rounds:
+            return best, speaks, doubt
+
+
+def _descended(problem: Problem, seed: int, why: str) -> Localization:
+    if problem.start is None:
+        raise InputError(f"{why}: method 'auto' needs a start then; give one")
+    found = bid(problem, BidConfig(), seed)
+    return replace(found, reason=f"{why}; {found.reason}")

@@ -1,0 +1,57 @@
+"""A baked surface as named tensors, for storage, and back."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.se3 import SE3
+from bidnerf_core.surface.surface_map import SurfaceMap
+from bidnerf_core.surface.surfels import Surfels
+
+KINDS = {
+    "positions": ((-1, 3), torch.float32),
+    "normals": ((-1, 3), torch.float32),
+    "rgb": ((-1, 3), torch.float32),
+    "rgb_gradient": ((-1, 3, 3), torch.float32),
+    "nearest": ((-1, -1, -1), torch.int32),
+    "keyframes": ((-1, 4, 4), torch.float64),
+    "lower": ((3,), torch.float64),
+    "cell": ((), torch.float64),
+}
+"""Shape, -1 for any length, and dtype."""
+
+
+def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
+    parts = surface.surfels
+    found = {
+        "positions": parts.positions, "normals": parts.normals, "rgb": parts.rgb, "rgb_gradient": parts.rgb_gradient,
+        "nearest": surface.nearest, "keyframes": surface.keyframes,
+        "lower": torch.tensor(surface.lower, dtype=torch.float64), "cell": torch.tensor(surface.cell, dtype=torch.float64),
+    }  # fmt: skip
+    return {name: found[name].to(kind).contiguous().clone() for name, (_, kind) in KINDS.items()}
+
+
+def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
+    """Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, kind or content."""
+    for name, (shape, kind) in KINDS.items():
+        value = tensors[name]
+        fits = len(shape) == value.dim() and all(
+            a in (-1, b) for a, b in zip(shape, value.shape, strict=True)
+        )
+        if not fits or value.dtype != kind:
+            raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, expected {kind} {list(shape)}")
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise ValueError(f"{name} holds NaN or infinity")
+    count, nearest = len(tensors["positions"]), tensors["nearest"]
+    if any(len(tensors[name]) != count for name in ("normals", "rgb", "rgb_gradient")) or not count:
+        raise ValueError("surfels of no or of several numbers")
+    if not nearest.numel() or not 0 <= int(nearest.min()) <= int(nearest.max()) < count:
+        raise ValueError(f"nearest names surfels that are not there, expected 0 to {count - 1}")
+    if not float(tensors["cell"]) > 0:
+        raise ValueError(f"cell is {float(tensors['cell'])}, expected a length")
+    if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
+        raise ValueError("no keyframe, or one that is not rigid")
+    surfels = Surfels(*(tensors[name] for name in ("positions", "normals", "rgb", "rgb_gradient")))
+    x, y, z = tensors["lower"].tolist()
+    return SurfaceMap(surfels, (x, y, z), float(tensors["cell"]), nearest, tensors["keyframes"])

@@ -1,0 +1,93 @@
+"""What tests of the baked surface and of the search on it share: a toy that was baked from exact depth, and images of it."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.closed_fields import GaussianBlobs
+from bidnerf_core.closed_form import ClosedFormScene
+from bidnerf_core.field import SceneBounds
+from bidnerf_core.frames import View
+from bidnerf_core.localization import Problem, rig
+from bidnerf_core.localization.alignment import Cloud
+from bidnerf_core.localization.clouds import measured_cloud
+from bidnerf_core.primitives import Primitive, Shape
+from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes import demo_object
+from bidnerf_core.se3 import SE3
+from bidnerf_core.surface import BakeConfig, SurfaceMap, Surfels, bake
+from bidnerf_core.surface.surface_map import nearest_surfels
+from bidnerf_core.textures import Texture
+
+CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)
+BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
+CONFIG = BakeConfig(cells=100_000)
+FIELD = GaussianBlobs.random()  # whatever it is: measured depth asks no field
+
+
+def baked(scene: ClosedFormScene, count: int = 24) -> SurfaceMap:
+    return bake(FIELD, scene.bounds, [], images(scene, count, seed=0), CONFIG)
+
+
+def images(scene: ClosedFormScene, count: int, seed: int) -> list[View]:
+    poses = orbit(3.5, count, elevation=(-10.0, 80.0), seed=seed)
+    return [View(scene.render(CAMERA, T, f"{i:04d}", supersample=1), T) for i, T in enumerate(poses)]
+
+
+@functools.cache
+def toy() -> SurfaceMap:
+    return baked(demo_object())
+
+
+@functools.cache
+def unseen() -> tuple[View, ...]:
+    """Images of the toy from which its surface was not baked."""
+    return tuple(images(demo_object(), 4, seed=7))
+
+
+def one_solid(shape: Shape, texture: Texture) -> ClosedFormScene:
+    return ClosedFormScene([Primitive(shape, SE3.identity(), texture)], BOUNDS, "one")
+
+
+def problem(*views: View, start: SE3 | None = None, surface: SurfaceMap | None = None) -> Problem:
+    return rig(FIELD, BOUNDS, views, start, surface=toy() if surface is None else surface)
+
+
+def cloud(*views: View, count: int = 1000, seed: int = 0) -> Cloud:
+    return measured_cloud(problem(*views), count, torch.Generator().manual_seed(seed))
+
+
+def of_points(
+    positions: Tensor, rgb: Tensor, normal: tuple[float, float, float], cells: int = 20
+) -> SurfaceMap:
+    """Surfels of one plane as they are, at most one a cell, in the cube from -1 to 1."""
+    cell = 2 / cells
+    x, y, z = ((positions + 1) / cell).floor().long().unbind(-1)
+    numbers = (x * cells + y) * cells + z
+    assert (numbers.diff() > 0).all(), "one a cell, in the order of the cells"
+    count = len(positions)
+    surfels = Surfels(
+        positions, positions.new_tensor(normal).expand(count, 3), rgb, positions.new_zeros((count, 3, 3))
+    )
+    keyframes = torch.eye(4, dtype=torch.float64)[None]
+    return SurfaceMap(surfels, (-1.0, -1.0, -1.0), cell, nearest_surfels(numbers, (cells,) * 3), keyframes)
+
+
+def patch(half: int = 5, dtype: torch.dtype = torch.float32) -> SurfaceMap:
+    """A square of 2 ``half`` by 2 ``half`` surfels in the plane z = 0.05, in cells of 0.1."""
+    side = (torch.arange(-half, half, dtype=dtype) + 0.5) / 10
+    x, y = torch.meshgrid(side, side, indexing="ij")
+    positions = torch.stack([x, y, torch.full_like(x, 0.05)], dim=-1).reshape(-1, 3)
+    return of_points(positions, (positions + 1) / 2, (0.0, 0.0, 1.0))
+
+
+def exact(surface: SurfaceMap) -> SurfaceMap:
+    """The same in float64, for numerical derivatives."""
+    parts = surface.surfels
+    values = (parts.positions, parts.normals, parts.rgb, parts.rgb_gradient)
+    return replace(surface, surfels=Surfels(*(value.double() for value in values)))

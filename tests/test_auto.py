@@ -1,0 +1,127 @@
+"""Method ``auto``: poses without a start, with one, and what it does where there is no surface or no depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import baked
+import bidnerf_core.localization.auto as module
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.frames import View
+from bidnerf_core.localization import AutoConfig, Localization, Problem, localize, rig
+from bidnerf_core.localization.bid import BidConfig
+from bidnerf_core.scenes import demo_room
+from bidnerf_core.se3 import SE3
+
+QUICK = AutoConfig(points=1000, hypotheses=128)
+
+
+def found_for(problem: Problem, seed: int = 0) -> Localization:
+    return localize(problem, "auto", QUICK, seed)
+
+
+def assert_right(found: Localization, truth: SE3) -> None:
+    error = pose_error(found.T_world_camera, truth)
+    assert float(error.translation) < 0.05
+    assert float(error.rotation_deg) < 1
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_no_start_is_needed(number: int) -> None:
+    view = baked.unseen()[number]
+    found = found_for(baked.problem(view))
+    assert_right(found, view.T_ref_camera)
+    assert found.converged, found.reason
+    assert found.method == "auto"
+    assert found.T_world_camera.rotation.dtype == torch.float64
+    assert found.steps == len(found.losses) == len(found.poses.translation) - 1
+    assert found.losses[-1] < found.losses[0]
+    assert found.covariance is not None
+    xi = (found.T_world_camera.inverse() @ view.T_ref_camera).log()
+    assert xi @ torch.linalg.solve(found.covariance, xi) < 16.8  # 99 % of chi^2 with 6 degrees of freedom
+
+
+def test_a_start_helps_where_the_map_has_no_view_alike() -> None:
+    view = baked.unseen()[0]
+    aside = replace(baked.toy(), keyframes=torch.eye(4, dtype=torch.float64)[None])
+    start = perturb(view.T_ref_camera, 0.2, 10, 0)
+    found = localize(
+        baked.problem(view, start=start, surface=aside), "auto", AutoConfig(hypotheses=32, rounds=1)
+    )
+    assert_right(found, view.T_ref_camera)
+
+
+def test_a_rig_is_placed_by_its_last_camera() -> None:
+    views = baked.unseen()
+    found = found_for(baked.problem(*views))
+    assert_right(found, views[-1].T_ref_camera)
+    assert found.converged, found.reason
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    problem = baked.problem(baked.unseen()[1])
+    first = found_for(problem, 3)
+    torch.manual_seed(99)
+    again = found_for(problem, 3)
+    assert torch.equal(first.T_world_camera.matrix(), again.T_world_camera.matrix())
+    assert torch.equal(first.losses, again.losses)
+    assert not torch.equal(first.T_world_camera.matrix(), found_for(problem, 4).T_world_camera.matrix())
+
+
+def test_an_image_of_something_else_is_not_found() -> None:
+    room = baked.images(replace(demo_room(), bounds=baked.BOUNDS), 1, seed=0)[0]
+    found = found_for(baked.problem(room))
+    assert not found.converged
+    assert found.covariance is not None
+
+
+def test_nothing_is_asked_of_the_gradient_and_nothing_is_left_behind() -> None:
+    with torch.enable_grad():
+        found = found_for(baked.problem(baked.unseen()[0]))
+    assert not found.T_world_camera.rotation.requires_grad
+    assert torch.is_grad_enabled()
+
+
+def colour_only(view: View) -> View:
+    return View(replace(view.frame, depth=None), view.T_ref_camera)
+
+
+def few(view: View) -> View:
+    assert view.frame.depth is not None
+    depth = view.frame.depth.clone()
+    depth[:, :35] = depth[:, 36:] = 0
+    depth[50:] = 0
+    return View(replace(view.frame, depth=depth), view.T_ref_camera)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda v, T: rig(baked.FIELD, baked.BOUNDS, [v], T), "the map has no surface"),
+        (lambda v, T: baked.problem(colour_only(v), start=T), "0 pixels have depth, expected 50 or more"),
+        (lambda v, T: baked.problem(few(v), start=T), "pixels have depth, expected 50 or more"),
+    ],
+    ids=["no surface", "no depth", "little depth"],
+)
+def test_without_surface_or_depth_a_start_is_needed(make, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    view = baked.unseen()[0]
+    with pytest.raises(InputError, match=said) as told:
+        found_for(make(view, None))
+    assert "needs a start" in str(told.value)
+    assert "\n" not in str(told.value)
+    monkeypatch.setattr(module, "BidConfig", lambda: BidConfig(max_steps=2, rays=32))
+    found = found_for(make(view, view.T_ref_camera))
+    assert (found.method, found.steps) == ("bid", 2)
+    assert said in found.reason
+
+
+@pytest.mark.parametrize("wrong", [{"points": 10}, {"hypotheses": 0}, {"rounds": 0}, {"rounds": 1000}])
+def test_settings_are_judged(wrong: dict[str, int]) -> None:
+    (name,) = wrong
+    with pytest.raises(InputError, match=f"{name} is"):
+        AutoConfig(**wrong)

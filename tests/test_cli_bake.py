@@ -1,0 +1,156 @@
+"""``bidnerf bake``, baking as a part of ``train``, and what they are for: ``localize --no-start``."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.cli import bake as module
+from bidnerf_core.cli import main
+from bidnerf_core.closed_fields import HomogeneousBall
+from bidnerf_core.storage import Map, load_info, load_map
+from tiny import backends_listed_once  # noqa: F401
+
+pytestmark = pytest.mark.usefixtures("backends_listed_once")
+
+Run = Callable[..., tuple[int, str, str]]
+COARSE = ["--cells", "30000"]
+
+
+@pytest.fixture
+def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Status, output and what was said, of a command in this process."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        status = main([str(word) for word in words])
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images large enough to recognise something in, and a map that was trained for a moment only."""
+    folder = tmp_path_factory.mktemp("bake")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tiny, "SIZE", 64)
+        patch.setattr(tiny, "CAMERA", Intrinsics(85.0, 85.0, 32.0, 32.0, 64, 64))
+        tiny.write_dataset(folder / "data", train=24)
+    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options(4)]) == 0
+    return folder
+
+
+@pytest.fixture
+def folder(shared: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(shared / "map", tmp_path / "map"))
+
+
+def test_a_baked_map_needs_no_start(shared: Path, folder: Path, bidnerf: Run) -> None:
+    data = shared / "data"
+    status, out, err = bidnerf("bake", folder, "--data", data, *COARSE)
+    assert (status, out) == (0, "")
+    assert "from 24 measured views" in err
+    facts = json.loads(bidnerf("info", folder, "--json")[1])
+    assert facts["surfels"] > 1000
+    status, out, _ = bidnerf("localize", folder, data, "--frame", "t_0000", "--no-start", "--json")
+    found = json.loads(out)
+    assert (status, found["method"]) == (0, "auto")
+    assert found["error"]["translation"] < 0.1
+    assert found["error"]["rotation_deg"] < 2
+    assert len(found["covariance"]) == len(found["covariance"][0]) == 6
+    points = folder / "points.txt"
+    points.write_text("0 0 3\n0.1 0 3\n")
+    place = ["localize", folder, data, "--frame", "t_0000", "--no-start"]
+    assert "took the depth of the images instead" in bidnerf(*place, "--depth-points", points)[2]
+    shown = bidnerf("localize", folder, data, "--frame", "t_0000", "--no-start")[1]
+    assert "start error  no start" in shown
+    assert "one standard deviation" in shown
+
+
+def test_without_a_surface_no_start_is_refused_in_a_line(shared: Path, folder: Path, bidnerf: Run) -> None:
+    status, out, err = bidnerf("localize", folder, shared / "data", "--frame", "t_0000", "--no-start")
+    assert (status, out, err.count("\n")) == (1, "", 1)
+    assert "'bidnerf bake'" in err
+    assert "needs a start" in err
+
+
+def test_a_map_is_baked_from_what_it_renders(
+    folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ball(folder: Path, **options: bool) -> Map:
+        return replace(load_map(folder, **options), field=HomogeneousBall(0.5, 300.0))
+
+    monkeypatch.setattr(module, "load_map", ball)
+    status, out, err = bidnerf("bake", folder, "--rays", "20000", "--cells", "20000")
+    assert (status, out) == (0, "")
+    assert "from 24 rendered views" in err
+    surface = load_map(folder).surface
+    assert surface is not None
+    height = torch.linalg.vector_norm(surface.surfels.positions, dim=-1) - 0.5
+    assert height.abs().max() < surface.cell
+    assert len(surface.keyframes) == 24
+
+
+def test_a_damaged_surface_is_baked_anew(shared: Path, folder: Path, bidnerf: Run) -> None:
+    bake = ["bake", folder, "--data", shared / "data", *COARSE]
+    assert bidnerf(*bake)[0] == 0
+    (folder / str(load_info(folder).surface)).write_bytes(b"")
+    status, _, err = bidnerf("info", folder)
+    assert (status, err.count("\n")) == (1, 1)
+    assert bidnerf(*bake)[0] == 0
+    assert load_map(folder).surface is not None
+
+
+def test_training_bakes_unless_told_otherwise(
+    shared: Path, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bidnerf_core.cli.train.BakeConfig", lambda: module.BakeConfig(cells=20_000))
+    train = ["train", shared / "data", *tiny.options(2)]
+    assert train.pop() == "--no-bake"
+    status, out, err = bidnerf(*train, "--out", tmp_path / "map")
+    assert (status, out) == (0, "")
+    assert "surface of" in err
+    assert load_map(tmp_path / "map").surface is not None
+    assert load_map(shared / "map").surface is None
+
+
+def test_a_map_without_a_surface_to_bake_is_a_map(
+    tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiny.write_dataset(tmp_path / "data", depth=False)
+    monkeypatch.setattr("bidnerf_core.cli.train.BakeConfig", lambda: module.BakeConfig(rays=1000, cells=1000))
+    train = ["train", tmp_path / "data", *tiny.options(1)[:-1]]
+    status, _, err = bidnerf(*train, "--out", tmp_path / "map")
+    assert status == 0
+    assert "no surface baked: no surface to bake" in err
+    assert load_map(tmp_path / "map").info.complete
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["{none}"], 1, "no such folder"),
+        (["{map}", "--cells", "3"], 2, "cells is 3"),
+        (["{map}", "--data", "{none}"], 1, "none"),
+        (["{map}", "--split", "x", "--data", "{data}"], 1, "no split 'x'"),
+        (["{map}", "--frobnicate"], 2, "--frobnicate"),
+    ],
+)
+def test_mistakes_are_told(
+    words: list[str], status: int, said: str, shared: Path, tmp_path: Path, bidnerf: Run
+) -> None:
+    places = {"none": tmp_path / "none", "map": shared / "map", "data": shared / "data"}
+    found, out, err = bidnerf("bake", *(word.format(**places) for word in words))
+    assert (found, out, "Traceback" in err) == (status, "", False), err
+    assert status == 2 or err.count("\n") == 1
+    assert said in err

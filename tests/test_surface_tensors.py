@@ -1,0 +1,63 @@
+"""A surface as named tensors: there and back, and what is not one is refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+import baked
+from bidnerf_core.surface import surface_from_tensors, surface_tensors
+
+
+def test_there_and_back() -> None:
+    surface = baked.toy()
+    again = surface_from_tensors(surface_tensors(surface))
+    assert (again.lower, again.cell) == (surface.lower, surface.cell)
+    for name, value in surface_tensors(surface).items():
+        found = surface_tensors(again)[name]
+        assert found.dtype == value.dtype
+        assert torch.equal(found, value)
+
+
+def test_an_uneven_corner_comes_back_exactly() -> None:
+    from dataclasses import replace
+
+    odd = replace(baked.toy(), lower=(0.1, 1 / 3, -1e-7), cell=1 / 7)
+    again = surface_from_tensors(surface_tensors(odd))
+    assert (again.lower, again.cell) == (odd.lower, odd.cell)
+
+
+def nan(value: Tensor) -> Tensor:
+    return torch.full_like(value, torch.nan)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("positions", nan, "positions holds NaN"),
+        ("cell", nan, "cell holds NaN"),
+        ("cell", torch.zeros_like, "cell is 0"),
+        ("rgb", lambda v: v[1:], "several numbers"),
+        ("normals", lambda v: v[:, :2], "normals is"),
+        ("nearest", lambda v: v + 1, "expected 0 to"),
+        ("nearest", lambda v: v - 1, "expected 0 to"),
+        ("nearest", lambda v: v[:0], "nearest"),
+        ("nearest", lambda v: v.long(), "int64"),
+        ("keyframes", lambda v: v.float(), "keyframes is torch.float32"),
+        ("keyframes", lambda v: v[:0], "no keyframe"),
+        ("keyframes", lambda v: 2 * v, "not rigid"),
+    ],
+)
+def test_what_is_no_surface_is_refused(name: str, change, said: str) -> None:
+    tensors = surface_tensors(baked.toy())
+    with pytest.raises(ValueError, match=said):
+        surface_from_tensors(tensors | {name: change(tensors[name])})
+
+
+@pytest.mark.parametrize("name", ["positions", "nearest", "lower"])
+def test_a_missing_tensor_is_named(name: str) -> None:
+    tensors = surface_tensors(baked.toy())
+    del tensors[name]
+    with pytest.raises(KeyError, match=name):
+        surface_from_tensors(tensors)
