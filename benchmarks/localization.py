@@ -1,67 +1,113 @@
 """Success of a method on a map from seeded starts, on frames that training never saw.
 
     python benchmarks/localization.py MAP DATA --start bid:0.5 --trials 40 --name localization_lego_bid_0.5
+    python benchmarks/localization.py MAP DATA --start none --method auto --all-frames --name no_start_lego
 
-``--start`` is a protocol, with a size where it has sizes: ``bid:SIZE``, ``perturb:METRES:DEGREES``, ``inerf``. Frames whose place in the test split is 1 modulo 5 are left out by default: settings were
-tuned on them. Trials run in processes of one thread; finished ones are kept in a ``.jsonl`` beside the record, so that
-an interrupted run goes on where it stopped. ``bidnerf evaluate`` is the same for other purposes.
+``--start`` is a protocol, with a size where it has sizes: ``bid:SIZE``, ``perturb:METRES:DEGREES``, ``inerf``, ``none``; one
+record may hold several. Frames whose place in the test split is 1 modulo 5 are left out by default: settings were tuned
+on them. Without ``--trials`` each frame is tried once. Trials run in processes of one thread; finished ones are kept in a
+``.jsonl`` beside the record, so that an interrupted run goes on where it stopped. ``bidnerf evaluate`` is the same for
+other purposes.
+
+Where a method gives a covariance, ``consistent`` counts the answers whose normalised squared error lies inside the 95 %
+bound of chi-squared with 6 degrees of freedom.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
 from record import RESULTS, write_record
+from scipy.stats import chi2
 
 from bidnerf_core.evaluation.bench import Plan, left_to_do, local_processes, planned, run_trials
-from bidnerf_core.evaluation.errors import CRITERIA, steps_to_success, success_rate
+from bidnerf_core.evaluation.errors import (
+    CRITERIA,
+    normalized_error_squared,
+    steps_to_success,
+    success_rate,
+)
 from bidnerf_core.evaluation.results import ResultsFile, key_of
+from bidnerf_core.evaluation.summary import applies
 from bidnerf_core.evaluation.trials import Trial, TrialResult, opened
 from bidnerf_core.plain import to_plain
+from bidnerf_core.se3 import SE3
+
+BOUND = float(chi2(6).ppf(0.95))
 
 
-def summary(rows: list[TrialResult]) -> dict[str, Any]:
-    """Rates by each criterion with Wilson intervals, steps, time, and how honest ``converged`` was."""
+def summary(rows: list[TrialResult], truth: dict[str, SE3]) -> dict[str, Any]:
+    """Rates by each criterion with Wilson intervals, steps, time, and how honest ``converged`` and covariance were."""
     traces = [row.errors.as_error() for row in rows]
     result: dict[str, Any] = {"trials": len(rows)}
     for name, criterion in CRITERIA.items():
+        if not applies(name, rows):
+            continue
         good = [bool(criterion(trace[-1], trace[0])) for trace in traces]
         result[name] = asdict(success_rate(sum(good), len(rows)))
         reached = [s for trace in traces if (s := steps_to_success(trace, criterion)) is not None]
         result[name]["median_steps_to_success"] = statistics.median(reached) if reached else None
     right = [bool(CRITERIA["5deg 0.05"](trace[-1], trace[0])) for trace in traces]
     said = [row.converged for row in rows]
+    result["converged"] = sum(said)
     result["converged_but_wrong"] = sum(s and not r for s, r in zip(said, right, strict=True))
     result["right_but_not_converged"] = sum(r and not s for s, r in zip(said, right, strict=True))
+    normalized = [value for row in rows if (value := nees(row, truth)) is not None]
+    if normalized:
+        inside = sum(value <= BOUND for value in normalized)
+        result["consistent"] = asdict(success_rate(inside, len(normalized)))
+        middle = statistics.median(normalized)
+        result["median_normalized_error_squared"] = middle if math.isfinite(middle) else None
     result["median_translation"] = statistics.median(float(t.translation[-1]) for t in traces)
     result["median_rotation_deg"] = statistics.median(float(t.rotation_deg[-1]) for t in traces)
-    result["median_start_rotation_deg"] = statistics.median(float(t.rotation_deg[0]) for t in traces)
+    if all(row.start_error is not None for row in rows):
+        result["median_start_rotation_deg"] = statistics.median(float(t.rotation_deg[0]) for t in traces)
+    result["median_seconds"] = statistics.median(row.seconds for row in rows)
+    result["slowest_seconds"] = max(row.seconds for row in rows)
     result["seconds_per_step"] = statistics.median(row.seconds / max(1, row.steps) for row in rows)
     result["peak_resident_GiB"] = max(row.peak_memory_bytes for row in rows) / 2**30
     return result
 
 
-def final(row: TrialResult) -> dict[str, Any]:
+def nees(row: TrialResult, truth: dict[str, SE3]) -> float | None:
+    """Normalised (estimation) error squared, infinite where the covariance is of no use; none where there is none."""
+    if row.covariance is None or row.T_world_camera is None:
+        return None
+    found = SE3.from_matrix(torch.tensor(row.T_world_camera, dtype=torch.float64))
+    spread = torch.tensor(row.covariance, dtype=torch.float64)
+    value = float(normalized_error_squared(found, truth[row.frame], spread))
+    return value if math.isfinite(value) and value >= 0 else math.inf
+
+
+def final(row: TrialResult, truth: dict[str, SE3]) -> dict[str, Any]:
     """A trial without its trace."""
     error = None if row.error is None else to_plain(row.error)
-    kept = ("frame", "seed", "converged", "steps", "seconds", "loss")
-    return {name: getattr(row, name) for name in kept} | (error or {"translation": None})
+    value = nees(row, truth)
+    kept = ("frame", "seed", "converged", "reason", "steps", "seconds", "loss")
+    return (
+        {name: getattr(row, name) for name in kept}
+        | (error or {"translation": None})
+        | ({} if value is None else {"normalized_error_squared": value if math.isfinite(value) else None})
+    )
 
 
-def trials(given: argparse.Namespace) -> list[Trial]:
-    protocol, *size = given.start.split(":")
+def trials(given: argparse.Namespace, start: str) -> list[Trial]:
+    protocol, *size = start.split(":")
     _, dataset = opened(str(given.map), str(given.data))
     names = dataset.frame_names("test")
     kept = [name for place, name in enumerate(names) if given.all_frames or place % 5 != 1]
     return planned(
         Plan(
             str(given.map), str(given.data), protocol, (tuple(map(float, size)),), given.method,
-            json.dumps(json.loads(given.config), sort_keys=True), given.trials, given.seed, frames=tuple(kept),
+            json.dumps(json.loads(given.config), sort_keys=True), given.trials or len(kept), given.seed,
+            frames=tuple(kept),
         )
     )  # fmt: skip
 
@@ -72,32 +118,39 @@ def main() -> None:
     )
     parser.add_argument("map", type=Path)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--start", required=True)
+    parser.add_argument("--start", nargs="+", required=True)
     parser.add_argument("--name", required=True, help="of the record")
     parser.add_argument("--method", default="bid")
     parser.add_argument(
         "--config", default="{}", help="JSON of the method's settings that differ from the defaults"
     )
-    parser.add_argument("--trials", type=int, default=40)
+    parser.add_argument("--trials", type=int, help="from each start")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--all-frames", action="store_true", help="also those that settings were tuned on")
     given = parser.parse_args()
-    wanted, partial = trials(given), RESULTS / f"{given.name}.partial.jsonl"
+    wanted = {start: trials(given, start) for start in given.start}
+    partial = RESULTS / f"{given.name}.partial.jsonl"
     with ResultsFile(partial) as file, local_processes(given.workers) as pool:
-        left = len(left_to_do(wanted, file))
-        run_trials(wanted, file, pool, given.workers, lambda row: print(".", end="", flush=True))
+        every = [trial for part in wanted.values() for trial in part]
+        left = len(left_to_do(every, file))
+        run_trials(every, file, pool, given.workers, lambda row: print(".", end="", flush=True))
         print(f" {left} trials done")
-        rows = [file.results[key_of(trial)] for trial in wanted]
-    results = {"map": given.map.name, "data": given.data.name, "start": given.start, "method": given.method}
+        rows = {start: [file.results[key_of(trial)] for trial in part] for start, part in wanted.items()}
+    _, dataset = opened(str(given.map), str(given.data))
+    truth = {view.frame.name: view.T_ref_camera for view in dataset.views("test")}
     record = {
-        **results,
-        "settings": rows[0].settings,
-        "summary": summary(rows),
-        "rows": [final(row) for row in rows],
+        "map": given.map.name,
+        "data": given.data.name,
+        "method": given.method,
+        "settings": rows[given.start[0]][0].settings,
+        "starts": {
+            start: {"summary": summary(part, truth), "rows": [final(row, truth) for row in part]}
+            for start, part in rows.items()
+        },
     }
     print(write_record(given.name, record, given.seed))
-    print(json.dumps(summary(rows), indent=1))
+    print(json.dumps({start: part["summary"] for start, part in record["starts"].items()}, indent=1))
     partial.unlink()
 
 

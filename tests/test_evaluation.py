@@ -10,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, kstest
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import (
@@ -18,6 +19,7 @@ from bidnerf_core.evaluation.errors import (
     PoseError,
     Reduced,
     Within,
+    normalized_error_squared,
     pose_error,
     rotation_angle,
     steps_to_success,
@@ -47,6 +49,25 @@ def test_error_agrees_with_scipy(a: torch.Tensor, b: torch.Tensor) -> None:
     assert float(error.translation) == pytest.approx(
         np.linalg.norm(one.translation - two.translation), abs=1e-12
     )
+
+
+def test_normalized_errors_of_an_honest_covariance_are_chi_squared() -> None:
+    generator = torch.Generator().manual_seed(0)
+    spread = 0.05 * torch.randn((6, 6), generator=generator, dtype=torch.float64)
+    covariance = spread @ spread.mT
+    true = SE3.exp(torch.randn(6, generator=generator, dtype=torch.float64))
+    drawn = torch.randn((4000, 6), generator=generator, dtype=torch.float64) @ spread.mT
+    found = true @ SE3.exp(drawn).inverse()
+    values = normalized_error_squared(found, true, covariance)
+    assert kstest(values.numpy(), chi2(6).cdf).pvalue > 0.01
+    expected = np.einsum("bi,ij,bj->b", drawn.numpy(), np.linalg.inv(covariance.numpy()), drawn.numpy())
+    assert values.numpy() == pytest.approx(expected, rel=1e-6)
+
+
+def test_normalized_error_without_an_inverse_is_no_finite_number() -> None:
+    nothing = torch.zeros((6, 6), dtype=torch.float64)
+    xi = torch.ones(6, dtype=torch.float64)
+    assert not normalized_error_squared(SE3.exp(xi), SE3.identity(), nothing).isfinite()
 
 
 @given(tangents, tangents, tangents)

@@ -32,6 +32,19 @@ def pose_error(found: SE3, true: SE3) -> PoseError:
     return PoseError(distance, torch.rad2deg(rotation_angle(true.rotation.mT @ found.rotation)))
 
 
+def normalized_error_squared(
+    found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]
+) -> Float[Tensor, "*b"]:
+    """``xi^T C^-1 xi`` with ``true = found exp(xi)``: chi-squared with 6 degrees of freedom where C tells the truth
+    (Bar-Shalom et al. 2001, "Estimation with applications to tracking and navigation", 5.4.2).
+
+    Infinite or not a number where the covariance has no inverse.
+    """
+    xi = (found.to(dtype=torch.float64).inverse() @ true.to(dtype=torch.float64)).log()
+    solved, _ = torch.linalg.solve_ex(covariance.double(), xi[..., None])
+    return (xi * solved[..., 0]).sum(-1)
+
+
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """Radians, 0 to pi. ``acos`` of the trace would lose half of the digits near both ends, ``atan2`` loses none."""
     skewed = rotation - rotation.mT

@@ -1,0 +1,244 @@
+"""What a user would take without a radiance field, beside method ``auto``, on the same map and the same frames.
+
+    python benchmarks/registration_baselines.py MAP DATA --name registration_lego
+
+Compared, alternately, each on one thread, on every frame of the test split:
+
+- ``open3d icp``: FPFH features and RANSAC, then point-to-plane ICP; no start;
+- ``open3d coloured icp``: the same, then coloured ICP;
+- ``auto``: ours; no start;
+- ``gicp``: small_gicp's GICP from the starts of protocol ``bid``, 0.5 off;
+- ``auto from start``: ours from the same starts;
+- ``auto + gicp``: GICP from the answer of ``auto``, which had no start.
+
+The map (``bidnerf bake`` must have been there) gives its surfels to the others; a frame gives every pixel with a depth.
+``--voxel`` is where tuning begins: 5 cm in rooms, or 2 % of what is seen. Voxels, distances and stages are chosen for each
+scene on frames whose place in the split is 1 modulo 5, and those do not count. Times begin with the frame in memory and
+the map's points, features and trees made.
+
+small_gicp comes with ``pip install '.[eval]'``. Open3D is large and is wanted nowhere else: give it its own environment,
+
+    python3.11 -m venv .venv-open3d && .venv-open3d/bin/pip install -c constraints.txt '.[eval]' open3d
+
+What is not installed is skipped. What is finished is kept in a ``.jsonl`` beside the record: an interrupted run goes on.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before any library counts the cores
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from kept import Kept
+from record import RESULTS, write_record
+from registration_clouds import Points, map_points, measured_points
+from registration_methods import Gicp, Matrix, Open3d, Ransac, Refine, SmallGicp
+from registration_tuning import Case, as_pose, cases, tuned_gicp, tuned_open3d
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.errors import CRITERIA, pose_error, success_rate
+from bidnerf_core.evaluation.protocols import bid
+from bidnerf_core.evaluation.trials import opened
+from bidnerf_core.frames import View
+from bidnerf_core.localization import localize, rig
+from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.se3 import SE3
+from bidnerf_core.storage import Map
+
+OFF = 0.5
+"""Size of the starts that are given."""
+
+OPEN3D: dict[str, type] = {"ransac": Ransac, "icp": Refine, "coloured icp": Refine}
+"""Settings by name, and of which kind they are."""
+
+Registration = Callable[[View, int], Matrix]
+"""T_world_camera of a view, whose own pose is for making a start from it only."""
+
+
+def auto(stored: Map, view: View, start: SE3 | None, seed: int) -> Matrix:
+    problem = rig(stored.field, stored.bounds, [view], start, surface=stored.surface)
+    return localize(problem, "auto", seed=seed).T_world_camera.matrix().numpy()
+
+
+def start_of(truth: SE3, seed: int) -> Matrix:
+    return bid(truth, OFF, seed).matrix().numpy()
+
+
+def tuning(stored: Map, views: Sequence[View], voxel: float, kept: Kept) -> dict[str, Any]:
+    """Settings by name, of what is installed."""
+    points = map_points(stored.surface)
+    tries = cases([(measured_points(view.frame), view.T_ref_camera) for view in views])
+    chosen: dict[str, Any] = {}
+    if find_spec("open3d"):
+        plain = kept.get(["tuned", "open3d"], lambda: open3d_settings(points, tries, voxel))
+        chosen = {name: from_plain(OPEN3D[name], plain[name], name) for name in OPEN3D}
+    if find_spec("small_gicp"):
+        given = [start_of(case.truth, i) for i, case in enumerate(tries)]
+        found = [auto(stored, views[i % len(views)], None, i) for i in range(len(tries))]
+        for name, starts in {"gicp": given, "auto + gicp": found}.items():
+            plain = kept.get(
+                ["tuned", name], partial(gicp_settings, points, tries, starts, voxel, name != "gicp")
+            )
+            chosen[name] = from_plain(Gicp, plain, name)
+    return chosen
+
+
+def open3d_settings(points: Points, tries: Sequence[Case], voxel: float) -> dict[str, Any]:
+    print("tuning Open3D", flush=True)
+    tuned = tuned_open3d(Open3d(points), tries, voxel)
+    return {name: to_plain(setting) for name, setting in zip(OPEN3D, tuned, strict=True)}
+
+
+def gicp_settings(
+    points: Points, tries: Sequence[Case], starts: Sequence[Matrix], voxel: float, near: bool
+) -> dict[str, Any]:
+    print("tuning small_gicp", flush=True)
+    plain: dict[str, Any] = to_plain(tuned_gicp(SmallGicp(points), tries, starts, voxel, near))
+    return plain
+
+
+def registrations(stored: Map, chosen: dict[str, Any]) -> dict[str, Registration]:
+    """By name, with all made of the map that can be made beforehand."""
+    points = map_points(stored.surface)
+    result: dict[str, Registration] = {
+        "auto": lambda view, seed: auto(stored, view, None, seed),
+        "auto from start": lambda view, seed: auto(
+            stored, view, as_pose(start_of(view.T_ref_camera, seed)), seed
+        ),
+    }
+    if "ransac" in chosen:
+        open3d = Open3d(points)
+
+        def searched(view: View, seed: int, refine: Refine) -> Matrix:
+            open3d.seed(seed)
+            measured = measured_points(view.frame)
+            return open3d.refine(measured, open3d.search(measured, chosen["ransac"]), refine)
+
+        result["open3d icp"] = lambda view, seed: searched(view, seed, chosen["icp"])
+        result["open3d coloured icp"] = lambda view, seed: searched(view, seed, chosen["coloured icp"])
+    if "gicp" in chosen:
+        gicp = SmallGicp(points)
+        result["gicp"] = lambda view, seed: gicp.refine(
+            measured_points(view.frame), start_of(view.T_ref_camera, seed), chosen["gicp"]
+        )
+        result["auto + gicp"] = lambda view, seed: gicp.refine(
+            measured_points(view.frame), auto(stored, view, None, seed), chosen["auto + gicp"]
+        )
+    return result
+
+
+def measured(run: Registration, view: View, seed: int) -> dict[str, Any]:
+    began, used = time.perf_counter(), time.process_time()
+    T = run(view, seed)
+    seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - used
+    error = pose_error(as_pose(T), view.T_ref_camera)
+    return {
+        "translation": float(error.translation),
+        "rotation_deg": float(error.rotation_deg),
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+    }
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def column(name: str) -> list[float]:
+        return [row[name] for row in rows]
+
+    result: dict[str, Any] = {"n": len(rows)}
+    for name in ("5deg 0.05", "1deg 0.02"):
+        bar: Any = CRITERIA[name]
+        good = [r["translation"] < bar.translation and r["rotation_deg"] < bar.rotation_deg for r in rows]
+        result[name] = asdict(success_rate(sum(good), len(rows)))
+    for name in ("translation", "rotation_deg", "seconds", "cpu_seconds"):
+        result[f"median_{name}"] = statistics.median(column(name))
+    return result | {"worst_seconds": max(column("seconds")), "worst_cpu_seconds": max(column("cpu_seconds"))}
+
+
+def times_slower(rows: dict[str, list[dict[str, Any]]], name: str, clock: str) -> float:
+    """Than ``auto``, median over frames: both had the machine in the same state."""
+    pairs = zip(rows[name], rows["auto"], strict=True)
+    return statistics.median(row[clock] / ours[clock] for row, ours in pairs)
+
+
+def versions() -> dict[str, str | None]:
+    found: dict[str, str | None] = {}
+    for name in ("open3d", "small_gicp"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+            print(f"{name} is not installed: skipped; see the head of this file")
+    return found
+
+
+def compared(stored: Map, views: Sequence[View], chosen: dict[str, Any], kept: Kept) -> dict[str, Any]:
+    """Rows by method, of the frames that settings were not tuned on."""
+    runs = registrations(stored, chosen)
+    names = list(runs)
+    for run in runs.values():  # what is done once only is not timed
+        run(views[1], 0)
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+    for place, view in enumerate(views):
+        if place % 5 == 1:
+            continue
+        shift = place % len(names)
+        for name in names[shift:] + names[:shift]:
+            row = kept.get([name, view.frame.name], lambda n=name, v=view, s=place: measured(runs[n], v, s))
+            rows[name].append({"frame": view.frame.name, **row})
+        print(".", end="", flush=True)
+    print()
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("map", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--name", required=True, help="of the record")
+    parser.add_argument("--voxel", type=float, default=0.05, help="metres")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    installed = versions()
+    stored, dataset = opened(str(given.map), str(given.data))
+    if stored.surface is None:
+        raise InputError(f"{given.map}: no baked surface, expected one as 'bidnerf bake' makes it")
+    views = dataset.views("test")
+    kept = Kept(RESULTS / f"{given.name}.partial.jsonl")
+    chosen = tuning(stored, views[1::5], given.voxel, kept)
+    rows = compared(stored, views, chosen, kept)
+    methods = {
+        name: summary(found)
+        | {f"{clock}_against_auto": times_slower(rows, name, clock) for clock in ("seconds", "cpu_seconds")}
+        for name, found in rows.items()
+    }
+    results = {
+        "map": given.map.name,
+        "data": given.data.name,
+        "versions": installed,
+        "start": f"bid:{OFF:g} for gicp and auto from start, none for the others",
+        "settings": {name: to_plain(setting) for name, setting in chosen.items()},
+        "methods": methods,
+        "rows": rows,
+    }
+    print(write_record(given.name, results, 0))
+    print(json.dumps(methods, indent=1))
+    kept.path.unlink()
+
+
+if __name__ == "__main__":
+    main()

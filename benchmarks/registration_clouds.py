@@ -1,0 +1,56 @@
+"""What registration of point clouds is given: the points of a baked map, and those that a frame measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.pixels import observe
+from bidnerf_core.se3 import SE3
+from bidnerf_core.surface import SurfaceMap
+
+WITNESSES = 24
+"""Keyframes that are asked which side of a surfel they see."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of one frame of reference, float64 as the libraries take them."""
+
+    positions: NDArray[np.float64]  # (n, 3), metres
+    rgb: NDArray[np.float64]  # (n, 3), 0 to 1
+    normals: NDArray[np.float64] | None = None  # (n, 3), unit, outwards
+
+
+def map_points(surface: SurfaceMap) -> Points:
+    """The surfels, their normals turned to where they were seen from: feature histograms depend on that."""
+    surfels = surface.surfels
+    normals = surfels.normals * _outwards(surface)[:, None]
+    return Points(*(part.double().numpy() for part in (surfels.positions, surfels.rgb, normals)))
+
+
+def measured_points(frame: Frame) -> Points:
+    """Every pixel that has a depth, in the frame of the camera."""
+    assert frame.depth is not None
+    rows, columns = (frame.depth > 0).nonzero().unbind(-1)
+    seen = observe(View(frame, SE3.identity()), torch.stack([columns, rows], dim=-1), torch.float64)
+    return Points((seen.distance[:, None] * seen.directions).numpy(), seen.rgb.numpy())
+
+
+def _outwards(surface: SurfaceMap) -> torch.Tensor:
+    """1 or -1 a surfel: the side on which most keyframes lie that see it; where none does, all are asked."""
+    keyframes = surface.keyframes[:: max(1, len(surface.keyframes) // WITNESSES)]
+    votes = torch.zeros((2, len(surface.surfels)))
+    for centre in keyframes[:, :3, 3].to(surface.surfels.positions):
+        way = surface.surfels.positions - centre
+        length = torch.linalg.vector_norm(way, dim=-1)
+        directions = way / length[:, None]
+        met = surface.trace(centre.expand_as(directions), directions)
+        side = -(directions * surface.surfels.normals).sum(-1).sign()
+        votes += torch.stack([side * (met > length - 2 * surface.cell), side])
+    decided = torch.where(votes[0] != 0, votes[0], votes[1])
+    return torch.where(decided < 0, -1.0, 1.0)
