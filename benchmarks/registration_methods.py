@@ -59,7 +59,7 @@ def ransac_neighbours(best: Ransac) -> Iterator[Ransac]:
     """What else may be tried once voxel and matching are chosen."""
     for distance in (0.8, 3.0):
         yield replace(best, distance=distance)
-    yield replace(best, iterations=1_000_000)
+    yield replace(best, iterations=300_000)
 
 
 def refine_choices(voxel: float, colour: bool) -> Iterator[Refine]:
