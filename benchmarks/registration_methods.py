@@ -50,7 +50,7 @@ class Gicp:
 
 def ransac_choices(voxel: float) -> Iterator[Ransac]:
     """About a voxel that is likely to do."""
-    for share in (0.7, 1.0, 1.6):
+    for share in (1.0, 1.6):
         for mutual in (False, True):
             yield Ransac(round(share * voxel, 4), mutual=mutual)
 
@@ -63,8 +63,8 @@ def ransac_neighbours(best: Ransac) -> Iterator[Ransac]:
 
 
 def refine_choices(voxel: float, colour: bool) -> Iterator[Refine]:
-    for voxels in ((voxel / 2,), (voxel, voxel / 2), (voxel, voxel / 2, voxel / 4)):
-        for distance in (0.4, 1.5, 3.0):
+    for voxels in ((voxel, voxel / 2), (voxel, voxel / 2, voxel / 4)):
+        for distance in (0.4, 1.5):
             yield Refine(colour, voxels, (distance,) * len(voxels))
 
 
