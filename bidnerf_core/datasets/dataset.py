@@ -95,6 +95,6 @@ def _not_there(name: str, names: Sequence[str], stems: Sequence[str]) -> str:
     if meant:
         listed = ", ".join(meant[:4]) + (", ..." if len(meant) > 4 else "")
         return f"frame {name!r} is ambiguous, expected one of {listed}"
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
-    hint = f", did you mean {near[0]!r}?" if near else ""
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f", did you mean {near[0]!r}?" if near else f", expected a name as {names[0]!r}" if names else ""
     return f"no frame {name!r} among its {len(names)} frames{hint}"
