@@ -203,7 +203,7 @@ def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("words", "status", "expected"),
     [
-        (["{map}"], 2, "1 folders given"),
+        (["{map}"], 2, "1 folder given, expected"),
         (["{map}", "{data}", "--trials", "0"], 2, "--trials is 0"),
         (["{map}", "{data}", "--frame", "r_77"], 1, "r_77"),
         (["{map}", "{data}", "--protocol", "bib"], 1, "did you mean 'bid'"),

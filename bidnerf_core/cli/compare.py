@@ -75,7 +75,8 @@ def run(arguments: list[str]) -> None:
         """
         if len(folders) < 2:
             raise UsageError(
-                f"{len(folders)} folders given, expected one of a map or more, then that of a dataset"
+                f"{len(folders)} folder{'s' if len(folders) != 1 else ''} given, "
+                "expected one of a map or more, then that of a dataset"
             )
         *maps, data = folders
         chosen = find_protocol(protocol)
