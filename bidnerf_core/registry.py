@@ -17,13 +17,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
 from importlib.machinery import ModuleSpec, PathFinder
-from importlib.metadata import Distribution, EntryPoint, distributions
-from typing import Any, cast
+from importlib.metadata import distributions
+from typing import Any, TypeAlias, cast
 
 from bidnerf_core.backend import Backend
 from bidnerf_core.errors import InputError
 
 GROUP = "bidnerf.backends"
+
+Distribution: TypeAlias = Any
+EntryPoint: TypeAlias = Any
+"""As in ``importlib.metadata``. Once the backport ``importlib_metadata`` is imported, by whomever, it answers with classes
+of its own that are no subclasses of these."""
 
 UNREADABLE = "?"
 """Stands for the name of entry points that cannot be read."""

@@ -350,3 +350,11 @@ def test_a_distribution_installed_by_pip_is_found(new_site: Callable[[str], Site
     (info,) = listed("stone")
     assert (info.distribution, info.version, info.summary) == ("stranger-real", "3.1", "A field of stone.")
     assert load_backend("stone").summary == "a field of stone"
+
+
+def test_the_backport_may_answer_in_place_of_the_library() -> None:
+    """Some packages import ``importlib_metadata``, which then finds all distributions, with classes of its own."""
+    pytest.importorskip("importlib_metadata")
+    code = "import importlib_metadata; from bidnerf_core import list_backends; print(*(b.name for b in list_backends()))"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert {"adanerf", "hashgrid", "vanilla"} <= set(shown.split())
