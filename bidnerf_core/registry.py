@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
 from importlib.machinery import ModuleSpec, PathFinder
-from importlib.metadata import distributions
+from importlib.metadata import EntryPoint, distributions
 from typing import Any, TypeAlias, cast
 
 from bidnerf_core.backend import Backend
@@ -25,8 +25,8 @@ from bidnerf_core.errors import InputError
 
 GROUP = "bidnerf.backends"
 
-Distribution: TypeAlias = Any
-EntryPoint: TypeAlias = Any
+AnyDistribution: TypeAlias = Any
+AnyEntryPoint: TypeAlias = Any
 """As in ``importlib.metadata``. Once the backport ``importlib_metadata`` is imported, by whomever, it answers with classes
 of its own that are no subclasses of these."""
 
@@ -77,9 +77,9 @@ def load_backend(name: str) -> Backend:
 # Reading metadata: whatever is wrong with a stranger's files is the stranger's affair.
 
 
-def _installed() -> Iterator[tuple[Distribution, tuple[str, ...]]]:
+def _installed() -> Iterator[tuple[AnyDistribution, tuple[str, ...]]]:
     """Distributions as ``import`` sees them, the first on sys.path, each with the versions that it hides."""
-    copies: dict[str, list[Distribution]] = {}
+    copies: dict[str, list[AnyDistribution]] = {}
     for dist in distributions():
         copies.setdefault(_normalized(_label(dist)), []).append(dist)
     for first, *others in copies.values():
@@ -87,7 +87,7 @@ def _installed() -> Iterator[tuple[Distribution, tuple[str, ...]]]:
         yield first, tuple(dict.fromkeys(v for v in map(_version, others) if v != shown))
 
 
-def _declared(dist: Distribution, hidden: tuple[str, ...]) -> Iterator[BackendInfo]:
+def _declared(dist: AnyDistribution, hidden: tuple[str, ...]) -> Iterator[BackendInfo]:
     about = BackendInfo(UNREADABLE, UNREADABLE, _label(dist), _version(dist), hidden=hidden)
     try:
         points = tuple(dist.entry_points.select(group=GROUP))
@@ -99,7 +99,7 @@ def _declared(dist: Distribution, hidden: tuple[str, ...]) -> Iterator[BackendIn
         yield _read(replace(about, name=point.name, value=point.value), point, dist)
 
 
-def _read(info: BackendInfo, point: EntryPoint, dist: Distribution) -> BackendInfo:
+def _read(info: BackendInfo, point: AnyEntryPoint, dist: AnyDistribution) -> BackendInfo:
     fallback = _metadata(dist, "Summary") or ""
     try:
         module = point.module  # fails where the value has not the form of a reference
@@ -127,7 +127,7 @@ def _with_rivals(infos: list[BackendInfo]) -> Iterator[BackendInfo]:
             yield info
 
 
-def _metadata(dist: Distribution, key: str) -> str | None:
+def _metadata(dist: AnyDistribution, key: str) -> str | None:
     try:
         values = dist.metadata.get_all(key)
     except Exception:
@@ -135,11 +135,11 @@ def _metadata(dist: Distribution, key: str) -> str | None:
     return str(values[0]) if values else None
 
 
-def _label(dist: Distribution) -> str:
+def _label(dist: AnyDistribution) -> str:
     return _metadata(dist, "Name") or f"unnamed distribution {getattr(dist, '_path', id(dist))}"
 
 
-def _version(dist: Distribution) -> str:
+def _version(dist: AnyDistribution) -> str:
     return _metadata(dist, "Version") or "of unknown version"
 
 
@@ -147,7 +147,7 @@ def _normalized(name: str) -> str:
     return name.lower().replace("-", "_").replace(".", "_")
 
 
-def _mentions_group(dist: Distribution) -> bool:
+def _mentions_group(dist: AnyDistribution) -> bool:
     try:
         return GROUP in (dist.read_text("entry_points.txt") or "")
     except Exception:
