@@ -11,7 +11,7 @@ from bidnerf_core.cli import main
 
 distributed = pytest.importorskip("distributed")
 
-WORDS = ["--trials", "6", "--size", "0.3", "--rays", "16", "--max-steps", "2"]
+WORDS = ["--trials", "6", "--size", "0.3", "--method", "bid", "--rays", "16", "--max-steps", "2"]
 
 
 def test_two_dask_workers_give_the_results_of_one_process(tmp_path: Path) -> None:
