@@ -191,12 +191,12 @@ def _result(
 
 
 def _device(name: str) -> torch.device:
+    """One that computes here: its name alone does not tell."""
     try:
         device = torch.device(name)
-    except RuntimeError as error:
-        raise InputError(f"no device {name!r}, expected one as cpu or cuda") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"device {name!r}: torch finds no CUDA here, expected cpu")
+        torch.ones((), device=device).item()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise InputError(f"no device {name!r} to compute on here, expected one as cpu or cuda") from error
     return device
 
 
