@@ -16,7 +16,7 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, BidLmConfig, InerfLmConfig, localize, rig, single
-from bidnerf_core.localization.cloud import cloud
+from bidnerf_core.localization.neighbours import neighbours
 from bidnerf_core.localization.photometric import refine
 from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.ray_batch import blurred
@@ -164,13 +164,13 @@ def test_the_covariance_is_the_cameras_whatever_the_pivot() -> None:
 
 
 def test_the_cloud_is_even_and_holds_the_start() -> None:
-    poses = cloud(TRUTH, 512, 0.2, 0.1, seed=0)
+    poses = neighbours(TRUTH, 512, 0.2, 0.1, seed=0)
     xi = (SE3(TRUTH.rotation[None], TRUTH.translation[None]).inverse() @ poses).log()
     assert float(xi[0].abs().max()) < 1e-9
     expected = torch.tensor([0.2] * 3 + [0.1] * 3, dtype=torch.float64)
     torch.testing.assert_close(xi.std(0), expected, rtol=0.1, atol=0)
     assert float(xi.mean(0).abs().max()) < 0.01
-    assert cloud(TRUTH, 1, 0.2, 0.1, seed=0).translation.shape == (1, 3)
+    assert neighbours(TRUTH, 1, 0.2, 0.1, seed=0).translation.shape == (1, 3)
 
 
 @pytest.mark.parametrize("size", [2, 3, 7, 100])

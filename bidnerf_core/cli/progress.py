@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType, TracebackType
+from typing import TypeVar
 
 from rich.progress import (
     BarColumn,
@@ -30,7 +31,30 @@ CHECKPOINT_SECONDS = 60.0
 LINE_EVERY = 10.0  # seconds, where stderr is no terminal
 
 
-class StoredTraining:
+Bar = TypeVar("Bar", bound="StoppableBar")
+
+
+class StoppableBar:
+    """A context that shows a bar and hears Ctrl-C by ``_interrupt``, and leaves the terminal and the signal as they were."""
+
+    _bar: Progress
+
+    def __enter__(self: Bar) -> Bar:
+        self._previous = signal.signal(signal.SIGINT, self._interrupt)
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+        signal.signal(signal.SIGINT, self._previous)
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+
+class StoredTraining(StoppableBar):
     """The ``Report`` of a training that keeps its map in a folder. Use as a context: Ctrl-C then stops after a step."""
 
     def __init__(
@@ -83,17 +107,6 @@ class StoredTraining:
         if not self._complete and isinstance(field, nn.Module):
             self.total = self._step
             self.save(TrainingState(self._step, field.state_dict(), {}))
-
-    def __enter__(self) -> StoredTraining:
-        self._previous = signal.signal(signal.SIGINT, self._interrupt)
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
-        signal.signal(signal.SIGINT, self._previous)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self.stopping:  # asked twice: at once, back to the last checkpoint

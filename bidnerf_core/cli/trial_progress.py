@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import time
-from types import FrameType, TracebackType
+from types import FrameType
 
 from rich.progress import (
     BarColumn,
@@ -15,13 +14,12 @@ from rich.progress import (
 )
 
 from bidnerf_core.cli.common import console, say
+from bidnerf_core.cli.progress import LINE_EVERY, StoppableBar
 from bidnerf_core.evaluation.errors import CRITERIA
 from bidnerf_core.evaluation.trials import TrialResult
 
-LINE_EVERY = 10.0  # seconds, where stderr is no terminal
 
-
-class TrialProgress:
+class TrialProgress(StoppableBar):
     """Use as a context: Ctrl-C then waits for the trials under way; a second one does not."""
 
     def __init__(self, total: int, at_once: int) -> None:
@@ -49,17 +47,6 @@ class TrialProgress:
         """Seconds; at first the workers are all still at their first trial, so the last of them counts more."""
         each = (time.monotonic() - self._began) / self.count
         return each * (self.total - self.count)
-
-    def __enter__(self) -> TrialProgress:
-        self._previous = signal.signal(signal.SIGINT, self._interrupt)
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
-        signal.signal(signal.SIGINT, self._previous)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self.stopping:

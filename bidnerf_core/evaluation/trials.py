@@ -195,7 +195,7 @@ def _device(name: str) -> torch.device:
     try:
         device = torch.device(name)
         torch.ones((), device=device).item()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
+    except (RuntimeError, AssertionError) as error:  # torch's own builds differ in which
         raise InputError(f"no device {name!r} to compute on here, expected one as cpu or cuda") from error
     return device
 

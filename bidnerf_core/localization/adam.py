@@ -6,17 +6,16 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.interest import DrawerName
 from bidnerf_core.localization.pivots import Pivot, PivotName, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.sampled import RayCounts, SampledLoss
+from bidnerf_core.localization.settings import Judged
 from bidnerf_core.localization.trail import AnswerName, Trail
 from bidnerf_core.residuals import Objective
 from bidnerf_core.robust import RobustName
@@ -26,7 +25,7 @@ Loss = Callable[[SE3], Tensor]
 
 
 @dataclass(frozen=True)
-class DescentConfig:
+class DescentConfig(Judged):
     """Settings that all first-order methods share."""
 
     rays: int = 2048  # in all, shared out equally among the views
@@ -54,19 +53,6 @@ class DescentConfig:
         self._require_one_of(pixels=DrawerName, colour_loss=RobustName, pivot=PivotName, answer=AnswerName)
         for name in ("stop_loss", "stop_step", "converged_loss"):
             self._require_not_negative(name)
-
-    def _require_one_of(self, **kinds: Any) -> None:
-        for name, kind in kinds.items():
-            known = get_args(kind)
-            self._require(name, getattr(self, name) in known, f"one of {', '.join(known)}")
-
-    def _require_not_negative(self, name: str) -> None:
-        value = getattr(self, name)
-        self._require(name, math.isfinite(value) and value >= 0, "a number, 0 or more")
-
-    def _require(self, name: str, fits: bool, expected: str) -> None:
-        if not fits:
-            raise InputError(f"{name} is {getattr(self, name)}, expected {expected}")
 
 
 def descend(

@@ -118,18 +118,15 @@ def alignment(surface: SurfaceMap, cloud: Cloud, scales: Scales, T: SE3) -> Syst
 def misfit(surface: SurfaceMap, cloud: Cloud, scales: Scales, T: SE3) -> Float[Tensor, "h"]:
     """Weighted mean of the squared residuals of ``alignment``, in units of their scales: the variance of one of them."""
     touch = contact(surface, cloud, T)
-    near = falling(touch.squared, scales.distance)
-    distance = touch.squared / scales.distance**2
     tint, _ = colours(surface, touch, cloud)
-    tinted = (tint**2).sum(-1) / scales.colour**2
-    weights = torch.stack(
-        [near**2, scales.colour_weight * near * falling((tint**2).sum(-1), scales.colour) ** 2]
-    )
-    total = (weights * torch.stack([distance, tinted])).sum((0, -1))
+    squared = torch.stack([touch.squared / scales.distance**2, (tint**2).sum(-1) / scales.colour**2])
+    near, alike = falling(squared, 1.0)
+    weights = torch.stack([near**2, scales.colour_weight * near * alike**2])
+    total = (weights * squared).sum((0, -1))
     return (total / weights.sum((0, -1)).clamp(min=1e-12)).double()
 
 
-def falling(squared: Float[Tensor, "h p"], scale: float) -> Float[Tensor, "h p"]:
+def falling(squared: Float[Tensor, "*s h p"], scale: float) -> Float[Tensor, "*s h p"]:
     """1 at 0, a half at ``scale``."""
     return 1 / (1 + squared / scale**2)
 

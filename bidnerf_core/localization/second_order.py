@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
-from typing import Any, get_args
 
 from torch import Generator
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.interest import DrawerName
-from bidnerf_core.localization.cloud import cloud
+from bidnerf_core.localization.neighbours import neighbours
 from bidnerf_core.localization.photometric import Refined, refine
 from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.settings import Judged
 from bidnerf_core.localization.stages import Refinement, Stage
 from bidnerf_core.robust import RobustName
 
 
 @dataclass(frozen=True)
-class SecondOrderConfig:
+class SecondOrderConfig(Judged):
     """Settings that both methods share."""
 
     poses: int = 32  # looked at first: the start, and others about it; 1: the start alone
@@ -63,19 +61,6 @@ class SecondOrderConfig:
             self._require_not_negative(name)
         self._require_not_negative("converged_step")
 
-    def _require_one_of(self, **kinds: Any) -> None:
-        for name, kind in kinds.items():
-            known = get_args(kind)
-            self._require(name, getattr(self, name) in known, f"one of {', '.join(known)}")
-
-    def _require_not_negative(self, name: str) -> None:
-        value = getattr(self, name)
-        self._require(name, math.isfinite(value) and value >= 0, "a number, 0 or more")
-
-    def _require(self, name: str, fits: bool, expected: str) -> None:
-        if not fits:
-            raise InputError(f"{name} is {getattr(self, name)}, expected {expected}")
-
 
 @dataclass(frozen=True)
 class Depth:
@@ -103,7 +88,7 @@ def second_order(
 ) -> Localization:
     """From ``problem.start`` through all stages."""
     began = time.perf_counter()
-    start = cloud(
+    start = neighbours(
         problem.start_for(method), config.poses, config.spread_translation, config.spread_rotation, seed
     )
     found = refine(problem, start, stages(config, depth), settings, Generator().manual_seed(seed))

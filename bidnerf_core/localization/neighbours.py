@@ -8,7 +8,7 @@ from torch.quasirandom import SobolEngine
 from bidnerf_core.se3 import SE3
 
 
-def cloud(T: SE3, count: int, translation: float, rotation: float, seed: int) -> SE3:
+def neighbours(T: SE3, count: int, translation: float, rotation: float, seed: int) -> SE3:
     """``T`` and ``count`` - 1 more: right updates of it that are spread evenly under a normal distribution.
 
     ``translation`` (metres) and ``rotation`` (radians) are its standard deviations along and about each axis of the
