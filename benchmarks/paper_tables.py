@@ -141,8 +141,9 @@ def main() -> None:
     for part in given.part:
         for folder in given.map:
             base = Plan(
-                folder, given.data, seed=given.seed, device=given.device, frames=untuned(folder, given.data)
-            )
+                folder, given.data, method="bid", seed=given.seed, device=given.device,
+                frames=untuned(folder, given.data),
+            )  # fmt: skip
             plans = PARTS[part](base, common, given.trials)
             trials = [trial for plan in plans for trial in planned(plan)]
             name = f"{part}_{trials[0].portable.map.replace(':', '_')}"
