@@ -54,6 +54,15 @@ class DepthRays:
             torch.cat([p.distance[p.distance > 0] for p in parts]),
         )
 
+    @staticmethod
+    def joined(parts: Sequence[DepthRays]) -> DepthRays:
+        """All of them, of one reference frame."""
+        return DepthRays(
+            torch.cat([part.origins for part in parts]),
+            torch.cat([part.directions for part in parts]),
+            torch.cat([part.distance for part in parts]),
+        )
+
     def drawn(
         self,
         count: int,

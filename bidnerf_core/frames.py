@@ -11,6 +11,9 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.se3 import SE3
 
+SPARSE = 0.05
+"""Share of an image's pixels under which measured depth is that of a few points: it tells of them, not of what is between."""
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -42,6 +45,11 @@ class Frame:
     @property
     def has_depth(self) -> bool:
         return self.depth is not None and bool((self.depth > 0).any())
+
+    @property
+    def has_dense_depth(self) -> bool:
+        """Whether more than a few points were measured."""
+        return self.depth is not None and float((self.depth > 0).float().mean()) >= SPARSE
 
 
 @dataclass(frozen=True, eq=False)

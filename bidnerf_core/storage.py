@@ -63,6 +63,7 @@ class MapInfo:
     data: str = ""  # name of the dataset's folder
     seconds: float = 0.0  # of training
     cameras: tuple[StoredCamera, ...] = ()
+    sparse_depth: int = 0  # pixels of the training images that had their depth from structure from motion
     weights: str = ""  # file names
     training: str | None = None  # what resuming needs; dropped when training is complete
     surface: str | None = None  # baked from these weights
@@ -146,6 +147,11 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
         (c.intrinsics, SE3.from_matrix(torch.tensor(c.T_world_camera, dtype=torch.float64)))
         for c in info.cameras
     ]
+
+
+def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
+    """Names of the training images, and T_world_camera, float64."""
+    return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
 
 
 def load_info(folder: Path) -> MapInfo:

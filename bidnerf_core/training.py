@@ -8,12 +8,15 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import Rays, SceneBounds
-from bidnerf_core.frames import View
+from bidnerf_core.frames import SPARSE, View
+
+MEASURED_SHARE = 0.25
+"""Of the rays of a batch, at measured pixels, where these are so few that hardly any would be drawn (in DS-NeRF: half)."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,7 @@ class RayBank:
         if self.has_depth:
             zero = [torch.zeros(f.rgb.shape[:2]) if f.depth is None else f.depth for f in frames]
             self._depth = torch.cat([d.reshape(-1) for d in zero])
+        self._few = self._few_measured()
         self._rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
         self._origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
         kinds = list(dict.fromkeys(frame.intrinsics for frame in frames))
@@ -125,8 +129,11 @@ class RayBank:
         self._camera_start = torch.stack([starts[kinds.index(frame.intrinsics)] for frame in frames])
 
     def draw(self, count: int, generator: Generator) -> RayBatch:
-        """``count`` pixels of all views, uniformly."""
+        """``count`` pixels of all views, uniformly; some of them where depth was measured, if that is in few places."""
         index = torch.randint(self.count, (count,), generator=generator)
+        if len(self._few):
+            some = round(MEASURED_SHARE * count)
+            index[:some] = self._few[torch.randint(len(self._few), (some,), generator=generator)]
         view = torch.searchsorted(self.offsets, index, right=True) - 1
         ray = self._camera_rays[self._camera_start[view] + index - self.offsets[view]]
         length = torch.linalg.vector_norm(ray, dim=-1)
@@ -134,6 +141,13 @@ class RayBank:
         distance = self._depth[index] * length if self.has_depth else torch.zeros(count)
         rgb, background = self._coloured(index, generator)
         return RayBatch(self.bounds.rays(self._origin[view], directions), rgb, distance, background)
+
+    def _few_measured(self) -> Int[Tensor, "m"]:
+        """Indices of the pixels with depth, where those are a few points of all (structure from motion); else none."""
+        if not self.has_depth:
+            return torch.zeros(0, dtype=torch.long)
+        measured = (self._depth > 0).nonzero()[:, 0]
+        return measured if len(measured) < SPARSE * self.count else measured[:0]
 
     def _coloured(self, index: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
         usual = torch.tensor(self.bounds.background).expand(len(index), 3)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.carving.boxes import Box, corner, grown, rays_of
+from bidnerf_core.carving.boxes import MARGIN, Box, corner, grown, rays_of
 from bidnerf_core.carving.hull import carved_box, has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
@@ -16,6 +16,7 @@ from bidnerf_core.frames import View
 
 OUTLIERS = 1e-3  # the part of measured points at either end of each axis that may be wrong
 POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements that are looked at: in all, and at least of each view
+SPARSE_MARGIN = 0.1  # of the box's size, at each end, where a few points are all that was measured
 FAR_MARGIN = 1.1  # a camera may stand a little farther off than any of the views did
 LEAST_NEAR = 0.01  # of far, where cameras stand in the box and nothing was measured
 LEAST_SPREAD = 0.01  # mean squared sine of the angles between optical axes and their mean: about 6 degrees
@@ -28,7 +29,7 @@ def estimate_bounds(
 ) -> SceneBounds:
     """The box that holds what ``views`` (poses in the world) show, and how near and far it is from their cameras.
 
-    With depth (in half of the views, or where there are no silhouettes): the middle 99.8 % along each axis of what was
+    With depth (dense in half of the views, or any where there are no silhouettes): the middle 99.8 % along each axis of what was
     measured. With silhouettes (alpha): the visual hull. With colour only it is a guess: of cameras that look inward, a
     cube about the point they look at, as large as an image is there; of others (a room), the box of the cameras and of
     all that they have in sight within ``ROOM`` times the extent of their places. Raises ``InputError`` where colour is
@@ -37,9 +38,10 @@ def estimate_bounds(
     if not views:
         raise InputError("scene bounds: no views to estimate them from")
     measured = [view for view in views if view.frame.has_depth]
+    dense = [view for view in measured if view.frame.has_dense_depth]
     outlined = [view for view in views if has_outline(view)]
-    if measured and (2 * len(measured) >= len(views) or not outlined):
-        box, near = _measured_box(measured)
+    if measured and (2 * len(dense) >= len(views) or not outlined):
+        box, near = _measured_box(measured, MARGIN if dense else SPARSE_MARGIN)
         far = _farthest(views, box)
     else:
         box = _guessed_box(views)
@@ -50,7 +52,7 @@ def estimate_bounds(
     return SceneBounds(corner(box[0]), corner(box[1]), near, FAR_MARGIN * far, background)
 
 
-def _measured_box(views: Sequence[View]) -> tuple[Box, float]:
+def _measured_box(views: Sequence[View], margin: float) -> tuple[Box, float]:
     """Box of the points that depth images show, and half the least distance from a camera; both without outliers."""
     share = max(POINTS_OF_VIEW, POINTS // len(views))
     parts = [measured_points(view, share) for view in views]
@@ -58,7 +60,7 @@ def _measured_box(views: Sequence[View]) -> tuple[Box, float]:
     last = len(points) - 1
     first = round(OUTLIERS * last)
     ordered, nearest = points.sort(dim=0).values, distances.sort().values[first].item()
-    return grown(ordered[first], ordered[last - first], at_least=nearest / 100), nearest / 2
+    return grown(ordered[first], ordered[last - first], nearest / 100, margin), nearest / 2
 
 
 def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:

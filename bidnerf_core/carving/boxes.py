@@ -17,10 +17,12 @@ Box: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
 MARGIN = 0.03  # of the box's size, at each end
 
 
-def grown(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0) -> Box:
+def grown(
+    lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = MARGIN
+) -> Box:
     """By a margin; a box without thickness gets some."""
     size = upper - lower
-    margin = torch.maximum(size * MARGIN, size.amax() * 0.01).clamp(min=at_least)
+    margin = torch.maximum(size * share, size.amax() * 0.01).clamp(min=at_least)
     return lower - margin, upper + margin
 
 

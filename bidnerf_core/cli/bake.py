@@ -50,6 +50,8 @@ def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
     began = time.monotonic()
     stored = load_map(folder, surface=False)  # which may be damaged, and is to be replaced
     measured = [view for view in views if view.frame.has_depth]
+    if not any(view.frame.has_dense_depth for view in measured):
+        measured = []  # a few points are no surface
     cameras = [] if measured else cameras_of(stored.info)
     if not (measured or cameras):
         raise InputError(

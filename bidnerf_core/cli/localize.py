@@ -29,7 +29,9 @@ from bidnerf_core.cli.common import (
     value_of,
 )
 from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.points import read_depth_points
+from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.evaluation.errors import PoseError, pose_error
@@ -39,7 +41,7 @@ from bidnerf_core.localization import METHODS, InerfConfig, Localization, find_m
 from bidnerf_core.localization import localize as find_pose
 from bidnerf_core.localization import window as windowed
 from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import load_map
+from bidnerf_core.storage import MapInfo, load_map, places_of
 
 one_of = tyro.conf.create_mutex_group(required=True, title="where to start")
 
@@ -64,7 +66,8 @@ class Seen:
     split: str
     frames: Sequence[str]
     window: int
-    depth_points: Path | None
+    depth_points: Path | None  # a file, or the folder of a COLMAP model
+    choice: SparseChoice
 
     def judge(self) -> None:
         if not self.frames:
@@ -83,6 +86,16 @@ class Seen:
             if names[0] in listed:  # else the dataset will tell
                 names = windowed(listed, listed.index(names[0]), self.window)
         return read_views(dataset, self.split, names)
+
+    def depth_rays(self, views: Sequence[View], info: MapInfo) -> DepthRays | None:
+        """What ``depth_points`` holds for these views, in the frame of the last one's camera."""
+        if self.depth_points is None or not self.depth_points.is_dir():
+            return None if self.depth_points is None else read_depth_points(self.depth_points)
+        sparse = SparsePoints(self.depth_points, places_of(info), self.choice)
+        rays = sparse.rays(views, self.split)
+        blind = [v.frame.name for v in views if len(sparse.seen(v.frame.name, self.split)) == 0]
+        say(f"{sparse.summary}; {len(rays)} points seen{', none by ' + ', '.join(blind) if blind else ''}")
+        return rays
 
 
 def run(arguments: list[str]) -> None:
@@ -110,11 +123,15 @@ def run(arguments: list[str]) -> None:
         depth_points: Annotated[
             Path | None,
             option(
-                "FILE", "points that a sensor measured from there, metres: x y z a row, .npy, or .npz", ""
+                "FILE",
+                "points that a sensor measured from there, metres: x y z a row, .npy, or .npz; or the folder of a "
+                "COLMAP sparse model, of which the points that the frames observe are taken",
+                "",
             ),
         ] = None,
         seed: Annotated[int, option("N", "of all that is drawn at random")] = 0,
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
+        choice: SparseChoice = SparseChoice(),
         config: Any = kind(),
     ) -> None:
         """Find the pose of a dataset's frame in a map.
@@ -123,7 +140,7 @@ def run(arguments: list[str]) -> None:
         last one's camera. Poses are camera to world, OpenCV axes (x right, y down, z forward); so are points, unless a .npz
         has T_camera_sensor beside them.
         """
-        seen = Seen(split, [name for group in frame for name in group], window, depth_points)
+        seen = Seen(split, [name for group in frame for name in group], window, depth_points, choice)
         _localize(map, data, seen, method, Beginning(start, perturb), seed, json, config)
 
     localize.__annotations__["config"] = kind
@@ -137,7 +154,7 @@ def _localize(
     require("--seed", seed, 0, LARGEST_SEED)
     stored = load_map(folder)
     views = seen.views(open_dataset(data, stored.bounds.background))
-    depth_rays = None if seen.depth_points is None else read_depth_points(seen.depth_points)
+    depth_rays = seen.depth_rays(views, stored.info)
     if depth_rays is not None and isinstance(config, InerfConfig):
         say(f"{seen.depth_points}: method inerf heeds no depth")
     truth = views[-1].T_ref_camera

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +24,8 @@ from bidnerf_core.cli.common import (
     value_of,
 )
 from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.plain import to_plain
@@ -31,6 +33,35 @@ from bidnerf_core.registry import load_backend
 from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
 from bidnerf_core.surface import BakeConfig
 from bidnerf_core.training import TrainingStopped
+
+
+@dataclass(frozen=True)
+class Source:
+    """What the user says of where the views come from."""
+
+    data: Path
+    split: str
+    background: str | None
+    depth_points: Path | None  # folder of a COLMAP model
+    choice: SparseChoice
+
+    def views(self, dataset: Dataset) -> tuple[list[View], int]:
+        """Views of the split, and how many pixels of them have their depth from points."""
+        plain = read_views(dataset, self.split)
+        if self.depth_points is None:
+            return plain, 0
+        places = [(view.frame.name, view.T_ref_camera) for view in plain]
+        sparse = SparsePoints(self.depth_points, places, self.choice, self.split)
+        views = [sparse.onto(view, self.split) for view in plain]
+        changed = [new for new, old in zip(views, plain, strict=True) if new is not old]
+        count = sum(int((view.frame.depth > 0).sum()) for view in changed if view.frame.depth is not None)
+        if count == 0:
+            raise InputError(
+                f"{self.depth_points}: gives no depth to split {self.split!r}, expected points that its images observe"
+                " and images without depth"
+            )
+        say(f"{sparse.summary}; depth at {count} pixels of {len(changed)} of {len(views)} images")
+        return views, count
 
 
 def run(arguments: list[str]) -> None:
@@ -53,7 +84,12 @@ def run(arguments: list[str]) -> None:
         checkpoint_every: Annotated[
             float, option("SECONDS", "how much work an interruption may cost")
         ] = CHECKPOINT_SECONDS,
+        depth_points: Annotated[
+            Path | None,
+            option("MODEL", "COLMAP sparse model: its points are the depth of images that have none", ""),
+        ] = None,
         no_bake: Annotated[Flag, option(None, "do without the surface; 'bidnerf bake' adds it", "")] = False,
+        choice: SparseChoice = SparseChoice(),
         config: Any = kind(),
     ) -> None:
         """Make a map of a dataset.
@@ -64,14 +100,15 @@ def run(arguments: list[str]) -> None:
         require("--checkpoint-every", checkpoint_every, 0)
         if resume and overwrite:
             raise UsageError("--resume goes on with a map, --overwrite begins anew; expected one of them")
+        source = Source(data, split, background, depth_points, choice)
         try:
             if resume:
                 info = load_interrupted(out)
                 _check_unchanged(out, info, named, kind(), config)
-                _resume(info, data, out, split, background, checkpoint_every, not no_bake)
+                _resume(info, source, out, checkpoint_every, not no_bake)
             else:
                 with output_folder(out, overwrite):
-                    _start(chosen, name, data, out, split, background, config, checkpoint_every, not no_bake)
+                    _start(chosen, name, source, out, config, checkpoint_every, not no_bake)
         except TrainingStopped as stopped:
             say(f"{out}: saved after step {stopped.step}; the same with --resume goes on from there")
             raise KeyboardInterrupt from stopped
@@ -83,11 +120,14 @@ def run(arguments: list[str]) -> None:
 def train_map(
     backend: Backend, name: str, views: Sequence[View], config: Any, out: Path, data: str,
     background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS, baked: bool = True,
+    sparse_depth: int = 0,
 ) -> None:  # fmt: skip
     """A new map in folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
     bounds = estimate_bounds(views, background)
     settings = to_plain(config, "config")
-    info = MapInfo(name, settings, bounds, 0, False, data, cameras=stored_cameras(views))
+    info = MapInfo(
+        name, settings, bounds, 0, False, data, cameras=stored_cameras(views), sparse_depth=sparse_depth
+    )
     with output_folder(out, overwrite=True):
         _run(backend, info, out, views, checkpoint_seconds, baked)
 
@@ -127,29 +167,35 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
 
 
 def _start(
-    backend: Backend, name: str, data: Path, out: Path, split: str, background: str | None, config: Any,
-    checkpoint_seconds: float, baked: bool,
+    backend: Backend, name: str, source: Source, out: Path, config: Any, checkpoint_seconds: float, baked: bool
 ) -> None:  # fmt: skip
-    dataset = open_dataset(data, background)
-    views = read_views(dataset, split)
+    dataset = open_dataset(source.data, source.background)
+    views, sparse_depth = source.views(dataset)
     if not any(view.frame.has_depth for view in views):
-        say(f"{data}: no measured depth in split {split!r}; training on colour only")
+        say(f"{source.data}: no measured depth in split {source.split!r}; training on colour only")
     train_map(
-        backend, name, views, config, out, data.resolve().name, dataset.background, checkpoint_seconds, baked
-    )
+        backend, name, views, config, out, source.data.resolve().name, dataset.background, checkpoint_seconds,
+        baked, sparse_depth,
+    )  # fmt: skip
 
 
 def _resume(
-    info: MapInfo, data: Path, out: Path, split: str, background: str | None, checkpoint_seconds: float, baked: bool
+    info: MapInfo, source: Source, out: Path, checkpoint_seconds: float, baked: bool
 ) -> None:  # fmt: skip
+    data, split, background = source.data, source.split, source.background
     dataset = open_dataset(data, info.bounds.background if background is None else background)
     if dataset.background != info.bounds.background:
         raise UsageError(f"{out}: was begun over background {info.bounds.background}, got {background!r}")
-    views = read_views(dataset, split)
+    views, sparse_depth = source.views(dataset)
     if stored_cameras(views) != info.cameras:
         raise InputError(
             f"{data}: split {split!r} has other frames or poses than {out} was begun with, expected those of"
             f" {info.data!r} unchanged"
+        )
+    if sparse_depth != info.sparse_depth:
+        raise UsageError(
+            f"{out}: was begun with the depth of {info.sparse_depth} pixels from points, got {sparse_depth}; "
+            "--resume keeps --depth-points and what goes with it"
         )
     with output_folder(out, overwrite=True):
         _run(load_backend(info.backend), info, out, views, checkpoint_seconds, baked)

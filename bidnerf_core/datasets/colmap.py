@@ -1,0 +1,195 @@
+"""What a COLMAP sparse model knows of a dataset's frames: for each, the points that it observes, in metres.
+
+Images of the model and frames of the dataset are matched by name. The model has a world and a unit of its own; how long
+the unit is comes from the places of the training cameras, which both know. No other pose is looked at.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.datasets.colmap_files import ModelImage, ModelPoints, read_model
+from bidnerf_core.datasets.similarity import fit_similarity, spread
+from bidnerf_core.depth_rays import DepthRays
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+from bidnerf_core.se3 import SE3
+
+SPLITS = frozenset({"train", "val", "test"})
+LARGEST_MISFIT = 0.05
+"""Median distance of the training cameras from where the model has them, in parts of their spread: more is another scene."""
+
+
+@dataclass(frozen=True)
+class SparseChoice:
+    """Which points of a COLMAP model are taken."""
+
+    points_error: float = 2.0  # pixels: those with a larger mean reprojection error are left out
+    points_views: int = 2  # those that fewer images observe are left out
+
+    def __post_init__(self) -> None:
+        if not self.points_error > 0:
+            raise InputError(f"points_error is {self.points_error}, expected a positive number of pixels")
+        if self.points_views < 1:
+            raise InputError(f"points_views is {self.points_views}, expected 1 or more")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """How long the model's unit is, and how sure that is."""
+
+    metres: float
+    cameras: int  # training cameras that told
+    misfit: float  # their median distance from where the model has them, in parts of their spread
+
+
+class SparsePoints:
+    """A model in ``folder``, and the training cameras ``places`` (frame name, T_world_camera) of what it shows.
+
+    Raises ``InputError`` where the folder holds no sound model, and where its cameras are not those of the training.
+    """
+
+    def __init__(
+        self, folder: Path, places: Sequence[tuple[str, SE3]], choice: SparseChoice, split: str = "train"
+    ) -> None:
+        self.folder = folder
+        images, self._points = read_model(folder)
+        self._images = _Names(folder, images)
+        self._kept = _kept(self._points, choice)
+        if not bool(self._kept.any()):
+            raise InputError(
+                f"{folder}: none of its {len(self._kept)} points has a reprojection error of "
+                f"{choice.points_error:g} pixels or less and {choice.points_views} observations or more"
+            )
+        self.unit = self._measured(places, split)
+
+    @property
+    def summary(self) -> str:
+        unit = self.unit
+        checked = (
+            f", places agree to {unit.misfit:.2%} of their spread" if unit.cameras > 2 else ", unchecked"
+        )
+        return f"{self.folder}: its unit is {unit.metres:.4g} m by {unit.cameras} training cameras{checked}"
+
+    def seen(self, name: str, split: str) -> Float[Tensor, "n 3"]:
+        """The points that a frame observes: metres, camera frame; none where the model does not have the frame."""
+        image = self._images.find(name, split)
+        if image is None:
+            return torch.zeros((0, 3), dtype=torch.float64)
+        place = torch.searchsorted(self._points.ids, image.points).clamp(max=len(self._points.ids) - 1)
+        place = place[(self._points.ids[place] == image.points) & self._kept[place]]
+        points = image.T_camera_model.apply(self._points.positions[place]) * self.unit.metres
+        return points[points[:, 2] > 0]
+
+    def rays(self, views: Sequence[View], split: str) -> DepthRays:
+        """What all ``views`` observe, in the frame of the last one's camera, by their relative poses.
+
+        Raises ``InputError`` where that is nothing.
+        """
+        T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
+        found = [(view, self.seen(view.frame.name, split)) for view in views]
+        parts = [
+            DepthRays.from_points(points, T_last_ref @ view.T_ref_camera.to("cpu", torch.float64))
+            for view, points in found
+            if len(points)
+        ]
+        if not parts:
+            names = ", ".join(view.frame.name for view in views)
+            raise InputError(f"{self.folder}: no points that {names} observes; it has {self._images.some}")
+        return DepthRays.joined(parts)
+
+    def onto(self, view: View, split: str) -> View:
+        """The view with the depth (planar z) of the nearest observed point at each pixel, 0 elsewhere.
+
+        A view that has measured depth is left as it is, and so is one that observes nothing.
+        """
+        points = self.seen(view.frame.name, split)
+        if view.frame.has_depth or len(points) == 0:
+            return view
+        camera = view.frame.intrinsics
+        column, row = camera.project(points).nan_to_num(-1.0, -1.0, -1.0).floor().long().unbind(-1)
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        pixel, z = (row * camera.width + column)[inside], points[inside, 2].float()
+        depth = torch.full((camera.height * camera.width,), torch.inf).scatter_reduce(0, pixel, z, "amin")
+        depth = torch.where(depth.isfinite(), depth, 0).reshape(camera.height, camera.width)
+        return View(replace(view.frame, depth=depth), view.T_ref_camera)
+
+    def _measured(self, places: Sequence[tuple[str, SE3]], split: str) -> Unit:
+        """By the training cameras that the model has; once more without those that it misplaced."""
+        pairs = [(self._images.find(name, split), T.translation) for name, T in places]
+        known = [(image.T_camera_model.inverse().translation, place) for image, place in pairs if image]
+        if len(known) < 2:
+            raise InputError(
+                f"{self.folder}: has {len(known)} of the {len(places)} training cameras, expected 2 or more to know "
+                f"how long its unit is; it has {self._images.some}"
+            )
+        there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
+        try:
+            off = _off(there, here)
+            fits = off <= max(3 * float(off.median()), LARGEST_MISFIT * spread(here) / 10)
+            unit = fit_similarity(there[fits], here[fits]).scale
+            misfit = float(_off(there[fits], here[fits]).median()) / spread(here[fits])
+        except InputError as error:
+            raise InputError(f"{self.folder}: training cameras tell no unit: {error}") from error
+        if misfit > LARGEST_MISFIT:
+            raise InputError(
+                f"{self.folder}: its cameras are {misfit:.0%} of their spread away from the training's, expected "
+                f"{LARGEST_MISFIT:.0%} or less; is it a model of these images?"
+            )
+        return Unit(unit, int(fits.sum()), misfit)
+
+
+class _Names:
+    """Images of a model by the name of a frame: its stem, or folders and stem as datasets join them ("left_0001")."""
+
+    def __init__(self, folder: Path, images: Sequence[ModelImage]) -> None:
+        self._folder, self._images = folder, images
+        self._by_name: dict[str, list[tuple[tuple[str, ...], ModelImage]]] = defaultdict(list)
+        for image in images:
+            parts = PurePosixPath(image.name.replace("\\", "/")).with_suffix("").parts
+            for name in {"_".join(parts[-count:]) for count in range(1, len(parts) + 1)}:
+                self._by_name[name].append((parts[:-1], image))
+
+    def find(self, name: str, split: str) -> ModelImage | None:
+        """None where there is none. Folders called train, val or test tell the frames of splits apart.
+
+        Raises ``InputError`` where several may be meant.
+        """
+        others = SPLITS - {split}
+        fits = [
+            (folders, image) for folders, image in self._by_name.get(name, []) if not others & set(folders)
+        ]
+        if len(fits) > 1:
+            fits = [(folders, image) for folders, image in fits if split in folders] or fits
+        if len(fits) > 1:
+            listed = ", ".join(image.name for _, image in fits[:4])
+            raise InputError(
+                f"{self._folder}: frame {name!r} may be any of {listed}; expected one image of that name"
+            )
+        return fits[0][1] if fits else None
+
+    @property
+    def some(self) -> str:
+        """A few names, for messages."""
+        names = ", ".join(image.name for image in self._images[:3])
+        return f"{len(self._images)} images" + (
+            f" ({names}{', ...' if len(self._images) > 3 else ''})" if names else ""
+        )
+
+
+def _kept(points: ModelPoints, choice: SparseChoice) -> Tensor:
+    """Which points are good enough; an error that was never computed (negative) speaks against none."""
+    sound = points.positions.isfinite().all(-1) & ~points.errors.isnan()
+    return sound & (points.errors <= choice.points_error) & (points.tracks >= choice.points_views)
+
+
+def _off(there: Float[Tensor, "n 3"], here: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """How far each camera is from where the model has it, once the two are laid over each other (metres)."""
+    return torch.linalg.vector_norm(fit_similarity(there, here).apply(there) - here, dim=-1)

@@ -1,0 +1,227 @@
+"""The files of a COLMAP sparse model: ``images`` and ``points3D``, as .bin or .txt.
+
+Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. ``cameras`` is not
+needed, as points are given in space; nor are ``rigs`` and ``frames`` of newer versions, which write each image's pose to
+``images`` as before. Read here rather than by pycolmap, which waits for ever at a truncated ``points3D.bin``.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.se3 import SE3
+
+Item = TypeVar("Item")
+Number = TypeVar("Number", int, float)
+
+NAMES = ("images", "points3D")
+COUNT, IMAGE, POINT = struct.Struct("<Q"), struct.Struct("<I7dI"), struct.Struct("<q3d3BdQ")
+OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+TRACK_BYTES = 8  # an image and one of its key points, 4 bytes each
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImage:
+    """A registered image."""
+
+    name: str  # path below the folder of images
+    T_camera_model: SE3  # in units of the model
+    points: Int[Tensor, "n"]  # ids of the points that it observes
+
+
+@dataclass(frozen=True)
+class ModelPoint:
+    id: int
+    position: tuple[float, float, float]  # model frame, in units of the model
+    error: float  # mean reprojection error, pixels; negative where it was never computed
+    track: int  # how often it was observed
+
+
+@dataclass(frozen=True, eq=False)
+class ModelPoints:
+    """All of them, by rising id."""
+
+    ids: Int[Tensor, "p"]
+    positions: Float[Tensor, "p 3"]  # model frame, in units of the model
+    errors: Float[Tensor, "p"]  # see ModelPoint
+    tracks: Int[Tensor, "p"]
+
+
+def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
+    """What the model in ``folder`` holds. Raises ``InputError`` where it is none, or damaged."""
+    suffix = next((s for s in (".bin", ".txt") if _is_model(folder, s)), None)
+    if suffix is None:
+        inside = [
+            child for child in (folder / "sparse/0", folder / "sparse", folder / "0") if _any_model(child)
+        ]
+        hint = f"; did you mean {inside[0]}?" if inside else ""
+        wanted = "images.bin and points3D.bin, or the same as .txt"
+        raise InputError(f"{folder}: no COLMAP sparse model in it, expected {wanted}{hint}")
+    images, points = (folder / f"{name}{suffix}" for name in NAMES)
+    if suffix == ".bin":
+        return _binary(images, _binary_image), _together(points, _binary(points, _binary_point))
+    return _text_images(images), _together(points, _text_points(points))
+
+
+def _is_model(folder: Path, suffix: str) -> bool:
+    return all((folder / f"{name}{suffix}").is_file() for name in NAMES)
+
+
+def _any_model(folder: Path) -> bool:
+    return _is_model(folder, ".bin") or _is_model(folder, ".txt")
+
+
+class _Bytes:
+    """A file that is read from its beginning."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._content, self._place = path, _content(path), 0
+
+    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
+        start = self._advance(layout.size)
+        return layout.unpack_from(self._content, start)
+
+    def array(self, kind: np.dtype, count: int) -> np.ndarray:
+        start = self._advance(kind.itemsize * count)
+        return np.frombuffer(self._content, kind, count, start)
+
+    def text(self) -> str:
+        end = self._content.find(b"\0", self._place)
+        start = self._advance((len(self._content) if end < 0 else end + 1) - self._place)
+        return self._content[start : self._place - 1].decode("utf-8", "replace")
+
+    def skip(self, size: int) -> None:
+        self._advance(size)
+
+    @property
+    def left(self) -> int:
+        return len(self._content) - self._place
+
+    def _advance(self, size: int) -> int:
+        if size > self.left:
+            length = len(self._content)
+            raise InputError(
+                f"{self.path}: ends too early, at byte {length}; expected a whole file of COLMAP's"
+            )
+        self._place += size
+        return self._place - size
+
+
+def _binary(path: Path, one: Callable[[_Bytes], Item]) -> list[Item]:
+    """A count, then so many of what ``one`` reads."""
+    file = _Bytes(path)
+    (count,) = file.take(COUNT)
+    if count > file.left:  # before anything is made for as many
+        raise InputError(
+            f"{path}: says that it holds {count} entries in {file.left} bytes, expected a sound file"
+        )
+    found = [one(file) for _ in range(int(count))]
+    if file.left:
+        raise InputError(f"{path}: {file.left} bytes after its {count} entries, expected a file of COLMAP's")
+    return found
+
+
+def _binary_image(file: _Bytes) -> ModelImage:
+    _, *pose, _ = file.take(IMAGE)
+    name = file.text()
+    (count,) = file.take(COUNT)
+    observed = file.array(OBSERVATION, int(count))["point"]
+    return _image(str(file.path), name, pose, observed[observed >= 0])
+
+
+def _binary_point(file: _Bytes) -> ModelPoint:
+    number, x, y, z, *_, error, track = file.take(POINT)
+    file.skip(TRACK_BYTES * int(track))
+    return ModelPoint(int(number), (x, y, z), error, int(track))
+
+
+def _text_images(path: Path) -> list[ModelImage]:
+    """Two lines an image; the second is empty where nothing was observed."""
+    found, lines = [], iter(enumerate(_lines(path), start=1))
+    for number, line in lines:
+        if not line or line.startswith("#"):
+            continue
+        where, words = f"{path}: line {number}", line.split(maxsplit=9)  # a name may hold blanks
+        if len(words) < 10:
+            raise InputError(
+                f"{where} has {len(words)} entries, expected id, pose, camera and name of an image"
+            )
+        observed = next(lines, (0, ""))[1].split()
+        if len(observed) % 3:
+            raise InputError(
+                f"{path}: line {number + 1} has {len(observed)} entries, expected x, y, id of points"
+            )
+        points = np.array(_numbers(f"{path}: line {number + 1}", observed[2::3], _id), dtype=np.int64)
+        found.append(_image(where, words[9], _numbers(where, words[1:8], float), points[points >= 0]))
+    return found
+
+
+def _text_points(path: Path) -> list[ModelPoint]:
+    found = []
+    for number, line in enumerate(_lines(path), start=1):
+        if not line or line.startswith("#"):
+            continue
+        where, words = f"{path}: line {number}", line.split()
+        if len(words) < 8 or len(words) % 2:
+            raise InputError(
+                f"{where} has {len(words)} entries, expected id, x y z, r g b, error and a track"
+            )
+        x, y, z, error = _numbers(where, [*words[1:4], words[7]], float)
+        found.append(ModelPoint(_numbers(where, words[:1], _id)[0], (x, y, z), error, (len(words) - 8) // 2))
+    return found
+
+
+def _image(where: str, name: str, pose: Sequence[float], points: np.ndarray) -> ModelImage:
+    """``pose``: the quaternion w x y z, then the translation."""
+    if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(pose[:4]) < 2):
+        raise InputError(f"{where}: image {name!r} has a pose that is none, expected a unit quaternion")
+    rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
+    T = SE3(torch.from_numpy(rotation), torch.tensor(pose[4:], dtype=torch.float64))
+    return ModelImage(name, T, torch.from_numpy(np.unique(points)))
+
+
+def _together(path: Path, points: list[ModelPoint]) -> ModelPoints:
+    ordered = sorted(points, key=lambda point: point.id)
+    ids = torch.tensor([point.id for point in ordered], dtype=torch.int64)
+    if bool((ids.diff() == 0).any()):
+        raise InputError(f"{path}: two points have the same id, expected a sound file")
+    positions = torch.tensor([point.position for point in ordered], dtype=torch.float64).reshape(-1, 3)
+    errors = torch.tensor([point.error for point in ordered], dtype=torch.float64)
+    tracks = torch.tensor([point.track for point in ordered], dtype=torch.int64)
+    return ModelPoints(ids, positions, errors, tracks)
+
+
+def _numbers(where: str, words: Sequence[str], kind: Callable[[str], Number]) -> list[Number]:
+    try:
+        return [kind(word) for word in words]
+    except ValueError as error:
+        raise InputError(f"{where}: {error}, expected numbers as COLMAP writes them") from error
+
+
+def _id(word: str) -> int:
+    found = int(word)
+    if not abs(found) < 2**63:
+        raise ValueError(f"{word} is no id")
+    return found
+
+
+def _lines(path: Path) -> list[str]:
+    return [line.strip() for line in _content(path).decode("utf-8", "replace").split("\n")]
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error

@@ -1,0 +1,130 @@
+"""COLMAP models on the command line: depth for training and for localization, and what is said of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import sparse_model
+import tiny
+from bidnerf_core.cli import main
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.storage import load_info
+from bidnerf_core.training import Progress
+from tiny import backends_listed_once  # noqa: F401
+
+pytestmark = pytest.mark.usefixtures("backends_listed_once")
+QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64", "--json"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    status: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Outcome]
+
+
+@pytest.fixture
+def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
+    def run(*arguments: object) -> Outcome:
+        capsys.readouterr()
+        status = main([str(argument) for argument in arguments])
+        said = capsys.readouterr()
+        return Outcome(status, said.out, said.err)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``data`` without depth, ``sparse`` of its training and test images, ``map`` trained with its points."""
+    folder = tmp_path_factory.mktemp("colmap")
+    dense = open_dataset(tiny.write_dataset(folder / "dense"))
+    views = [view for split in ("train", "test") for view in dense.views(split)]
+    sparse_model.write(folder / "sparse", sparse_model.known(views, [f"{v.frame.name}.png" for v in views]))
+    tiny.write_dataset(folder / "data", depth=False)
+    train = ["train", folder / "data", "--out", folder / "map", "--depth-points", folder / "sparse"]
+    assert main([*map(str, train), *tiny.options()]) == 0
+    return folder
+
+
+def assert_refused(outcome: Outcome, status: int, *fragments: str) -> None:
+    assert (outcome.status, outcome.out) == (status, "")
+    assert outcome.err.count("\n") == 1, outcome.err
+    assert all(fragment in outcome.err for fragment in fragments), outcome.err
+
+
+def test_training_takes_depth_from_the_points(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    train = ["train", shared / "data", *tiny.options()]
+    found = bidnerf(*train, "--out", tmp_path / "map", "--depth-points", shared / "sparse")
+    assert found.status == 0
+    assert "its unit is 0.37 m by 6 training cameras, places agree" in found.err
+    info = load_info(tmp_path / "map")
+    assert info.sparse_depth > 30
+    assert f"depth at {info.sparse_depth} pixels of 6 of 6 images" in found.err
+    assert "colour only" not in found.err
+    fewer = bidnerf(
+        *train, "--out", tmp_path / "fewer", "--depth-points", shared / "sparse", "--points-views", 4
+    )
+    assert fewer.status == 0
+    assert 0 < load_info(tmp_path / "fewer").sparse_depth < info.sparse_depth
+
+
+def test_images_with_depth_of_their_own_keep_it(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    train = ["train", shared / "dense", "--out", tmp_path / "map", *tiny.options()]
+    assert_refused(bidnerf(*train, "--depth-points", shared / "sparse"), 1, "gives no depth to split 'train'")
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_training_is_resumed_with_the_depth_that_it_began_with(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from bidnerf_core.cli import progress
+
+    real = progress.StoredTraining.step
+
+    def stop(self: progress.StoredTraining, done: Progress) -> None:
+        real(self, done)
+        self.stopping = done.step >= 5
+
+    monkeypatch.setattr(progress.StoredTraining, "step", stop)
+    train = ["train", shared / "data", "--out", tmp_path / "map", *tiny.options()]
+    points = ["--depth-points", shared / "sparse"]
+    assert bidnerf(*train, *points).status == 130
+    monkeypatch.undo()
+    refused = bidnerf(*train, "--resume")
+    assert_refused(refused, 2, "--resume keeps --depth-points", "got 0")
+    assert bidnerf(*train, *points, "--resume").status == 0
+
+
+def test_localization_takes_the_points_that_the_frames_observe(bidnerf: Run, shared: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", *QUICK, "--frame", "t_0001", "--window", 2]
+    without, with_points = bidnerf(*place), bidnerf(*place, "--depth-points", shared / "sparse")
+    assert (without.status, with_points.status) == (0, 0)
+    assert json.loads(without.out)["loss"] != json.loads(with_points.out)["loss"]
+    assert "its unit is 0.37 m by 6 training cameras" in with_points.err
+    assert "points seen" in with_points.err
+    assert "none by" not in with_points.err
+
+
+def test_a_model_that_is_of_no_use_is_told_in_a_line(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", *QUICK, "--frame", "t_0001"]
+    assert_refused(bidnerf(*place, "--depth-points", shared / "data"), 1, "no COLMAP sparse model in it")
+    assert_refused(bidnerf(*place, "--depth-points", shared), 1, "did you mean", str(shared / "sparse"))
+    views = open_dataset(shared / "dense").views("train")
+    names = [f"{view.frame.name}.png" for view in views]
+    training = sparse_model.write(tmp_path / "training", sparse_model.known(views, names))
+    assert_refused(
+        bidnerf(*place, "--depth-points", training), 1, "no points that t_0001 observes", "6 images"
+    )
+    strangers = sparse_model.write(
+        tmp_path / "strangers", sparse_model.known(views, [f"x{n}" for n in names])
+    )
+    assert_refused(bidnerf(*place, "--depth-points", strangers), 1, "has 0 of the 6 training cameras")
