@@ -328,7 +328,7 @@ def test_a_pose_comes_closer_with_the_points_than_without(tmp_path: Path) -> Non
     model = sparse_model.write(tmp_path, what)
     sparse = SparsePoints(model, places(what)[3:], CHOICE)
     config = BidConfig(
-        rays=16, depth_rays=64, max_steps=40, learning_rate=0.02, pivot="camera", level=None
+        rays=16, depth_rays=64, max_steps=25, learning_rate=0.03, pivot="camera", level=None
     )  # fmt: skip
 
     def error(view: View, rays: DepthRays | None, back: float) -> float:

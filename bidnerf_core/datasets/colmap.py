@@ -23,8 +23,12 @@ from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
 
 SPLITS = frozenset({"train", "val", "test"})
-LARGEST_MISFIT = 0.05
-"""Median distance of the training cameras from where the model has them, in parts of their spread: more is another scene."""
+LARGEST_MISFIT = 0.2
+"""Median distance of the training cameras from where the model has them, in parts of their spread: more is another scene.
+A hand-held camera that was moved by decimetres comes to 0.03."""
+OUTLIER = 3.0
+"""Cameras that are off by more than so many medians are left out, and never those that are off by less than ..."""
+ALWAYS_FITS = 0.01  # ... of the spread
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ class SparsePoints:
         there, here = (torch.stack([pair[i].double().cpu() for pair in known]) for i in (0, 1))
         try:
             off = _off(there, here)
-            fits = off <= max(3 * float(off.median()), LARGEST_MISFIT * spread(here) / 10)
+            fits = off <= max(OUTLIER * float(off.median()), ALWAYS_FITS * spread(here))
             unit = fit_similarity(there[fits], here[fits]).scale
             misfit = float(_off(there[fits], here[fits]).median()) / spread(here[fits])
         except InputError as error:
