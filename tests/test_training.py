@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -18,6 +19,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.pixels import all_pixels, observe
 from bidnerf_core.rigs import orbit
 from bidnerf_core.training import (
+    MEASURED_SHARE,
     Progress,
     RayBank,
     RayBatch,
@@ -312,6 +314,25 @@ def test_every_pixel_is_as_likely_as_any_other() -> None:
     assert len(counts) == bank.count
     expected = 20000 / bank.count
     assert bool(((counts - expected).abs() < 6 * expected**0.5).all())
+
+
+def test_where_few_pixels_have_depth_a_share_of_the_rays_goes_through_them() -> None:
+    """Drawn uniformly, 3 of 164 pixels would be met by 2 % of the rays; all of the three are, and no others among those."""
+    views = random_views(5, True, True)
+    few = [replace(v, frame=replace(v.frame, depth=torch.zeros_like(v.frame.depth))) for v in views]  # type: ignore[arg-type]
+    for number in (0, 1, 4):
+        few[number].frame.depth[3, 2] = 1.0 + number  # type: ignore[index]
+    bank = RayBank(few, BOUNDS)
+    batch = bank.draw(400, torch.Generator().manual_seed(0))
+    measured = batch.distance > 0
+    assert float(measured.float().mean()) == pytest.approx(MEASURED_SHARE, abs=0.05)
+    assert len(batch.distance[measured].unique()) == 3
+    for view in (few[0], few[1], few[4]):
+        seen = observe(view, torch.tensor([[2, 3]]))
+        here = (batch.distance - seen.distance).abs() < 1e-5
+        assert int(here.sum()) > 10
+        torch.testing.assert_close(batch.rays.directions[here], seen.directions.expand(int(here.sum()), 3))
+    assert len(batch.distance[~measured]) > 250
 
 
 def test_the_same_generator_draws_the_same_rays(generator: torch.Generator) -> None:
