@@ -107,7 +107,7 @@ def trials(given: argparse.Namespace, start: str) -> list[Trial]:
         Plan(
             str(given.map), str(given.data), protocol, (tuple(map(float, size)),), given.method,
             json.dumps(json.loads(given.config), sort_keys=True), given.trials or len(kept), given.seed,
-            frames=tuple(kept),
+            frames=tuple(kept), depth=not given.no_depth,
         )
     )  # fmt: skip
 
@@ -128,6 +128,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--all-frames", action="store_true", help="also those that settings were tuned on")
+    parser.add_argument("--no-depth", action="store_true", help="withhold the measured depth")
     given = parser.parse_args()
     wanted = {start: trials(given, start) for start in given.start}
     partial = RESULTS / f"{given.name}.partial.jsonl"
@@ -143,6 +144,7 @@ def main() -> None:
         "map": given.map.name,
         "data": given.data.name,
         "method": given.method,
+        "depth": not given.no_depth,
         "settings": rows[given.start[0]][0].settings,
         "starts": {
             start: {"summary": summary(part, truth), "rows": [final(row, truth) for row in part]}

@@ -75,7 +75,7 @@ def test_bid_needs_many_more() -> None:
 
 def test_colour_alone_finds_a_place_that_is_near() -> None:
     start = perturb(TRUTH, 0.1, 3.0, seed=2)
-    config = InerfLmConfig(poses=8, coarse_poses=2, coarse_rays=128, fine_rays=512, blur=2)
+    config = InerfLmConfig(poses=8, search_poses=2, middle_poses=2, coarse_rays=128, fine_rays=512)
     answers = [
         localize(single(FIELD, BOUNDS, frame, start), "inerf-lm", config)
         for frame in (FRAME, replace(FRAME, depth=None), replace(FRAME, depth=torch.full((40, 48), 9.0)))
@@ -83,6 +83,20 @@ def test_colour_alone_finds_a_place_that_is_near() -> None:
     assert float(pose_error(answers[0].T_world_camera, TRUTH).translation) < 0.03
     for other in answers[1:]:  # depth is not looked at
         assert torch.equal(other.T_world_camera.matrix(), answers[0].T_world_camera.matrix())
+
+
+def test_colour_alone_finds_a_place_that_is_far() -> None:
+    """A camera that was turned by 30 degrees sees next to nothing of what it saw."""
+    start = TRUTH @ SE3.exp(torch.tensor([0.1, -0.1, 0.1, 0.0, 0.5, 0.1], dtype=torch.float64))
+    blind = single(FIELD, BOUNDS, replace(FRAME, depth=None), start)
+    found = localize(
+        blind,
+        "inerf-lm",
+        InerfLmConfig(poses=96, search_poses=8, middle_poses=3, coarse_rays=128, fine_rays=512),
+    )
+    assert float(pose_error(found.T_world_camera, TRUTH).translation) < 0.03
+    assert found.converged, found.reason
+    assert found.steps == len(found.losses) == len(found.poses.translation) - 1
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:
@@ -194,3 +208,13 @@ def test_blur_keeps_means_and_places(size: int) -> None:
 def test_settings_that_make_no_sense_are_named(setting: str, value: object) -> None:
     with pytest.raises(InputError, match=f"{setting} is .*, expected "):
         replace(BidLmConfig(), **{setting: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("poses", 0), ("search_poses", 0), ("middle_steps", 0), ("width", 3), ("spread_rotation", -1.0), ("fine_rays", 6),
+     ("coarse_steps", 0), ("colour_scale", 0.0), ("least_weight", 1.0), ("play", -1.0)],
+)  # fmt: skip
+def test_so_are_those_of_colour_alone(setting: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"{setting} is .*, expected "):
+        replace(InerfLmConfig(), **{setting: value})  # type: ignore[arg-type]

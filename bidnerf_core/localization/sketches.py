@@ -1,0 +1,77 @@
+"""What many rays see, quickly and without derivatives: on the baked surface, or by rendering a field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.rendering import render
+from bidnerf_core.surface import SurfaceMap
+from bidnerf_core.surface.casting import cast
+
+CHUNK = 16384
+"""Rays that are rendered at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """On the CPU."""
+
+    rgb: Float[Tensor, "r 3"]  # times ``known``, where less than all is known
+    known: Float[Tensor, "r"]  # 0 where a ray leads to where the map knows nothing
+    along: Float[
+        Tensor, "r"
+    ]  # metres to what is seen or, where that is the background, to what the ray passes by
+
+
+@runtime_checkable
+class Sketcher(Protocol):
+    """Looks along half-lines with unit directions, world frame, on the CPU."""
+
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> Sketch: ...
+
+
+@dataclass(frozen=True, eq=False)
+class OnSurface:
+    """Colours of surfels; of what lies behind, too, where there is a background."""
+
+    surface: SurfaceMap
+    background: tuple[float, float, float] | None  # none: what meets nothing looks through a hole of the map
+
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> Sketch:
+        found = cast(self.surface, origins, directions)
+        met = found.met[:, None].to(origins)
+        behind = origins.new_tensor(self.background or (0.0, 0.0, 0.0))
+        rgb = met * self.surface.surfels.rgb[found.index] + (1 - met) * behind
+        known = met[:, 0] if self.background is None else torch.ones_like(found.along)
+        return Sketch(rgb, known, found.along.clamp(min=self.surface.cell))
+
+
+@dataclass(frozen=True, eq=False)
+class ByField:
+    """Renderings, background and all."""
+
+    field: RadianceField
+    bounds: SceneBounds
+    device: torch.device
+
+    @torch.no_grad()
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> Sketch:
+        middle = origins.new_tensor([self.bounds.lower, self.bounds.upper]).mean(0)
+        passing = ((middle - origins) * directions).sum(-1)
+        parts = [
+            self._rendered(*(part.to(self.device) for part in some))
+            for some in zip(origins.split(CHUNK), directions.split(CHUNK), strict=True)
+        ]
+        rgb, along, opacity = (torch.cat(values) for values in zip(*parts, strict=True))
+        along = torch.where(opacity > 0.5, along / opacity.clamp(min=0.5), passing)
+        return Sketch(rgb, torch.ones_like(along), along.clamp(min=self.bounds.near))
+
+    def _rendered(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        seen = render(self.field, self.bounds.rays(origins, directions), self.bounds.background)
+        return seen.rgb.cpu(), seen.distance.cpu(), seen.opacity.cpu()

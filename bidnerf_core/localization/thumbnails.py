@@ -1,0 +1,80 @@
+"""Images made small and smooth: what drawings of a surface are compared with, and where their rays run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import conv2d, grid_sample, interpolate, pad
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import View
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A view seen by a small camera without distortion, on the CPU."""
+
+    camera: Intrinsics
+    T_last_camera: SE3
+    rgb: Float[Tensor, "3 h w"]  # smooth
+
+    @cached_property
+    def flat(self) -> Float[Tensor, "n 3"]:
+        """Points of the camera frame on the plane z = 1 that its pixels see, row by row."""
+        return self.camera.unproject(self.camera.pixel_centres()).reshape(-1, 3)
+
+    @cached_property
+    def directions(self) -> Float[Tensor, "n 3"]:
+        """Unit; in the last camera's frame."""
+        return self.T_last_camera.to(self.flat).rotate(torch.nn.functional.normalize(self.flat, dim=-1))
+
+    @cached_property
+    def directness(self) -> Float[Tensor, "n"]:
+        """Metres of depth in a metre along each ray."""
+        return 1 / torch.linalg.vector_norm(self.flat, dim=-1)
+
+    @cached_property
+    def origin(self) -> Float[Tensor, "3"]:
+        return self.T_last_camera.translation.to(self.flat)
+
+    @cached_property
+    def slopes(self) -> Float[Tensor, "3 n 2"]:
+        return slopes(self.rgb, self.camera)
+
+
+def thumbnail(view: View, width: int) -> Thumbnail:
+    """``view`` made smaller, so that its longer side has ``width`` pixels at most, and ``smooth``."""
+    camera = view.frame.intrinsics
+    small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
+    rgb = view.frame.rgb.cpu().float().permute(2, 0, 1)[None]
+    # Averaged first, so that nothing between the small camera's rays is left out.
+    rgb = interpolate(rgb, (small.height, small.width), mode="area")
+    if camera.distortion:
+        seen = camera.project(small.unproject(small.pixel_centres())) / torch.tensor(
+            [camera.width, camera.height]
+        )
+        rgb = grid_sample(rgb, 2 * seen[None] - 1, padding_mode="border", align_corners=False)
+    return Thumbnail(small, view.T_ref_camera.to("cpu", torch.float64), smooth(rgb[0]))
+
+
+def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """Convolved with a binomial kernel of 5x5 pixels, a Gaussian of one pixel; beyond the border, what is at the border."""
+    kernel = image.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+    flat = image.reshape(-1, 1, *image.shape[-2:])
+    flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
+    flat = conv2d(pad(flat, (0, 0, 2, 2), mode="replicate"), kernel.view(1, 1, 5, 1))
+    return flat.view(image.shape)
+
+
+def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, "*b n 2"]:
+    """Central differences, per unit to the right and down on the plane z = 1."""
+    flat = image.reshape(-1, 1, *image.shape[-2:])
+    wide = pad(flat, (1, 1, 1, 1), mode="replicate")
+    across = (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) * (camera.fx / 2)
+    down = (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]) * (camera.fy / 2)
+    return torch.stack([across, down], -1).reshape(*image.shape[:-2], -1, 2)
