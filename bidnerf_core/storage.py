@@ -29,7 +29,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.plain import from_plain, to_plain
-from bidnerf_core.registry import load_backend
+from bidnerf_core.registry import BackendError, load_backend
 from bidnerf_core.se3 import SE3
 from bidnerf_core.surface import SurfaceMap, surface_from_tensors, surface_tensors
 from bidnerf_core.training import TrainingState
@@ -157,6 +157,8 @@ def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
 def load_info(folder: Path) -> MapInfo:
     """Read and judge ``map.json``. Raises ``InputError`` where it is no map, or one of another version."""
     path = folder / DESCRIPTION
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file, expected the folder of a map as written by 'bidnerf train'")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a map as written by 'bidnerf train'")
     if not path.is_file():
@@ -168,7 +170,9 @@ def load_info(folder: Path) -> MapInfo:
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise InputError(f'{path}: not the description of a map, expected "format": "{FORMAT}"')
     if found.get("version") != VERSION:
-        raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; train the map anew")
+        newer = isinstance(found.get("version"), int) and found["version"] > VERSION
+        advice = "it was written by a newer bidnerf, update yours" if newer else "train the map anew"
+        raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; {advice}")
     info = from_plain(MapInfo, found, str(path))
     for name in (info.weights, info.training, info.surface):
         if name is not None and (not name or Path(name).name != name):
@@ -182,12 +186,20 @@ def load_map(folder: Path, device: torch.device | str = "cpu", surface: bool = T
     ``surface``: whether to read that as well.
     """
     info, tensors, baked = _read(folder, surface)
-    field, _ = build_field(load_backend(info.backend), info, str(folder / DESCRIPTION))
+    field, _ = build_field(backend_of(folder, info), info, str(folder / DESCRIPTION))
     _check_weights(field, tensors, folder / info.weights)
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
     return Map(info, field, baked)
+
+
+def backend_of(folder: Path, info: MapInfo) -> Backend:
+    """The backend that made the map in ``folder``. Raises ``BackendError``, which names both."""
+    try:
+        return load_backend(info.backend)
+    except BackendError as error:
+        raise BackendError(f"{folder / DESCRIPTION}: {error}") from error
 
 
 def load_surface(path: Path) -> SurfaceMap:

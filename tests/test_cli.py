@@ -260,11 +260,11 @@ def test_names_that_do_not_exist_are_told_with_those_that_do(
     )
     assert_refused(bidnerf("demo", "--backend", "x", "--out", tmp_path / "out"), 1, "'x'", known)
     assert_refused(bidnerf(*train, "--split", "trian"), 1, str(data), "no split 'trian'", "train, test")
-    assert_refused(bidnerf(*train, "--background", "pink"), 1, "'pink'", 'expected "white"')
+    assert_refused(bidnerf(*train, "--background", "pink"), 2, "'pink'", 'expected "white"')
     localize = ["localize", place, data, *QUICK]
     assert_refused(bidnerf(*localize, "--frame", "t_001"), 1, str(data), "'t_001'", "mean 't_0001'")
     assert_refused(
-        bidnerf("localize", place, data, "--frame", "t_0001", "--no-start", "--method", "x"), 1, "'x'"
+        bidnerf("localize", place, data, "--frame", "t_0001", "--no-start", "--method", "x"), 2, "'x'"
     )
     render = ["render", place, data, "--out", tmp_path / "out"]
     assert_refused(bidnerf(*render, "--frame", "r_0000"), 1, str(data), "split 'test'", "'r_0000'")
@@ -304,6 +304,11 @@ def add_setting(name: str, value: object) -> Edit:
     return of_description(lambda content: content["config"].update({name: value}))
 
 
+def into_a_file(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.write_text("x")
+
+
 BIAS = "geometry.0.bias"
 BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "no folder": (shutil.rmtree, ("no such folder", "expected a map")),
@@ -313,7 +318,15 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "another version": (
         of_description(lambda content: content.update(version=99)),
-        ("map.json", "version 99, expected 1"),
+        ("map.json", "version 99, expected 1", "by a newer bidnerf, update yours"),
+    ),
+    "an older version": (
+        of_description(lambda content: content.update(version=0)),
+        ("map.json", "version 0, expected 1", "train the map anew"),
+    ),
+    "a file": (
+        into_a_file,
+        ("is a file, expected the folder of a map",),
     ),
     "another format": (
         of_description(lambda content: content.update(format="x")),
@@ -385,7 +398,7 @@ def test_a_map_that_cannot_be_used_is_told_in_a_line(
     edit, fragments = BAD_MAPS[case]
     edit(map_folder)
     before = contents(tmp_path)
-    named = fragments if case == "unknown backend" else (str(map_folder), *fragments)
+    named = (str(map_folder), *fragments)
     assert_refused(bidnerf("info", map_folder), 1, "bidnerf info: ", *named)
     render = bidnerf("render", map_folder, shared / "data", "--out", tmp_path / "out")
     assert_refused(render, 1, "bidnerf render: ", *named)
@@ -416,6 +429,10 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
     assert contents(interrupted) == before
     (interrupted / str(load_info(interrupted).training)).write_bytes(b"junk")
     assert_refused(bidnerf(*resume, interrupted), 1, "training-", "expected a safetensors file")
+    of_description(lambda content: content.update(backend="hashgird"))(interrupted)
+    assert_refused(
+        bidnerf(*resume, interrupted), 1, str(interrupted / "map.json"), "'hashgird'", "installed: "
+    )
 
 
 # Places that cannot be written.
@@ -536,6 +553,32 @@ def test_a_disk_that_fills_up_keeps_the_last_whole_map(
         ["demo", "--steps", "0", "--out", "{out}"],
         ["demo", "extra", "--out", "{out}"],
         ["backends", "--jsn"],
+        ["train", "{data}", "--out", "{out}", "--backend", "adanerf", "--threshold", "inf"],
+        ["train", "{data}", "--out", "{out}", "--depth-weight", "inf"],
+        ["train", "{data}", "--out", "{out}", "--points-error", "inf"],
+        ["localize", "{map}", "{data}", "--frame", "t_0000", "--no-start", "--method", "guess"],
+        [
+            "localize",
+            "{map}",
+            "{data}",
+            "--frame",
+            "t_0000",
+            "--perturb",
+            "1",
+            "2",
+            "--method",
+            "bid",
+            "--wide",
+            "nan",
+        ],
+        ["evaluate", "{map}", "{data}", "--out", "{out}", "--method", "guess"],
+        ["evaluate", "{map}", "{data}", "--out", "{out}", "--protocol", "guess"],
+        ["evaluate", "{map}", "{data}", "--out", "{out}", "--size", "-1"],
+        ["evaluate", "{map}", "{data}", "--out", "{out}", "--protocol", "none", "--size", "1"],
+        ["compare", "{map}", "{data}", "--method", "guess"],
+        ["compare", "{map}", "{data}", "--size", "0.5:10"],
+        ["report", "--out", "{out}"],
+        ["compare", "{map}", "{data}", "--protocol", "guess"],
     ],
     ids=" ".join,
 )
@@ -584,9 +627,11 @@ def test_a_start_that_is_no_pose_is_told_in_a_line(
 
 
 def test_a_perturbation_is_judged(bidnerf: Callable[..., Outcome], shared: Path) -> None:
-    for wrong in (("-1", "5"), ("nan", "5"), ("1", "inf")):
-        found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0000", "--perturb", *wrong)
-        assert_refused(found, 1, "expected a finite number, 0 or more")
+    place = ["localize", shared / "map", shared / "data", "--frame", "t_0000", "--perturb"]
+    for wrong in (("-1", "5"), ("nan", "5"), ("inf", "5")):
+        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: T is", "expected a finite number, 0 or more")
+    for wrong in (("1", "inf"), ("0.5", "1e9"), ("0.5", "180.1"), ("0.5", "-1")):
+        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: R is", "expected degrees from 0 to 180")
 
 
 # What is printed.
@@ -645,6 +690,12 @@ def test_every_frame_that_is_named_counts(
     assert seen == [["a", "b", "c"]]
 
 
+def test_a_frame_is_no_rig_by_being_named_twice(bidnerf: Callable[..., Outcome], shared: Path) -> None:
+    place = ["localize", shared / "map", shared / "data", *QUICK]
+    for twice in (["t_0001", "t_0001"], ["t_0000", "t_0001", "--frame", "t_0001"]):
+        assert_refused(bidnerf(*place, "--frame", *twice), 2, "--frame names t_0001 more than once")
+
+
 def test_a_window_is_the_frame_and_those_before_it(
     bidnerf: Callable[..., Outcome], shared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -659,13 +710,17 @@ def test_a_window_is_the_frame_and_those_before_it(
 
     monkeypatch.setattr(localize, "read_views", note)
     place = ["localize", shared / "map", shared / "data", *QUICK]
-    for frame, size in (("t_0002", 2), ("t_0001", 5), ("t_0001", 1)):
-        assert bidnerf(*place, "--frame", frame, "--window", size).status == 0
+    for frame, size in (("t_0002", 2), ("t_0001", 3), ("t_0001", 1)):
+        found = bidnerf(*place, "--frame", frame, "--window", size)
+        assert found.status == 0
+        cut = "--window 3: t_0001 has 1 before it in split 'test'; a rig of 2" in found.err
+        assert cut == (size == 3)
     assert asked == [["t_0001", "t_0002"], ["t_0000", "t_0001"], ["t_0001"]]
     assert_refused(
         bidnerf(*place, "--frame", "t_0000", "t_0001", "--window", 2), 2, "--window 2 with 2 frames"
     )
     assert_refused(bidnerf(*place, "--frame", "t_0000", "--window", 0), 2, "--window is 0")
+    assert_refused(bidnerf(*place, "--frame", "t_0000", "--window", 4), 2, "--window is 4, expected 1 to 3")
     assert_refused(bidnerf(*place, "--frame", "t_9", "--window", 2), 1, "'t_9'")
 
 

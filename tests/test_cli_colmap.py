@@ -13,6 +13,8 @@ import sparse_model
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.evaluation.groups import grouped
+from bidnerf_core.evaluation.results import read_results
 from bidnerf_core.storage import load_info
 from bidnerf_core.training import Progress
 from tiny import backends_listed_once  # noqa: F401
@@ -112,6 +114,43 @@ def test_localization_takes_the_points_that_the_frames_observe(bidnerf: Run, sha
     assert "its unit is 0.37 m by 6 training cameras" in with_points.err
     assert "points seen" in with_points.err
     assert "none by" not in with_points.err
+
+
+def test_a_bench_takes_them_too(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    out, points = tmp_path / "r.jsonl", ["--depth-points", shared / "sparse"]
+    bench = [
+        "evaluate",
+        shared / "map",
+        shared / "data",
+        "--out",
+        out,
+        "--trials",
+        2,
+        "--size",
+        0.5,
+        "--workers",
+        1,
+    ]
+    bench += ["--method", "bid", "--max-steps", 2, "--rays", 32]
+    assert bidnerf(*bench).status == 0
+    assert bidnerf(*bench, *points).status == 0
+    again = bidnerf(*bench, *points)
+    assert "2 of 2 trials are there already" in again.err
+    found = read_results([out])
+    assert [result.trial.depth_points for result in found[:2]] == [None, None]
+    assert all(str(result.trial.depth_points).endswith("/sparse") for result in found[2:])
+    assert found[0].loss != found[2].loss
+    assert found[0].start_error == found[2].start_error
+    labels = {group.label for group in grouped(found)}
+    assert any("no points" in label for label in labels)
+    assert any("points of" in label for label in labels)
+    known = sparse_model.known(
+        open_dataset(shared / "dense").views("train"), [f"r_000{i}.png" for i in range(6)]
+    )
+    training = sparse_model.write(tmp_path / "training", known)
+    refused = bidnerf(*bench, "--depth-points", training)
+    assert_refused(refused, 1, "no points for 3 of 3 frames (t_0000,", "choose others with --frame")
+    assert_refused(bidnerf("evaluate", "demo:blobs", "--out", tmp_path / "x", *points), 1, "with no cameras")
 
 
 def test_a_model_that_is_of_no_use_is_told_in_a_line(bidnerf: Run, shared: Path, tmp_path: Path) -> None:

@@ -174,6 +174,7 @@ def test_the_command_prints_a_table_and_writes_what_it_says(
     assert "short" in shown.out
     assert "ms a step" in shown.out
     assert "1/1" in shown.err
+    assert shown.err.startswith("1 start in 1 map; a process for each begins\n")
     kept = from_plain(Comparison, json.loads((tmp_path / "out" / "compare.json").read_text()), "compare.json")
     assert [len(column) for column in kept.results] == [1]
     assert main(["compare", *folders, *options]) == 1  # what is there is not overwritten
@@ -206,8 +207,8 @@ def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.Ca
         (["{map}"], 2, "1 folder given, expected"),
         (["{map}", "{data}", "--trials", "0"], 2, "--trials is 0"),
         (["{map}", "{data}", "--frame", "r_77"], 1, "r_77"),
-        (["{map}", "{data}", "--protocol", "bib"], 1, "did you mean 'bid'"),
-        (["{map}", "{data}", "--size", "1:2"], 1, "size is 1:2"),
+        (["{map}", "{data}", "--protocol", "bib"], 2, "did you mean 'bid'"),
+        (["{map}", "{data}", "--size", "1:2"], 2, "size is 1:2"),
         (["{map}", "{data}", "--split", "none"], 1, "no split 'none'"),
         (["{data}", "{data}"], 1, "expected a map"),
         (["{map}", "{map}", "{data}"], 1, "named twice"),

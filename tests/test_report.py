@@ -205,6 +205,26 @@ def test_a_file_without_results_is_told_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_report_replaces_a_report_and_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], results: list[TrialResult]
+) -> None:
+    file, out = write(tmp_path / "r.jsonl", *results), tmp_path / "out"
+    out.mkdir()  # empty: nothing is lost
+    for title in ("first", "second"):
+        assert main(["report", str(file), "--out", str(out), "--title", title]) == 0
+        assert title in (out / "index.html").read_text()
+    for name in ("index.html", "thesis.tex"):
+        other = tmp_path / name.partition(".")[0]
+        other.mkdir()
+        (other / name).write_text("<html>mine</html>")
+        capsys.readouterr()
+        assert main(["report", str(file), "--out", str(other)]) == 1
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert f"{other}: holds something that is no report" in error
+        assert [path.read_text() for path in other.iterdir()] == ["<html>mine</html>"]
+
+
 def test_a_damaged_side_file_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], results: list[TrialResult]
 ) -> None:

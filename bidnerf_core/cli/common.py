@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import io
 import json
 import math
@@ -21,6 +23,8 @@ from rich.table import Table
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.localization import find_method
+from bidnerf_core.localization.methods import Method
 
 T = TypeVar("T")
 
@@ -64,7 +68,9 @@ def parse(command: str, function: Callable[..., T], arguments: list[str]) -> T:
 
     def call() -> T:
         config = (tyro.conf.OmitArgPrefixes,)
-        return tyro.cli(function, args=arguments, prog=f"bidnerf {command}", config=config)
+        return tyro.cli(
+            _of_finite_settings(function), args=arguments, prog=f"bidnerf {command}", config=config
+        )
 
     if not {"-h", "--help"} & set(arguments):
         return call()
@@ -74,6 +80,28 @@ def parse(command: str, function: Callable[..., T], arguments: list[str]) -> T:
             return call()
     finally:
         sys.stdout.write(page.wrapped(shutil.get_terminal_size().columns))
+
+
+def _of_finite_settings(function: Callable[..., T]) -> Callable[..., T]:
+    """The same, called with settings that are numbers; what is not would be found out hours later, or never."""
+
+    @functools.wraps(function)
+    def judged(*arguments: Any, **options: Any) -> T:
+        for value in (*arguments, *options.values()):
+            _require_finite(value)
+        return function(*arguments, **options)
+
+    return judged
+
+
+def _require_finite(settings: Any) -> None:
+    if not dataclasses.is_dataclass(settings):
+        return
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UsageError(f"--{field.name.replace('_', '-')} is {value}, expected a finite number")
+        _require_finite(value)
 
 
 class _Page(io.StringIO):
@@ -172,6 +200,21 @@ def _make_writable(out: Path) -> None:
         raise InputError(
             f"{out}: cannot be written ({error.strerror}), expected a folder that can be made and written"
         ) from error
+
+
+def chosen_method(arguments: Sequence[str], usual: str) -> Method:
+    """What ``--method`` names."""
+    with wrong_usage():
+        return find_method(value_of("--method", arguments) or usual)
+
+
+@contextlib.contextmanager
+def wrong_usage() -> Iterator[None]:
+    """What is found in here is wrong with the arguments by themselves, whatever is in the files."""
+    try:
+        yield
+    except InputError as error:
+        raise UsageError(str(error)) from error
 
 
 def value_of(option: str, arguments: Sequence[str]) -> str | None:

@@ -17,6 +17,7 @@ from bidnerf_core.cli.common import (
     Flag,
     Names,
     UsageError,
+    chosen_method,
     option,
     output_folder,
     parse,
@@ -24,7 +25,7 @@ from bidnerf_core.cli.common import (
     print_table,
     require,
     say,
-    value_of,
+    wrong_usage,
 )
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import changed_settings
@@ -35,7 +36,7 @@ from bidnerf_core.evaluation.errors import CRITERIA
 from bidnerf_core.evaluation.protocols import PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.trial_process import Measured
 from bidnerf_core.evaluation.trials import Trial
-from bidnerf_core.localization import METHODS, find_method
+from bidnerf_core.localization import METHODS
 from bidnerf_core.plain import to_plain
 from bidnerf_core.storage import load_info, write_file
 
@@ -48,7 +49,7 @@ Folders = Annotated[
 
 def run(arguments: list[str]) -> None:
     """Parse with the settings of the method that the arguments name."""
-    kind = find_method(value_of("--method", arguments) or "bid").config_type
+    kind = chosen_method(arguments, "bid").config_type
 
     def compare(
         folders: Folders,
@@ -79,9 +80,12 @@ def run(arguments: list[str]) -> None:
                 "expected one of a map or more, then that of a dataset"
             )
         *maps, data = folders
-        chosen = find_protocol(protocol)
+        with wrong_usage():
+            chosen = find_protocol(protocol)
+            asked = chosen.sizes[0] if size is None else read_size(size)
+            chosen.check_size(asked)
         usual = Trial(
-            "", data, ("",), protocol, chosen.sizes[0] if size is None else read_size(size), method,
+            "", data, ("",), protocol, asked, method,
             changed_settings(method, config), chosen.seed if seed is None else seed, split,
         )  # fmt: skip
         names = [name for group in frame for name in group]
@@ -113,11 +117,19 @@ def _compare(
         if not is_closed_form(folder):
             load_info(Path(folder))
     if out is None:
-        return compare(planned, _Progress())
+        return _compared(planned)
     with output_folder(out, overwrite):
-        found = compare(planned, _Progress())
+        found = _compared(planned)
         _write(found, out)
     return found
+
+
+def _compared(planned: Sequence[Sequence[Trial]]) -> Comparison:
+    starts, maps = len(planned), len(planned[0])
+    say(
+        f"{starts} start{'s' if starts > 1 else ''} in {maps} map{'s' if maps > 1 else ''}; a process for each begins"
+    )
+    return compare(planned, _Progress())
 
 
 class _Progress:

@@ -13,7 +13,17 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidnerf_core.cli.common import LARGEST_SEED, Names, UsageError, option, parse, require, say, value_of
+from bidnerf_core.cli.common import (
+    LARGEST_SEED,
+    Names,
+    UsageError,
+    chosen_method,
+    option,
+    parse,
+    require,
+    say,
+    wrong_usage,
+)
 from bidnerf_core.cli.trial_progress import TrialProgress
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import (
@@ -26,18 +36,18 @@ from bidnerf_core.evaluation.bench import (
     share,
 )
 from bidnerf_core.evaluation.cluster import dask_executor
-from bidnerf_core.evaluation.protocols import PROTOCOLS, Size
+from bidnerf_core.evaluation.protocols import PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.provenance import command_line, note_run, provenance
 from bidnerf_core.evaluation.results import ResultsFile
 from bidnerf_core.evaluation.trials import Trial
-from bidnerf_core.localization import METHODS, find_method
+from bidnerf_core.localization import METHODS
 
 Place = Annotated[str, tyro.conf.Positional]
 
 
 def run(arguments: list[str]) -> None:
     """Parse with the settings of the method that the arguments name."""
-    kind = find_method(value_of("--method", arguments) or "auto").config_type
+    kind = chosen_method(arguments, "auto").config_type
 
     def evaluate(
         map: Annotated[Place, option("MAP", "folder of a map, or demo:blobs")],
@@ -65,6 +75,10 @@ def run(arguments: list[str]) -> None:
         images: Annotated[int, option("K", "images at once, a sequence around the object")] = 1,
         angle: Annotated[float, option("DEGREES", "between neighbours of a sequence")] = 15.0,
         depth: Annotated[bool, option(None, "give the method the measured depth, where there is any")] = True,
+        depth_points: Annotated[
+            Path | None,
+            option("MODEL", "COLMAP sparse model: give it the points that the frames observe as well", ""),
+        ] = None,
         device: Annotated[str, option("NAME", "what the field computes on: cpu, cuda ...")] = "cpu",
         workers: Annotated[
             int | None, option("N", "processes, of one thread each", "one a core; one on a GPU")
@@ -82,10 +96,15 @@ def run(arguments: list[str]) -> None:
         tables and figures of the results.
         """
         _check(trials, seed, images, angle, workers, shards, shard)
+        with wrong_usage():
+            chosen = find_protocol(protocol)
+            for asked in _sizes(size) or ():
+                chosen.check_size(asked)
         names = tuple(name for group in frame for name in group) or None
         plan = Plan(
             map, data or _own_data(map), protocol, _sizes(size), method, changed_settings(method, config),
             trials, seed, split, names, images, angle, device, depth,
+            None if depth_points is None else str(depth_points),
         )  # fmt: skip
         mine = share(planned(plan), shard, shards)
         _evaluate(mine, out, workers, dask, command_line("bidnerf evaluate", arguments))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as jsonlib
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +21,13 @@ from bidnerf_core.cli.common import (
     MapFolder,
     Names,
     UsageError,
+    chosen_method,
     option,
     parse,
     print_json,
     read_views,
     require,
     say,
-    value_of,
 )
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
@@ -37,7 +38,7 @@ from bidnerf_core.evaluation import protocols
 from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.trials import plain_localization
 from bidnerf_core.frames import View
-from bidnerf_core.localization import METHODS, InerfConfig, Localization, find_method, rig
+from bidnerf_core.localization import METHODS, InerfConfig, Localization, rig
 from bidnerf_core.localization import localize as find_pose
 from bidnerf_core.localization import window as windowed
 from bidnerf_core.se3 import SE3
@@ -58,6 +59,13 @@ class Beginning:
             return read_pose(self.file)
         return None if self.perturb is None else protocols.perturb(truth, *self.perturb, seed)
 
+    def judge(self) -> None:
+        if self.perturb is not None:
+            for what, value, most in zip(("T", "R"), self.perturb, (math.inf, 180.0), strict=True):
+                if not (math.isfinite(value) and 0 <= value <= most):
+                    expected = "a finite number, 0 or more" if most == math.inf else "degrees from 0 to 180"
+                    raise UsageError(f"--perturb: {what} is {value:g}, expected {expected}")
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -72,6 +80,9 @@ class Seen:
     def judge(self) -> None:
         if not self.frames:
             raise UsageError("no frame to localize; name at least one with --frame")
+        twice = [name for name, count in Counter(self.frames).items() if count > 1]
+        if twice:
+            raise UsageError(f"--frame names {twice[0]} more than once, expected each frame of a rig once")
         require("--window", self.window, 1)
         if self.window > 1 and len(self.frames) > 1:
             raise UsageError(
@@ -83,8 +94,12 @@ class Seen:
         names = self.frames
         if self.window > 1:
             listed = dataset.frame_names(self.split)
+            require("--window", self.window, 1, len(listed))
             if names[0] in listed:  # else the dataset will tell
                 names = windowed(listed, listed.index(names[0]), self.window)
+                if len(names) < self.window:
+                    said = f"{names[-1]} has {len(names) - 1} before it in split {self.split!r}"
+                    say(f"--window {self.window}: {said}; a rig of {len(names)}")
         return read_views(dataset, self.split, names)
 
     def depth_rays(self, views: Sequence[View], info: MapInfo) -> DepthRays | None:
@@ -100,7 +115,7 @@ class Seen:
 
 def run(arguments: list[str]) -> None:
     """Parse with the settings of the method that the arguments name."""
-    kind = find_method(value_of("--method", arguments) or "auto").config_type
+    kind = chosen_method(arguments, "auto").config_type
 
     def localize(
         map: MapFolder,
@@ -151,6 +166,7 @@ def _localize(
     folder: Path, data: Path, seen: Seen, method: str, begin: Beginning, seed: int, as_json: bool, config: Any
 ) -> None:
     seen.judge()
+    begin.judge()
     require("--seed", seed, 0, LARGEST_SEED)
     stored = load_map(folder)
     views = seen.views(open_dataset(data, stored.bounds.background))

@@ -9,11 +9,11 @@ from typing import Annotated, Literal
 import tyro
 from rich.table import Table
 
-from bidnerf_core.cli.common import console, option, output_folder, parse, print_table
+from bidnerf_core.cli.common import UsageError, console, option, output_folder, parse, print_table
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import CRITERIA
 from bidnerf_core.evaluation.groups import Group, grouped, situations
-from bidnerf_core.evaluation.page import Figure, page
+from bidnerf_core.evaluation.page import MARK, Figure, page
 from bidnerf_core.evaluation.plots import NAMES, Figures
 from bidnerf_core.evaluation.provenance import read_runs
 from bidnerf_core.evaluation.results import read_results
@@ -40,10 +40,11 @@ def report(
     Trials are put side by side by map, start, method and settings. A trial that is in several files counts once.
     """
     if not results:
-        raise InputError("no file of results, expected at least one as 'bidnerf evaluate' writes it")
+        raise UsageError("no file of results, expected at least one as 'bidnerf evaluate' writes it")
     found = read_results(results)
     if not found:
         raise InputError(f"{', '.join(map(str, results))}: no finished trial in it, nothing to report")
+    _check_ours(out)
     runs = [(path.name, read_runs(path)) for path in results]
     groups = grouped(found)
     with output_folder(out, overwrite=True), console.status("drawing"):
@@ -51,6 +52,18 @@ def report(
         write_file(out / "index.html", text.encode())
     _print(groups)
     print(f"look at {out / 'index.html'}")
+
+
+def _check_ours(out: Path) -> None:
+    """A report may be replaced by a newer one; what is something else is left alone."""
+    try:
+        written = MARK in (out / "index.html").read_text(errors="replace")
+    except OSError:
+        written = False
+    if out.is_dir() and any(out.iterdir()) and not written:
+        raise InputError(
+            f"{out}: holds something that is no report of bidnerf's; name another --out or remove it"
+        )
 
 
 def draw(groups: Sequence[Group], folder: Path, criterion: str) -> list[Figure]:

@@ -22,15 +22,17 @@ from bidnerf_core.cli.common import (
     require,
     say,
     value_of,
+    wrong_usage,
 )
 from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
+from bidnerf_core.datasets.dataset import background_colour
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.plain import to_plain
 from bidnerf_core.registry import load_backend
-from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
+from bidnerf_core.storage import MapInfo, backend_of, build_field, load_info, load_state, stored_cameras
 from bidnerf_core.surface import BakeConfig
 from bidnerf_core.training import TrainingStopped
 
@@ -67,8 +69,9 @@ class Source:
 def run(arguments: list[str]) -> None:
     """Parse with the options of the backend that the arguments name."""
     named = value_of("--backend", arguments)
-    name = named or _resumed_backend(arguments) or DEFAULT_BACKEND
-    chosen = load_backend(name)
+    resumed = None if named else _resumed_map(arguments)
+    name = named or (resumed[1].backend if resumed else DEFAULT_BACKEND)
+    chosen = backend_of(*resumed) if resumed else load_backend(name)
     kind = chosen.config_type
 
     def train(
@@ -100,6 +103,9 @@ def run(arguments: list[str]) -> None:
         require("--checkpoint-every", checkpoint_every, 0)
         if resume and overwrite:
             raise UsageError("--resume goes on with a map, --overwrite begins anew; expected one of them")
+        if background is not None:
+            with wrong_usage():
+                background_colour(background)
         source = Source(data, split, background, depth_points, choice)
         try:
             if resume:
@@ -143,13 +149,13 @@ def load_interrupted(out: Path) -> MapInfo:
     return info
 
 
-def _resumed_backend(arguments: list[str]) -> str | None:
-    """The backend of the map that is to be resumed, if it can be known already."""
+def _resumed_map(arguments: list[str]) -> tuple[Path, MapInfo] | None:
+    """The map that is to be resumed, if it can be known already."""
     out = value_of("--out", arguments)
     if "--resume" not in arguments or out is None:
         return None
     try:
-        return load_info(Path(out)).backend
+        return Path(out), load_info(Path(out))
     except InputError:  # told later, if the arguments are otherwise right
         return None
 
@@ -198,7 +204,7 @@ def _resume(
             "--resume keeps --depth-points and what goes with it"
         )
     with output_folder(out, overwrite=True):
-        _run(load_backend(info.backend), info, out, views, checkpoint_seconds, baked)
+        _run(backend_of(out, info), info, out, views, checkpoint_seconds, baked)
 
 
 def _run(

@@ -19,7 +19,7 @@ from bidnerf_core.evaluation.closed_form_data import ClosedFormData
 from bidnerf_core.evaluation.protocols import Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.sequences import sequence
-from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, run_trial, settings_of
+from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, opened_points, run_trial, settings_of
 from bidnerf_core.localization import find_method
 from bidnerf_core.plain import to_plain
 
@@ -42,6 +42,7 @@ class Plan:
     angle: float = 15.0  # ... so many degrees apart
     device: str = "cpu"
     depth: bool = True  # measured depth, where there is any
+    depth_points: str | None = None  # COLMAP model, see Trial
 
 
 def planned(plan: Plan) -> list[Trial]:
@@ -51,6 +52,7 @@ def planned(plan: Plan) -> list[Trial]:
     settings_of(plan.method, plan.config)
     names = dataset.frame_names(plan.split)
     rigs = _rigs(plan, dataset, names)
+    _check_points(plan, rigs)
     sizes = protocol.sizes if plan.sizes is None else plan.sizes
     for size in sizes:
         protocol.check_size(size)
@@ -71,6 +73,7 @@ def planned(plan: Plan) -> list[Trial]:
             split=plan.split,
             device=plan.device,
             depth=plan.depth,
+            depth_points=plan.depth_points,
         )
         for size in sizes
         for place, seed in cases
@@ -207,6 +210,20 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
             f"{plan.angle:g} degrees apart around what the cameras look at"
         )
     return rigs
+
+
+def _check_points(plan: Plan, rigs: list[tuple[str, ...]]) -> None:
+    """Every trial must have some."""
+    points = opened_points(plan.depth_points, plan.map)
+    if points is None:
+        return
+    blind = [rig[-1] for rig in rigs if not any(len(points.seen(name, plan.split)) for name in rig)]
+    if blind:
+        listed = ", ".join(blind[:4]) + (", ..." if len(blind) > 4 else "")
+        raise InputError(
+            f"{plan.depth_points}: has no points for {len(blind)} of {len(rigs)} frames ({listed}); "
+            "choose others with --frame"
+        )
 
 
 def _found_sequences(

@@ -40,10 +40,12 @@ class Condition:
     backend: str
     device: str
     depth: bool
+    depth_points: str | None = None
 
     def facts(self) -> dict[str, Any]:
         """What tells conditions apart, by name."""
-        own = {"images": self.images, "depth": self.depth, "backend": self.backend, "device": self.device}
+        own = {"images": self.images, "depth": self.depth, "depth_points": self.depth_points}
+        own |= {"backend": self.backend, "device": self.device}
         return {"method": self.method, **own, **json.loads(self.settings)}
 
 
@@ -77,7 +79,9 @@ def situation_of(result: TrialResult) -> Situation:
 def condition_of(result: TrialResult) -> Condition:
     trial, settings = result.trial, json.dumps(result.settings, sort_keys=True)
     images = len(trial.frames)
-    return Condition(result.method, settings, images, result.backend, trial.device, trial.depth)
+    return Condition(
+        result.method, settings, images, result.backend, trial.device, trial.depth, trial.depth_points
+    )
 
 
 def labels(conditions: Sequence[Condition]) -> dict[Condition, str]:
@@ -127,6 +131,8 @@ def _said(name: str, value: Any) -> str:
         return f"{value} image{'s' if value != 1 else ''}"
     if name == "depth":
         return "RGB-D" if value else "RGB"
+    if name == "depth_points":
+        return "no points" if value is None else f"points of {value}"
     if name in ("backend", "device"):
         return str(value)
     shown = f"{value:g}" if isinstance(value, float) else "none" if value is None else str(value).lower()

@@ -14,6 +14,9 @@ from bidnerf_core.evaluation.plots import NAMES
 from bidnerf_core.evaluation.provenance import Provenance
 from bidnerf_core.evaluation.summary import Comparison, Judged, comparisons, summarize
 
+MARK = '<meta name="generator" content="bidnerf report">'
+"""By which a page is known as one of these."""
+
 CSS = """
 :root { color-scheme: light; }
 body { font: 16px/1.5 Georgia, "Times New Roman", serif; color: #222; background: #fff;
@@ -73,6 +76,7 @@ def page(
     ]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"{MARK}"
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{_text(title)}</title><style>{CSS}</style></head>\n<body>\n"
         + "\n".join(body)

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.evaluation.errors import PoseError, pose_error
@@ -28,7 +29,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.localization import Localization, find_method, localize, rig
 from bidnerf_core.plain import from_plain, to_plain
 from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import Map, load_map
+from bidnerf_core.storage import Map, load_info, load_map, places_of
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 
@@ -48,6 +49,7 @@ class Trial:
     split: str = "test"
     device: str = "cpu"  # that the field computes on
     depth: bool = True  # whether the method is given the measured depth
+    depth_points: str | None = None  # COLMAP model (folder) whose points that the frames observe it is given
 
     @property
     def frame(self) -> str:
@@ -56,7 +58,8 @@ class Trial:
     @property
     def portable(self) -> Trial:
         """The same with the names of folders only: it is one trial wherever they are."""
-        return replace(self, map=_name(self.map), data=_name(self.data))
+        points = None if self.depth_points is None else "/".join(_parts(self.depth_points)[-2:])  # sparse/0
+        return replace(self, map=_name(self.map), data=_name(self.data), depth_points=points)
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,9 @@ def run_trial(trial: Trial) -> TrialResult:
         truth, start = views[-1].T_ref_camera, start_of(trial, views, dataset)
         settings = settings_of(trial.method, trial.config)
         forget_peak_memory()
-        problem = rig(stored.field, stored.bounds, views, start, surface=stored.surface)
+        points = opened_points(trial.depth_points, trial.map)
+        rays = None if points is None else points.rays(views, trial.split)
+        problem = rig(stored.field, stored.bounds, views, start, rays, stored.surface)
         found = localize(problem, trial.method, settings, trial.seed)
         return _result(trial, stored, found, start, truth, settings)
 
@@ -154,6 +159,16 @@ def opened(map_folder: str, data: str, device: str = "cpu") -> tuple[Map, Datase
     if is_closed_form(data):
         return stored, closed_form_data(data)
     return stored, open_dataset(data, stored.bounds.background)
+
+
+@lru_cache(maxsize=4)
+def opened_points(folder: str | None, map_folder: str) -> SparsePoints | None:
+    """Points in ``folder``, in the unit of a map, by the places of the cameras that this was trained with."""
+    if folder is None:
+        return None
+    if is_closed_form(map_folder):
+        raise InputError(f"{map_folder}: was trained with no cameras, which tell the unit of {folder}")
+    return SparsePoints(Path(folder), places_of(load_info(Path(map_folder))), SparseChoice())
 
 
 def plain_localization(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
@@ -202,6 +217,10 @@ def _device(name: str) -> torch.device:
 
 def _name(folder: str) -> str:
     return folder if is_closed_form(folder) else Path(folder).resolve().name
+
+
+def _parts(folder: str) -> tuple[str, ...]:
+    return Path(folder).resolve().parts[1:]
 
 
 def _off(error: PoseError) -> Off | None:
