@@ -355,11 +355,11 @@ def test_ctrl_c_keeps_what_is_finished(
     ("words", "status", "said"),
     [
         (["--size", "half"], 2, "--size is half, expected numbers"),
-        (["--size", "-1"], 1, "size is -1, expected e_t"),
+        (["--size", "-1"], 2, "size is -1, expected e_t"),
         (["--trials", "0"], 2, "--trials is 0"),
         (["--shards", "2", "--shard", "2"], 2, "--shard is 2"),
         (["--protocol", "none"], 1, "needs a start"),
-        (["--protocol", "prallel"], 1, "did you mean 'parallel'"),
+        (["--protocol", "prallel"], 2, "did you mean 'parallel'"),
         (["--dask", "tcp://x:1", "--workers", "2"], 2, "contradict"),
     ],
 )
