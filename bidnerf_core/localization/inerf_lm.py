@@ -30,13 +30,14 @@ class InerfLmConfig(PolishConfig):
     search_steps: int = 8
     middle_poses: int = 6  # the best of these, which take more on larger ones
     middle_steps: int = 6
-    width: int = 16  # pixels along the longer side of the first renderings; later ones have half as many more
+    last_steps: int = 4  # of the best two, on the largest renderings
+    width: int = 16  # pixels along the longer side of the first renderings; later ones have half and twice as many more
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("poses", "search_poses", "middle_poses"):
             self._require(name, 1 <= getattr(self, name) <= 10**5, "1 to 100 thousand")
-        for name in ("search_steps", "middle_steps"):
+        for name in ("search_steps", "middle_steps", "last_steps"):
             self._require(name, 1 <= getattr(self, name) <= 10**5, "1 to 100 thousand")
         self._require("width", 4 <= self.width <= 1000, "4 to 1000 pixels")
         for name in ("spread_translation", "spread_rotation"):
@@ -55,6 +56,7 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
         Stage(config.width, 0, config.search_poses),
         Stage(config.width, config.search_steps, config.middle_poses),
         Stage(config.width * 3 // 2, config.middle_steps, 2),
+        Stage(config.width * 3, config.last_steps, 2),
     )
     found = search(rendered_sight(problem, start), many, stages)
     refined = polished(replace(problem, start=start), found.T, config, generator)

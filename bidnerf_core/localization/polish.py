@@ -20,15 +20,15 @@ from bidnerf_core.se3 import SE3
 class PolishConfig(Judged):
     """Settings of the steps on rendered rays."""
 
-    coarse_steps: int = 6  # of each pose that the search gave, at the coarsest level
-    coarse_rays: int = 512  # for each of them
-    fine_steps: int = 10  # of the best one, in full detail
+    coarse_steps: int = 4  # of each pose that the search gave, at the coarsest level
+    coarse_rays: int = 256  # for each of them
+    fine_steps: int = 8  # of the best one, in full detail
     fine_rays: int = 1024
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
     pivot: PivotName = "scene"  # what an update turns about: the middle of what is seen, camera, world
     colour_loss: RobustName = "huber"  # robust loss of colour differences
     colour_scale: float = 0.1  # of it, in differences of colour: about where an outlier begins
-    play: float = 0.02  # metres that surfaces may be off at coarse steps, half of it at fine ones
+    play: float = 0.006  # metres that surfaces may be off at coarse steps, half of it at fine ones
     exposure: bool = False  # estimate a gain and a bias of each colour along
     least_weight: float = 0.01  # samples of less rendering weight have no part in derivatives
     stop_step: float = 1e-4  # a stage ends once a step is shorter than this (metres, radians)
