@@ -62,8 +62,18 @@ def list_backends() -> list[BackendInfo]:
     return sorted(_with_rivals(infos), key=lambda info: (info.name, info.distribution, info.value))
 
 
-def load_backend(name: str) -> Backend:
-    """The backend of that name, imported and checked. Raises ``BackendError``, which names the culprit."""
+def load_backend(name: str, wanted_by: str = "") -> Backend:
+    """The backend of that name, imported and checked.
+
+    Raises ``BackendError``, which names the culprit and, where it is given, the map that is of no use without it.
+    """
+    try:
+        return _loaded(name)
+    except BackendError as error:
+        raise BackendError(f"{wanted_by}: {error}" if wanted_by else str(error)) from error.__cause__
+
+
+def _loaded(name: str) -> Backend:
     infos = list_backends()
     found = [info for info in infos if info.name == name and name != UNREADABLE]
     if not found:

@@ -29,7 +29,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.plain import from_plain, to_plain
-from bidnerf_core.registry import BackendError, load_backend
+from bidnerf_core.registry import load_backend
 from bidnerf_core.se3 import SE3
 from bidnerf_core.surface import SurfaceMap, surface_from_tensors, surface_tensors
 from bidnerf_core.training import TrainingState
@@ -149,18 +149,12 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
     ]
 
 
-def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
-    """Names of the training images, and T_world_camera, float64."""
-    return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
-
-
 def load_info(folder: Path) -> MapInfo:
     """Read and judge ``map.json``. Raises ``InputError`` where it is no map, or one of another version."""
     path = folder / DESCRIPTION
-    if folder.is_file():
-        raise InputError(f"{folder}: is a file, expected the folder of a map as written by 'bidnerf train'")
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder, expected a map as written by 'bidnerf train'")
+        what = "is a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: {what}, expected a map: a folder as written by 'bidnerf train'")
     if not path.is_file():
         raise InputError(f"{folder}: no {DESCRIPTION} in it, expected a map as written by 'bidnerf train'")
     try:
@@ -186,20 +180,12 @@ def load_map(folder: Path, device: torch.device | str = "cpu", surface: bool = T
     ``surface``: whether to read that as well.
     """
     info, tensors, baked = _read(folder, surface)
-    field, _ = build_field(backend_of(folder, info), info, str(folder / DESCRIPTION))
+    field, _ = build_field(load_backend(info.backend, str(folder)), info, str(folder / DESCRIPTION))
     _check_weights(field, tensors, folder / info.weights)
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
     return Map(info, field, baked)
-
-
-def backend_of(folder: Path, info: MapInfo) -> Backend:
-    """The backend that made the map in ``folder``. Raises ``BackendError``, which names both."""
-    try:
-        return load_backend(info.backend)
-    except BackendError as error:
-        raise BackendError(f"{folder / DESCRIPTION}: {error}") from error
 
 
 def load_surface(path: Path) -> SurfaceMap:

@@ -326,7 +326,7 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "a file": (
         into_a_file,
-        ("is a file, expected the folder of a map",),
+        ("is a file, expected a map: a folder",),
     ),
     "another format": (
         of_description(lambda content: content.update(format="x")),
@@ -430,9 +430,7 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
     (interrupted / str(load_info(interrupted).training)).write_bytes(b"junk")
     assert_refused(bidnerf(*resume, interrupted), 1, "training-", "expected a safetensors file")
     of_description(lambda content: content.update(backend="hashgird"))(interrupted)
-    assert_refused(
-        bidnerf(*resume, interrupted), 1, str(interrupted / "map.json"), "'hashgird'", "installed: "
-    )
+    assert_refused(bidnerf(*resume, interrupted), 1, str(interrupted), "'hashgird'", "installed: ")
 
 
 # Places that cannot be written.

@@ -36,13 +36,13 @@ from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.evaluation.errors import PoseError, pose_error
-from bidnerf_core.evaluation.trials import plain_localization
+from bidnerf_core.evaluation.trials import places_of, plain_localization
 from bidnerf_core.frames import View
 from bidnerf_core.localization import METHODS, InerfConfig, Localization, rig
 from bidnerf_core.localization import localize as find_pose
 from bidnerf_core.localization import window as windowed
 from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import MapInfo, load_map, places_of
+from bidnerf_core.storage import MapInfo, load_map
 
 one_of = tyro.conf.create_mutex_group(required=True, title="where to start")
 

@@ -32,7 +32,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.plain import to_plain
 from bidnerf_core.registry import load_backend
-from bidnerf_core.storage import MapInfo, backend_of, build_field, load_info, load_state, stored_cameras
+from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
 from bidnerf_core.surface import BakeConfig
 from bidnerf_core.training import TrainingStopped
 
@@ -71,7 +71,7 @@ def run(arguments: list[str]) -> None:
     named = value_of("--backend", arguments)
     resumed = None if named else _resumed_map(arguments)
     name = named or (resumed[1].backend if resumed else DEFAULT_BACKEND)
-    chosen = backend_of(*resumed) if resumed else load_backend(name)
+    chosen = load_backend(name, str(resumed[0]) if resumed else "")
     kind = chosen.config_type
 
     def train(
@@ -204,7 +204,7 @@ def _resume(
             "--resume keeps --depth-points and what goes with it"
         )
     with output_folder(out, overwrite=True):
-        _run(backend_of(out, info), info, out, views, checkpoint_seconds, baked)
+        _run(load_backend(info.backend, str(out)), info, out, views, checkpoint_seconds, baked)
 
 
 def _run(

@@ -29,7 +29,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.localization import Localization, find_method, localize, rig
 from bidnerf_core.plain import from_plain, to_plain
 from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import Map, load_info, load_map, places_of
+from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 
@@ -169,6 +169,11 @@ def opened_points(folder: str | None, map_folder: str) -> SparsePoints | None:
     if is_closed_form(map_folder):
         raise InputError(f"{map_folder}: was trained with no cameras, which tell the unit of {folder}")
     return SparsePoints(Path(folder), places_of(load_info(Path(map_folder))), SparseChoice())
+
+
+def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
+    """Names of the training images, and T_world_camera, float64."""
+    return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
 
 
 def plain_localization(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
