@@ -181,7 +181,10 @@ def _localize(
     problem = rig(stored.field, stored.bounds, views, start, depth_rays, stored.surface)
     found = find_pose(problem, method, config, seed)
     if depth_rays is not None and found.method == "auto":
-        say(f"{seen.depth_points}: method auto took the depth of the images instead; --method bid takes both")
+        taken = "colours" if len(bare) == len(views) else "depth"
+        say(
+            f"{seen.depth_points}: method auto took the {taken} of the images instead; --method bid takes both"
+        )
     if not bool(found.T_world_camera.matrix().isfinite().all()):
         raise InputError(f"{folder}: {found.method} came to a pose that is not finite, expected a sound map")
     error = pose_error(found.T_world_camera, truth)

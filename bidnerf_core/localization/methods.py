@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.auto import AutoConfig, auto
+from bidnerf_core.localization.auto import AutoConfig
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.bid_lm import BidLmConfig, bid_lm
+from bidnerf_core.localization.by_depth import by_depth_or_colour
 from bidnerf_core.localization.inerf import InerfConfig, inerf
 from bidnerf_core.localization.inerf_lm import InerfLmConfig, inerf_lm
 from bidnerf_core.localization.problem import Problem
@@ -26,7 +27,9 @@ class Method:
 
 
 METHODS = {
-    "auto": Method(auto, AutoConfig, "search and alignment on the baked surface; no start needed"),
+    "auto": Method(
+        by_depth_or_colour, AutoConfig, "search on the baked surface, by depth or colour; no start needed"
+    ),
     "bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)"),
     "inerf": Method(inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)"),
     "bid-lm": Method(bid_lm, BidLmConfig, "second-order steps on colour and depth, from coarse to fine"),

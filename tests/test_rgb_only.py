@@ -1,0 +1,90 @@
+"""Method ``auto`` without depth: a closed-form field, its baked surface, and images that nothing else is known of."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import pytest
+import torch
+
+import baked
+from bidnerf_core.closed_fields import GaussianBlobs
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization import AutoConfig, Localization, Problem, localize, rig
+from bidnerf_core.rendering import render_image
+from bidnerf_core.rigs import orbit
+from bidnerf_core.se3 import SE3
+from bidnerf_core.surface import SurfaceMap, bake
+
+BOUNDS = replace(baked.BOUNDS, lower=(-1.2, -1.2, -1.2), upper=(1.2, 1.2, 1.2))
+FIELD = GaussianBlobs.random(density=60.0)
+QUICK = AutoConfig(hypotheses=48, rounds=1)
+SEEN = orbit(3.5, 24, elevation=(-10.0, 80.0), seed=0)
+UNSEEN = orbit(3.5, 3, elevation=(-10.0, 80.0), seed=7)
+
+
+@functools.cache
+def surface() -> SurfaceMap:
+    return bake(FIELD, BOUNDS, [(baked.CAMERA, T) for T in SEEN], config=baked.CONFIG)
+
+
+def photograph(T: SE3, depth: bool = False) -> View:
+    seen = render_image(FIELD, baked.CAMERA, T, BOUNDS)
+    return View(Frame("frame", seen.rgb, baked.CAMERA, seen.depth if depth else None), T)
+
+
+def problem(*views: View, start: SE3 | None = None) -> Problem:
+    return rig(FIELD, BOUNDS, views, start, surface=surface())
+
+
+def assert_right(found: Localization, truth: SE3) -> None:
+    error = pose_error(found.T_world_camera, truth)
+    assert float(error.translation) < 0.03
+    assert float(error.rotation_deg) < 0.5
+    assert found.converged, found.reason
+
+
+def test_no_start_is_needed() -> None:
+    truth = UNSEEN[1]
+    found = localize(problem(photograph(truth)), "auto", QUICK)
+    assert_right(found, truth)
+    assert found.method == "auto"
+    assert found.steps == len(found.losses) == len(found.poses.translation) - 1
+    assert found.covariance is not None
+    assert float(normalized_error_squared(found.T_world_camera, truth, found.covariance)) < 16.8
+
+
+def test_measured_depth_that_is_too_little_does_no_harm() -> None:
+    view = photograph(UNSEEN[2], depth=True)
+    assert view.frame.depth is not None
+    depth = torch.zeros_like(view.frame.depth)
+    depth[30:33, 30:40] = view.frame.depth[30:33, 30:40]
+    few = View(replace(view.frame, depth=depth), view.T_ref_camera)
+    assert_right(localize(problem(few), "auto", QUICK, 3), UNSEEN[2])
+
+
+def test_a_start_is_one_more_place_to_look() -> None:
+    truth = UNSEEN[0]
+    aside = replace(surface(), keyframes=surface().keyframes[:1])
+    turned = truth @ SE3.exp(torch.tensor([0.1, 0.0, 0.1, 0.1, 0.3, 0.1], dtype=torch.float64))
+    found = localize(
+        rig(FIELD, BOUNDS, [photograph(truth)], turned, surface=aside), "auto", replace(QUICK, hypotheses=96)
+    )
+    assert_right(found, truth)
+
+
+def test_an_image_of_something_else_is_not_believed() -> None:
+    view = baked.unseen()[0]
+    other = View(replace(view.frame, depth=None), view.T_ref_camera)
+    found = localize(problem(other), "auto", QUICK)
+    assert not found.converged
+    assert "expected" in found.reason
+
+
+def test_a_map_without_surface_needs_a_start() -> None:
+    with pytest.raises(InputError, match=r"no surface .*needs a start") as told:
+        localize(rig(FIELD, BOUNDS, [photograph(UNSEEN[0])], None), "auto", QUICK)
+    assert "\n" not in str(told.value)
