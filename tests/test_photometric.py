@@ -97,6 +97,7 @@ def test_colour_alone_finds_a_place_that_is_far() -> None:
     assert float(pose_error(found.T_world_camera, TRUTH).translation) < 0.03
     assert found.converged, found.reason
     assert found.steps == len(found.losses) == len(found.poses.translation) - 1
+    assert torch.equal(found.poses[0].matrix(), start.matrix())
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:

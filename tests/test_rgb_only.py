@@ -74,6 +74,7 @@ def test_a_start_is_one_more_place_to_look() -> None:
         rig(FIELD, BOUNDS, [photograph(truth)], turned, surface=aside), "auto", replace(QUICK, hypotheses=96)
     )
     assert_right(found, truth)
+    assert torch.equal(found.poses[0].matrix(), turned.matrix())
 
 
 def test_an_image_of_something_else_is_not_believed() -> None:

@@ -85,22 +85,22 @@ def doubted(refined: Refined, found: Found, config: PolishConfig) -> str | None:
 def answered(
     problem: Problem, refined: Refined, found: Found, config: PolishConfig, began: float, doubt: str | None
 ) -> Localization:
-    """The way through the search and then over rendered rays is one."""
-    rotations, translations = (
-        torch.cat([getattr(found.path, part)[:-1], getattr(refined.poses, part)])
-        for part in ("rotation", "translation")
-    )
+    """The way through the search and then over rendered rays is one, and begins at the start if there is one: to choose a
+    hypothesis is part of the first step.
+    """
+    way = [T[i] for T in (found.path[:-1], refined.poses) for i in range(len(T.translation))]
+    way[0] = problem.start or way[0]
     # Rays that are side by side err alike: as where depth was measured, those of a view count for a few only.
     covariance = refined.covariance * max(1.0, config.fine_rays / (INDEPENDENT * len(problem.views)))
     return Localization(
         T_world_camera=refined.T.normalized(),
         converged=doubt is None,
         reason=doubt or f"{refined.inliers:.0%} of fresh rays see what was measured",
-        steps=len(rotations) - 1,
+        steps=len(way) - 1,
         seconds=time.perf_counter() - began,
         loss=refined.loss,
         method="auto",
-        poses=SE3(rotations, translations),
+        poses=SE3.stack(way),
         losses=torch.cat([found.losses, refined.losses]),
         covariance=covariance if bool(covariance.isfinite().all()) else None,
     )
