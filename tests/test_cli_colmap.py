@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,6 +64,12 @@ def assert_refused(outcome: Outcome, status: int, *fragments: str) -> None:
     assert all(fragment in outcome.err for fragment in fragments), outcome.err
 
 
+def assert_refused_last(outcome: Outcome, *fragments: str) -> None:
+    """With something said before."""
+    assert (outcome.status, outcome.out) == (1, "")
+    assert all(fragment in outcome.err.splitlines()[-1] for fragment in fragments), outcome.err
+
+
 def test_training_takes_depth_from_the_points(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     train = ["train", shared / "data", *tiny.options()]
     found = bidnerf(*train, "--out", tmp_path / "map", "--depth-points", shared / "sparse")
@@ -114,6 +121,22 @@ def test_localization_takes_the_points_that_the_frames_observe(bidnerf: Run, sha
     assert "its unit is 0.37 m by 6 training cameras" in with_points.err
     assert "points seen" in with_points.err
     assert "none by" not in with_points.err
+
+
+def test_with_a_surface_the_points_take_the_place_of_a_start(
+    bidnerf: Run, shared: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(shared / "map", tmp_path / "map"))
+    frames = ["--frame", "t_0002", "--window", 3, "--no-start", "--json"]
+    place = ["localize", folder, shared / "data", *frames]
+    points = ["--depth-points", shared / "sparse"]
+    assert_refused_last(bidnerf(*place, *points), "needs a start")
+    assert bidnerf("bake", folder, "--data", shared / "dense").status == 0
+    found = bidnerf(*place, *points)
+    assert found.status == 0
+    assert json.loads(found.out)["method"] == "auto"
+    assert "auto took the depth of the images" not in found.err
+    assert "colour only" not in found.err
 
 
 def test_a_bench_takes_them_too(bidnerf: Run, shared: Path, tmp_path: Path) -> None:

@@ -36,13 +36,13 @@ from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.evaluation.errors import PoseError, pose_error
-from bidnerf_core.evaluation.trials import places_of, plain_localization
+from bidnerf_core.evaluation.trials import places_of, plain_localization, with_points
 from bidnerf_core.frames import View
 from bidnerf_core.localization import METHODS, InerfConfig, Localization, rig
 from bidnerf_core.localization import localize as find_pose
 from bidnerf_core.localization import window as windowed
 from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import MapInfo, load_map
+from bidnerf_core.storage import Map, load_map
 
 one_of = tyro.conf.create_mutex_group(required=True, title="where to start")
 
@@ -102,15 +102,16 @@ class Seen:
                     say(f"--window {self.window}: {said}; a rig of {len(names)}")
         return read_views(dataset, self.split, names)
 
-    def depth_rays(self, views: Sequence[View], info: MapInfo) -> DepthRays | None:
-        """What ``depth_points`` holds for these views, in the frame of the last one's camera."""
+    def with_points(self, views: list[View], method: str, stored: Map) -> tuple[list[View], DepthRays | None]:
+        """The views with what ``depth_points`` holds for them: depth images, or rays of the last one's camera."""
         if self.depth_points is None or not self.depth_points.is_dir():
-            return None if self.depth_points is None else read_depth_points(self.depth_points)
-        sparse = SparsePoints(self.depth_points, places_of(info), self.choice)
-        rays = sparse.rays(views, self.split)
-        blind = [v.frame.name for v in views if len(sparse.seen(v.frame.name, self.split)) == 0]
-        say(f"{sparse.summary}; {len(rays)} points seen{', none by ' + ', '.join(blind) if blind else ''}")
-        return rays
+            return views, None if self.depth_points is None else read_depth_points(self.depth_points)
+        sparse = SparsePoints(self.depth_points, places_of(stored.info), self.choice)
+        given = with_points(sparse, views, self.split, method, stored)
+        counts = {v.frame.name: len(sparse.seen(v.frame.name, self.split)) for v in views}
+        blind = ", ".join(name for name, count in counts.items() if count == 0)
+        say(f"{sparse.summary}; {sum(counts.values())} points seen{blind and f', none by {blind}'}")
+        return given
 
 
 def run(arguments: list[str]) -> None:
@@ -170,7 +171,7 @@ def _localize(
     require("--seed", seed, 0, LARGEST_SEED)
     stored = load_map(folder)
     views = seen.views(open_dataset(data, stored.bounds.background))
-    depth_rays = seen.depth_rays(views, stored.info)
+    views, depth_rays = seen.with_points(views, method, stored)
     if depth_rays is not None and isinstance(config, InerfConfig):
         say(f"{seen.depth_points}: method inerf heeds no depth")
     truth = views[-1].T_ref_camera

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
+from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.evaluation.errors import PoseError, pose_error
@@ -27,6 +28,7 @@ from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.frames import View
 from bidnerf_core.localization import Localization, find_method, localize, rig
+from bidnerf_core.localization.auto import LEAST_POINTS
 from bidnerf_core.plain import from_plain, to_plain
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
@@ -117,7 +119,9 @@ def run_trial(trial: Trial) -> TrialResult:
         settings = settings_of(trial.method, trial.config)
         forget_peak_memory()
         points = opened_points(trial.depth_points, trial.map)
-        rays = None if points is None else points.rays(views, trial.split)
+        rays = None
+        if points is not None:
+            views, rays = with_points(points, views, trial.split, trial.method, stored)
         problem = rig(stored.field, stored.bounds, views, start, rays, stored.surface)
         found = localize(problem, trial.method, settings, trial.seed)
         return _result(trial, stored, found, start, truth, settings)
@@ -169,6 +173,21 @@ def opened_points(folder: str | None, map_folder: str) -> SparsePoints | None:
     if is_closed_form(map_folder):
         raise InputError(f"{map_folder}: was trained with no cameras, which tell the unit of {folder}")
     return SparsePoints(Path(folder), places_of(load_info(Path(map_folder))), SparseChoice())
+
+
+def with_points(
+    points: SparsePoints, views: list[View], split: str, method: str, stored: Map
+) -> tuple[list[View], DepthRays | None]:
+    """The points that ``views`` observe as method ``auto`` takes them, in images, or as others do: rays of their own.
+
+    In an image they are so few that rays drawn anywhere would not meet them; ``auto`` looks at all that was measured. It
+    takes rays as well where it can do no better than ``bid``. Raises ``InputError`` where nothing is observed.
+    """
+    if method == "auto" and stored.surface is not None and not any(v.frame.has_depth for v in views):
+        seen = [points.onto(view, split) for view in views]
+        if sum(int((v.frame.depth > 0).sum()) for v in seen if v.frame.depth is not None) >= LEAST_POINTS:
+            return seen, None
+    return views, points.rays(views, split)
 
 
 def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
