@@ -109,6 +109,11 @@ class SE3:
             torch.stack([t.rotation for t in transforms]), torch.stack([t.translation for t in transforms])
         )
 
+    @staticmethod
+    def cat(batches: list[SE3]) -> SE3:
+        """Batches along one axis, one after the other."""
+        return SE3(torch.cat([b.rotation for b in batches]), torch.cat([b.translation for b in batches]))
+
 
 def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """``skew(a) @ b = a x b``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,16 +10,23 @@ import torch
 
 import baked
 import bidnerf_core.localization.auto as module
+from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.frames import View
+from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import AutoConfig, Localization, Problem, localize, rig
 from bidnerf_core.localization.bid import BidConfig
+from bidnerf_core.localization.clouds import measured_cloud
+from bidnerf_core.localization.search import Found, score
+from bidnerf_core.rendering import render_image
+from bidnerf_core.rigs import orbit
 from bidnerf_core.scenes import demo_room
 from bidnerf_core.se3 import SE3
+from bidnerf_core.surface import bake
 
-QUICK = AutoConfig(points=1000, hypotheses=128)
+QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)
+"""The field of these tests does not show the toy."""
 
 
 def found_for(problem: Problem, seed: int = 0) -> Localization:
@@ -51,7 +59,9 @@ def test_a_start_helps_where_the_map_has_no_view_alike() -> None:
     aside = replace(baked.toy(), keyframes=torch.eye(4, dtype=torch.float64)[None])
     start = perturb(view.T_ref_camera, 0.2, 10, 0)
     found = localize(
-        baked.problem(view, start=start, surface=aside), "auto", AutoConfig(hypotheses=32, rounds=1)
+        baked.problem(view, start=start, surface=aside),
+        "auto",
+        AutoConfig(hypotheses=32, rounds=1, refine_steps=0),
     )
     assert_right(found, view.T_ref_camera)
 
@@ -71,6 +81,39 @@ def test_the_same_seed_gives_the_same_answer() -> None:
     assert torch.equal(first.T_world_camera.matrix(), again.T_world_camera.matrix())
     assert torch.equal(first.losses, again.losses)
     assert not torch.equal(first.T_world_camera.matrix(), found_for(problem, 4).T_world_camera.matrix())
+
+
+def shown(field: GaussianBlobs, count: int, seed: int) -> list[View]:
+    """Images of what a field shows, with its depth."""
+    views = []
+    for place, T in enumerate(orbit(3.5, count, elevation=(-10.0, 60.0), seed=seed)):
+        image = render_image(field, baked.CAMERA, T, baked.BOUNDS)
+        depth = torch.where(image.opacity > 0.95, image.depth, 0)
+        views.append(View(Frame(f"{place:04d}", image.rgb, baked.CAMERA, depth), T))
+    return views
+
+
+def test_the_field_refines_what_the_surface_found() -> None:
+    field = GaussianBlobs.random(density=60.0)
+    surface = bake(field, baked.BOUNDS, [], shown(field, 12, seed=0), baked.CONFIG)
+    view = shown(field, 1, seed=5)[0]
+    problem = rig(field, baked.BOUNDS, [view], None, surface=surface)
+    generator = torch.Generator().manual_seed(0)
+    cloud = measured_cloud(problem, 500, generator)
+    near = perturb(view.T_ref_camera, 0.08, 3, 0)
+    found = Found(near, float(score(surface, cloud, near[None])[0]), math.inf, near[None])
+    refined = module._refined(problem, surface, cloud, found, AutoConfig(refine_steps=4), generator)
+    error = pose_error(refined.T, view.T_ref_camera)
+    assert float(error.translation) < 0.02
+    assert float(error.rotation_deg) < 0.5
+    assert torch.equal(refined.path[0].matrix(), near.matrix())
+    assert len(refined.path.translation) > 1
+
+
+def test_a_field_that_does_not_show_the_surface_has_no_say() -> None:
+    problem = baked.problem(baked.unseen()[0])
+    found = localize(problem, "auto", replace(QUICK, refine_steps=3), 0)
+    assert torch.equal(found.T_world_camera.matrix(), found_for(problem).T_world_camera.matrix())
 
 
 def test_an_image_of_something_else_is_not_found() -> None:

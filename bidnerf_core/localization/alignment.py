@@ -104,15 +104,28 @@ def alignment(surface: SurfaceMap, cloud: Cloud, scales: Scales, T: SE3) -> Syst
     """
     touch = contact(surface, cloud, T)
     near = falling(touch.squared, scales.distance)
-    weight, cost = near**2 / scales.distance**2, (1 - near).mean(-1)
+    weight = near**2 / scales.distance**2
     if not scales.colour_weight:
-        return System(cost.double(), *_distances(touch, cloud, weight))
+        return System((1 - near).mean(-1).double(), *_distances(touch, cloud, weight))
     tint, gradient = colours(surface, touch, cloud)
     alike = falling((tint**2).sum(-1), scales.colour)
-    cost = cost + scales.colour_weight * (1 - near * alike).mean(-1)
     system = _distances(touch, cloud, weight * (1 + scales.colour_weight * alike))
     tinted = _tints(tint, gradient, scales.colour_weight * near * alike**2 / scales.colour**2, touch, cloud)
-    return System(cost.double(), *(a + b for a, b in zip(system, tinted, strict=True)))
+    return System(_cost(near, alike, scales), *(a + b for a, b in zip(system, tinted, strict=True)))
+
+
+def cost(surface: SurfaceMap, cloud: Cloud, scales: Scales, T: SE3) -> Float[Tensor, "h"]:
+    """That of ``alignment``, without the time that derivatives take."""
+    touch = contact(surface, cloud, T)
+    near = falling(touch.squared, scales.distance)
+    if not scales.colour_weight:
+        return (1 - near).mean(-1).double()
+    tint, _ = colours(surface, touch, cloud)
+    return _cost(near, falling((tint**2).sum(-1), scales.colour), scales)
+
+
+def _cost(near: Float[Tensor, "h p"], alike: Float[Tensor, "h p"], scales: Scales) -> Float[Tensor, "h"]:
+    return ((1 - near).mean(-1) + scales.colour_weight * (1 - near * alike).mean(-1)).double()
 
 
 def misfit(surface: SurfaceMap, cloud: Cloud, scales: Scales, T: SE3) -> Float[Tensor, "h"]:

@@ -1,4 +1,6 @@
-"""Method ``auto``: find the pose on the baked surface, with a start or without one, and say whether to believe it."""
+"""Method ``auto``: find the pose on the baked surface, with a start or without one, refine it on what the field itself
+shows, and say whether to believe it.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +8,26 @@ import time
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Generator
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.alignment import Cloud
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.clouds import measured_cloud
 from bidnerf_core.localization.hypotheses import hypotheses
+from bidnerf_core.localization.photometric import refine
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search import Found, score, search
-from bidnerf_core.localization.verdict import Bars, Evidence, covariance, evidence
+from bidnerf_core.localization.stages import Refinement, Stage
+from bidnerf_core.localization.verdict import Bars, covariance, evidence
+from bidnerf_core.se3 import SE3
 from bidnerf_core.surface import SurfaceMap
 
 LEAST_POINTS = 50
 """With fewer there is no shape to recognise."""
+WORSE = 0.05
+"""By how much refinement may raise the cost on the surface; a field that asks for more does not show what was baked."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +37,13 @@ class AutoConfig:
     points: int = 2000  # of the measured pixels, at most
     hypotheses: int = 256  # that a round of the search begins with
     rounds: int = 3  # of search, each with fresh hypotheses, until an answer is believed
+    refine_steps: int = 2  # on rendered rays, of the answer; 0: the surface has the last word
+    refine_rays: int = 512
 
     def __post_init__(self) -> None:
         for name, least, most in (
-            ("points", LEAST_POINTS, 10**6), ("hypotheses", 8, 10**5), ("rounds", 1, 100)
+            ("points", LEAST_POINTS, 10**6), ("hypotheses", 8, 10**5), ("rounds", 1, 100),
+            ("refine_steps", 0, 1000), ("refine_rays", 64, 10**6),
         ):  # fmt: skip
             if not least <= getattr(self, name) <= most:
                 raise InputError(f"{name} is {getattr(self, name)}, expected {least} to {most}")
@@ -44,14 +55,19 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     Raises ``InputError`` where that needs a start and there is none.
     """
     began = time.perf_counter()
-    generator = torch.Generator().manual_seed(seed)
+    generator = Generator().manual_seed(seed)
     if problem.surface is None:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
     cloud = measured_cloud(problem, config.points, generator)
     if len(cloud) < LEAST_POINTS:
         return _descended(problem, seed, f"{len(cloud)} pixels have depth, expected {LEAST_POINTS} or more")
     with torch.no_grad():
-        found, speaks, doubt = _searched(problem, problem.surface, cloud, config, generator)
+        found = _searched(problem, problem.surface, cloud, config, generator)
+    if config.refine_steps:
+        found = _refined(problem, problem.surface, cloud, found, config, generator)
+    with torch.no_grad():
+        speaks = evidence(problem.surface, cloud, found)
+        doubt = speaks.doubt(Bars())
         spread = covariance(problem.surface, cloud, found.T, len(problem.views))
         losses = score(problem.surface, cloud.first(200), found.path)
     return Localization(
@@ -69,18 +85,35 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
 
 
 def _searched(
-    problem: Problem, surface: SurfaceMap, cloud: Cloud, config: AutoConfig, generator: torch.Generator
-) -> tuple[Found, Evidence, str | None]:
-    """Rounds of search until an answer is believed; else the best of them, and what speaks against it."""
+    problem: Problem, surface: SurfaceMap, cloud: Cloud, config: AutoConfig, generator: Generator
+) -> Found:
+    """Rounds of search until an answer is believed; else the best of them."""
     answers: list[Found] = []
     while True:
         pool = hypotheses(surface, cloud, problem.start, config.hypotheses, generator)
         answers.append(search(surface, cloud, pool))
         best = min(answers, key=lambda found: found.score)
-        speaks = evidence(surface, cloud, best)
-        doubt = speaks.doubt(Bars())
-        if doubt is None or len(answers) == config.rounds:
-            return best, speaks, doubt
+        if len(answers) == config.rounds or evidence(surface, cloud, best).doubt(Bars()) is None:
+            return best
+
+
+def _refined(
+    problem: Problem,
+    surface: SurfaceMap,
+    cloud: Cloud,
+    found: Found,
+    config: AutoConfig,
+    generator: Generator,
+) -> Found:
+    """The surface is as coarse as its cells; the field is not, and has seen every pixel of the training images."""
+    cell = surface.cell
+    stage = Stage(config.refine_steps, config.refine_rays, depth_scale=6 * cell, play=cell / 2)
+    refined = refine(problem, found.T[None], (stage,), Refinement(), generator)
+    with torch.no_grad():
+        before, after = score(surface, cloud, SE3.stack([found.T, refined.T])).tolist()
+    if after > before + WORSE:
+        return found
+    return replace(found, T=refined.T, score=after, path=SE3.cat([found.path, refined.poses[1:]]))
 
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:

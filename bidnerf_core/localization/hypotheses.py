@@ -28,7 +28,7 @@ def hypotheses(surface: SurfaceMap, cloud: Cloud, start: SE3 | None, count: int,
     alike = scattered(drawn(keyframes, half - len(turns), generator), surface, generator)
     rotations = torch.cat([alike.rotation, turns])
     pools.append(centred(rotations, surface, cloud))
-    return SE3(torch.cat([p.rotation for p in pools]), torch.cat([p.translation for p in pools]))
+    return SE3.cat(pools)
 
 
 def centred(rotations: Float[Tensor, "h 3 3"], surface: SurfaceMap, cloud: Cloud) -> SE3:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.localization.alignment import Cloud, Scales, alignment
+from bidnerf_core.localization.alignment import Cloud, Scales, alignment, cost
 from bidnerf_core.localization.levenberg_marquardt import descend
 from bidnerf_core.se3 import SE3
 from bidnerf_core.surface import SurfaceMap
@@ -39,10 +39,10 @@ class Stage:
 # Colour has no say at first: its derivatives reach no farther than a surfel, and from afar they only hold a pose back.
 STAGES = (
     Stage(48, 0, 96, 0.3, 0.0),
-    Stage(48, 10, 24, 0.3, 0.0),
-    Stage(100, 20, 6, 0.2, 0.0),
-    Stage(400, 8, 2, 0.05, 0.1),
-    Stage(2000, 10, 1, 0.0, 1.0),
+    Stage(48, 8, 24, 0.3, 0.0),
+    Stage(100, 10, 6, 0.2, 0.0),
+    Stage(400, 6, 2, 0.05, 0.1),
+    Stage(2000, 4, 1, 0.0, 1.0),
 )
 
 
@@ -72,15 +72,12 @@ def search(surface: SurfaceMap, cloud: Cloud, start: SE3, stages: tuple[Stage, .
             now = _lead(surface, cloud, done.T[scores.argsort()], scores.sort().values)
             lead = now if math.isfinite(now) else lead
         T, scores = done.T[best], scores[best]
-    rotations, translations = (
-        torch.cat([getattr(path, part)[:, 0] for path in paths]) for part in ("rotation", "translation")
-    )
-    return Found(T[0], float(scores[0]), lead, SE3(rotations, translations))
+    return Found(T[0], float(scores[0]), lead, SE3.cat([path[:, 0] for path in paths]))
 
 
 def score(surface: SurfaceMap, cloud: Cloud, T: SE3) -> Float[Tensor, "h"]:
     """What poses are compared by: the cost at one scale for all."""
-    return alignment(surface, cloud, Scales(JUDGED * surface.extent), T).cost
+    return cost(surface, cloud, Scales(JUDGED * surface.extent), T)
 
 
 def _lead(surface: SurfaceMap, cloud: Cloud, T: SE3, scores: Float[Tensor, "h"]) -> float:
