@@ -1,4 +1,4 @@
-"""What ``bid-lm`` and ``inerf-lm`` are settings of: many poses about the start, few of them refined, one answered with."""
+"""What ``bid-lm`` is settings of: many poses about the start, few of them refined, one answered with."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bidnerf_core.robust import RobustName
 
 @dataclass(frozen=True)
 class SecondOrderConfig(Judged):
-    """Settings that both methods share."""
+    """Settings of steps on colour, with depth or without."""
 
     poses: int = 32  # looked at first: the start, and others about it; 1: the start alone
     spread_translation: float = 0.3  # their standard deviation along each axis of the camera, metres
