@@ -64,6 +64,8 @@ def test_a_start_helps_where_the_map_has_no_view_alike() -> None:
         AutoConfig(hypotheses=32, rounds=1, refine_steps=0),
     )
     assert_right(found, view.T_ref_camera)
+    assert torch.equal(found.poses[0].matrix(), start.matrix())
+    assert torch.allclose(found.poses[-1].matrix(), found.T_world_camera.matrix())
 
 
 def test_a_rig_is_placed_by_its_last_camera() -> None:

@@ -69,7 +69,8 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         speaks = evidence(problem.surface, cloud, found)
         doubt = speaks.doubt(Bars())
         spread = covariance(problem.surface, cloud, found.T, len(problem.views))
-        losses = score(problem.surface, cloud.first(200), found.path)
+        path = _way(problem.start, found.path)
+        losses = score(problem.surface, cloud.first(200), path)
     return Localization(
         T_world_camera=found.T.normalized(),
         converged=doubt is None,
@@ -78,7 +79,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         seconds=time.perf_counter() - began,
         loss=found.score,
         method="auto",
-        poses=found.path,
+        poses=path,
         losses=losses[:-1],
         covariance=spread,
     )
@@ -114,6 +115,11 @@ def _refined(
     if after > before + WORSE:
         return found
     return replace(found, T=refined.T, score=after, path=SE3.cat([found.path, refined.poses[1:]]))
+
+
+def _way(start: SE3 | None, path: SE3) -> SE3:
+    """It begins at the start if there is one: to choose a hypothesis is part of the first step."""
+    return path if start is None else SE3.cat([start[None], path[1:]])
 
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:
