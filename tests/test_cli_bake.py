@@ -84,13 +84,37 @@ def test_without_a_surface_no_start_is_refused_in_a_line(shared: Path, folder: P
     assert "needs a start" in err
 
 
-def test_a_map_is_baked_from_what_it_renders(
-    folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def _ball(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is baked is a ball, whatever the map shows."""
+
     def ball(folder: Path, **options: bool) -> Map:
         return replace(load_map(folder, **options), field=HomogeneousBall(0.5, 300.0))
 
     monkeypatch.setattr(module, "load_map", ball)
+
+
+@pytest.mark.usefixtures("_ball")
+def test_a_map_that_was_imported_is_baked_from_where_a_dataset_was_seen(
+    folder: Path, tmp_path: Path, bidnerf: Run
+) -> None:
+    described = json.loads((folder / "map.json").read_text())
+    (folder / "map.json").write_text(json.dumps(described | {"cameras": []}))
+    bake = ["bake", folder, "--rays", "20000", "--cells", "20000"]
+    status, _, err = bidnerf(*bake)
+    assert (status, err.count("\n")) == (1, 1)
+    assert "--data" in err
+    tiny.write_dataset(tmp_path / "data", train=9, depth=False)
+    status, _, err = bidnerf(*bake, "--data", tmp_path / "data")
+    assert status == 0
+    assert "from 9 rendered views" in err
+    surface = load_map(folder).surface
+    assert surface is not None
+    assert len(surface.keyframes) == 9
+
+
+@pytest.mark.usefixtures("_ball")
+def test_a_map_is_baked_from_what_it_renders(folder: Path, bidnerf: Run) -> None:
     status, out, err = bidnerf("bake", folder, "--rays", "20000", "--cells", "20000")
     assert (status, out) == (0, "")
     assert "from 24 rendered views" in err

@@ -38,7 +38,7 @@ def _bake(
     """Find the surface that a map shows, and store it in the map.
 
     Depth is rendered from where the training images were taken; what several of these views agree on is kept. With
-    --data, views with measured depth are taken as they are instead.
+    --data, views with measured depth are taken as they are instead; of views without, an imported map takes the places.
     """
     background = load_info(map).bounds.background
     views = [] if data is None else read_views(open_dataset(data, background), split)
@@ -50,13 +50,12 @@ def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
     began = time.monotonic()
     stored = load_map(folder, surface=False)  # which may be damaged, and is to be replaced
     measured = [view for view in views if view.frame.has_depth]
+    places = [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     if not any(view.frame.has_dense_depth for view in measured):
         measured = []  # a few points are no surface
-    cameras = [] if measured else cameras_of(stored.info)
+    cameras = [] if measured else cameras_of(stored.info) or places
     if not (measured or cameras):
-        raise InputError(
-            f"{folder}: knows no place to see it from; give --data with measured depth, or train it anew"
-        )
+        raise InputError(f"{folder}: knows no place to see it from; say by --data where it was seen from")
     with _progress() as report:
         surface = bake(stored.field, stored.bounds, cameras, measured, config, report)
     save_surface(folder, stored.info, surface)
