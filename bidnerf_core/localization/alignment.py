@@ -58,11 +58,8 @@ class Cloud:
         return (self.basis.mT @ self.basis).flatten(1)
 
     def retract(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """``T C exp(delta) C^-1`` with C the translation to the middle: for points far from the camera, turns and shifts
-        written in the camera's own frame are nearly the same motion.
-        """
-        centre = SE3(torch.eye(3, dtype=torch.float64), self.middle.to(torch.float64))
-        return (T @ centre).retract(delta) @ centre.inverse()
+        """An update about the middle of the points."""
+        return T.retract_about(self.middle, delta)
 
 
 @dataclass(frozen=True, eq=False)

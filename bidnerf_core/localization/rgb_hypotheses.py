@@ -31,7 +31,7 @@ def hypotheses(sight: Sight, keyframes: SE3, start: SE3 | None, count: int, gene
     moved = _moved(sight, keyframes[torch.randint(known, (left,), generator=generator)], TURNED, generator)
     roll = torch.zeros((left, 6), dtype=torch.float64)
     roll[::4, 5] = math.pi * (2 * torch.rand(len(roll[::4]), generator=generator, dtype=torch.float64) - 1)
-    return _joined(*near, plain, moved.retract(roll))
+    return SE3.cat([*near, plain, moved.retract(roll)])
 
 
 def around(sight: Sight, start: SE3, count: int, generator: Generator) -> SE3:
@@ -41,7 +41,8 @@ def around(sight: Sight, start: SE3, count: int, generator: Generator) -> SE3:
     there = SE3(start.rotation[None], start.translation[None])
     turns = torch.randn((half, 6), generator=generator, dtype=torch.float64)
     turns = turns * _spread(sight, ASTRAY)
-    return _joined(there, many[:half].retract(turns), _moved(sight, many[half + 1 :], ASTRAY, generator))
+    moved = _moved(sight, many[half + 1 :], ASTRAY, generator)
+    return SE3.cat([there, many[:half].retract(turns), moved])
 
 
 def _moved(sight: Sight, T: SE3, angle: float, generator: Generator) -> SE3:
@@ -51,7 +52,3 @@ def _moved(sight: Sight, T: SE3, angle: float, generator: Generator) -> SE3:
 
 def _spread(sight: Sight, angle: float) -> torch.Tensor:
     return torch.tensor([ASIDE * sight.extent] * 3 + [angle] * 3, dtype=torch.float64)
-
-
-def _joined(*parts: SE3) -> SE3:
-    return SE3(torch.cat([p.rotation for p in parts]), torch.cat([p.translation for p in parts]))

@@ -45,9 +45,8 @@ class Sight:
         return [thumbnail(view, width) for view in self.views]
 
     def retract(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """``T C exp(delta) C^-1`` with C the translation to the middle, as a cloud has it."""
-        centre = SE3(torch.eye(3, dtype=torch.float64), self.middle.double())
-        return (T @ centre).retract(delta) @ centre.inverse()
+        """An update about the middle, as a cloud has it."""
+        return T.retract_about(self.middle, delta)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +73,8 @@ def search(sight: Sight, start: SE3, stages: Sequence[Stage]) -> Found:
         T, costs = done.T[kept], done.system.cost[kept]
     others = costs[different(sight, T)]
     lead = float(others.min() / costs[0].clamp(min=1e-6)) - 1 if len(others) else math.inf
-    rotations, translations = (
-        torch.cat([getattr(path, part)[:, 0] for path in paths]) for part in ("rotation", "translation")
-    )
-    return Found(T, costs, lead, SE3(rotations, translations), torch.cat([values[:, 0] for values in losses]))
+    path = SE3.cat([path[:, 0] for path in paths])
+    return Found(T, costs, lead, path, torch.cat([values[:, 0] for values in losses]))
 
 
 def _kept(sight: Sight, T: SE3, costs: Float[Tensor, "h"], count: int) -> Int[Tensor, "k"]:
