@@ -17,6 +17,7 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "paper_tables.py"
 PLACE = "demo:blobs"
 CELLS = {
     "table1": (4, 3, 8, {"bid"}),  # conditions, sizes, trials of each, methods
+    "depth_weight": (2, 3, 8, {"bid"}),
     "table2": (3, 3, 16, {"bid"}),
     "inerf": (2, 1, 25, {"bid", "inerf"}),
 }
