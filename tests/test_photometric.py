@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Generator
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.closed_fields import GaussianBlobs
@@ -17,7 +18,7 @@ from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, BidLmConfig, InerfLmConfig, localize, rig, single
 from bidnerf_core.localization.neighbours import neighbours
-from bidnerf_core.localization.photometric import refine
+from bidnerf_core.localization.photometric import refine, stepped
 from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.ray_batch import blurred
 from bidnerf_core.localization.stages import Refinement, Stage
@@ -219,3 +220,19 @@ def test_settings_that_make_no_sense_are_named(setting: str, value: object) -> N
 def test_so_are_those_of_colour_alone(setting: str, value: object) -> None:
     with pytest.raises(InputError, match=f"{setting} is .*, expected "):
         replace(InerfLmConfig(), **{setting: value})  # type: ignore[arg-type]
+
+
+def test_a_few_steps_alone_are_those_of_a_refinement() -> None:
+    problem, near = single(FIELD, BOUNDS, FRAME, None), perturb(TRUTH, 0.05, 1.0, seed=2)
+    stage, settings = Stage(3, 512), Refinement()
+    poses = stepped(problem, near, stage, settings, Generator().manual_seed(0))
+    whole = refine(problem, near[None], (stage,), settings, Generator().manual_seed(0))
+    assert torch.allclose(poses.matrix(), whole.poses.matrix(), atol=1e-3)
+    errors = pose_error(poses, TRUTH).translation
+    assert float(errors[-1]) < 0.3 * float(errors[0])
+
+
+def test_at_the_truth_no_step_leads_away() -> None:
+    stage, settings = Stage(3, 256), Refinement(depth_weight=0.0)
+    poses = stepped(single(FIELD, BOUNDS, FRAME, None), TRUTH, stage, settings, Generator().manual_seed(0))
+    assert float(pose_error(poses, TRUTH).translation.max()) < 1e-3

@@ -15,7 +15,7 @@ from bidnerf_core.localization.alignment import Cloud
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.clouds import measured_cloud
 from bidnerf_core.localization.hypotheses import hypotheses
-from bidnerf_core.localization.photometric import refine
+from bidnerf_core.localization.photometric import stepped
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search import Found, score, search
@@ -109,12 +109,12 @@ def _refined(
     """The surface is as coarse as its cells; the field is not, and has seen every pixel of the training images."""
     cell = surface.cell
     stage = Stage(config.refine_steps, config.refine_rays, depth_scale=6 * cell, play=cell / 2)
-    refined = refine(problem, found.T[None], (stage,), Refinement(), generator)
+    poses = stepped(problem, found.T, stage, Refinement(), generator)
     with torch.no_grad():
-        before, after = score(surface, cloud, SE3.stack([found.T, refined.T])).tolist()
-    if after > before + WORSE:
+        scores = score(surface, cloud, poses).tolist()
+    if scores[-1] > scores[0] + WORSE:
         return found
-    return replace(found, T=refined.T, score=after, path=SE3.cat([found.path, refined.poses[1:]]))
+    return replace(found, T=poses[-1], score=scores[-1], path=SE3.cat([found.path, poses[1:]]))
 
 
 def _way(start: SE3 | None, path: SE3) -> SE3:
