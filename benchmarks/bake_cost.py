@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import shutil
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -22,7 +23,15 @@ from record import write_record
 
 from bidnerf_core.storage import load_info, load_map
 
-MAIN = "import sys; from bidnerf_core.cli import main; sys.exit(main())"
+# The child tells of itself: what a parent hears of a child's peak includes its own.
+MAIN = """
+import json, sys, time
+from bidnerf_core.cli import main
+from bidnerf_core.evaluation.memory import peak_memory_bytes
+status = main(sys.argv[1:])
+print(json.dumps([time.process_time(), peak_memory_bytes()]))
+sys.exit(status)
+"""
 
 
 def baked(source: Path, data: Path | None, folder: Path) -> dict[str, Any]:
@@ -31,17 +40,17 @@ def baked(source: Path, data: Path | None, folder: Path) -> dict[str, Any]:
     if old is not None:
         (copy / str(old)).unlink(missing_ok=True)
     before, began = size(copy), time.perf_counter()
-    words = [sys.executable, "-c", MAIN, "bake", str(copy), *(["--data", str(data)] if data else [])]
-    child = os.posix_spawn(sys.executable, words, os.environ | {"OMP_NUM_THREADS": "1"})
-    _, status, used = os.wait4(child, 0)
-    if status:
-        raise SystemExit(f"{source}: 'bidnerf bake' failed")
+    done = subprocess.run(
+        [sys.executable, "-c", MAIN, "bake", str(copy), *(["--data", str(data)] if data else [])],
+        env=os.environ | {"OMP_NUM_THREADS": "1"}, stdout=subprocess.PIPE, check=True, text=True,
+    )  # fmt: skip
+    cpu_seconds, peak = json.loads(done.stdout.splitlines()[-1])
     surface = load_map(copy).surface
     assert surface is not None
     return {
         "seconds, import of torch included": time.perf_counter() - began,
-        "cpu_seconds": used.ru_utime + used.ru_stime,
-        "peak_resident_MiB": used.ru_maxrss / 2**10,
+        "cpu_seconds": cpu_seconds,
+        "peak_resident_MiB": peak / 2**20,
         "added_on_disk_MiB": (size(copy) - before) / 2**20,
         "surfels": len(surface.surfels),
         "cell_metres": surface.cell,
@@ -62,6 +71,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path)
     parser.add_argument("--name", default="bake_cost")
     given = parser.parse_args()
+    if len({source.name for source in given.map}) < len(given.map):
+        raise SystemExit("--map: two folders have one name, expected different ones")
     with TemporaryDirectory() as folder:
         results = {source.name: baked(source, given.data, Path(folder)) for source in given.map}
     print(write_record(given.name, {"maps": results}, 0))

@@ -102,6 +102,10 @@ def main() -> None:
     parser.add_argument("--tuning-frames", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    if len({m.name for m in given.map}) < len(given.map):
+        raise SystemExit(
+            "--map: two folders have one name, expected different ones: records and trials go by it"
+        )
     wanted = {(m, method): trials(given, m, method) for m in given.map for method in given.methods}
     partial = RESULTS / f"{given.name}.partial.jsonl"
     with ResultsFile(partial) as file:

@@ -104,18 +104,21 @@ def test_the_field_refines_what_the_surface_found() -> None:
     cloud = measured_cloud(problem, 500, generator)
     near = perturb(view.T_ref_camera, 0.08, 3, 0)
     found = Found(near, float(score(surface, cloud, near[None])[0]), math.inf, near[None])
-    refined = module._refined(problem, surface, cloud, found, AutoConfig(refine_steps=4), generator)
+    refined, share = module._refined(problem, surface, cloud, found, AutoConfig(refine_steps=4), generator)
     error = pose_error(refined.T, view.T_ref_camera)
     assert float(error.translation) < 0.02
     assert float(error.rotation_deg) < 0.5
     assert torch.equal(refined.path[0].matrix(), near.matrix())
     assert len(refined.path.translation) > 1
+    assert share > 0.9
 
 
 def test_a_field_that_does_not_show_the_surface_has_no_say() -> None:
     problem = baked.problem(baked.unseen()[0])
     found = localize(problem, "auto", replace(QUICK, refine_steps=3), 0)
     assert torch.equal(found.T_world_camera.matrix(), found_for(problem).T_world_camera.matrix())
+    assert not found.converged
+    assert "rays that the field renders" in found.reason
 
 
 def test_an_image_of_something_else_is_not_found() -> None:

@@ -28,6 +28,7 @@ import tiny
 from bidnerf_core import storage
 from bidnerf_core.cli import COMMANDS, main, progress
 from bidnerf_core.errors import InputError
+from bidnerf_core.localization.methods import METHODS
 from bidnerf_core.registry import list_backends
 from bidnerf_core.storage import load_info, load_map
 from tiny import backends_listed_once  # noqa: F401
@@ -624,10 +625,20 @@ def test_a_start_that_is_no_pose_is_told_in_a_line(
     assert_refused(found, 1, str(path), finding, 'expected {"T_world_camera": 4x4 rows}')
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("command", ["localize", "evaluate", "compare"])
+def test_each_method_has_its_settings_beside_those_of_the_command(
+    command: str, method: str, bidnerf: Callable[..., Outcome]
+) -> None:
+    found = bidnerf(command, "--method", method, "--help")
+    assert (found.status, found.err) == (0, "")
+    assert "--" in found.out
+
+
 def test_a_perturbation_is_judged(bidnerf: Callable[..., Outcome], shared: Path) -> None:
     place = ["localize", shared / "map", shared / "data", "--frame", "t_0000", "--perturb"]
     for wrong in (("-1", "5"), ("nan", "5"), ("inf", "5")):
-        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: T is", "expected a finite number, 0 or more")
+        assert_refused(bidnerf(*place, *wrong), 2, "--perturb: T is", "expected metres from 0 to 1e+06")
     for wrong in (("1", "inf"), ("0.5", "1e9"), ("0.5", "180.1"), ("0.5", "-1")):
         assert_refused(bidnerf(*place, *wrong), 2, "--perturb: R is", "expected degrees from 0 to 180")
 

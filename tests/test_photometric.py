@@ -142,7 +142,7 @@ def test_it_does_not_claim_what_it_cannot_know() -> None:
 
 def test_a_window_about_the_measured_depth_serves_as_well() -> None:
     problem = single(FIELD, BOUNDS, FRAME, perturb(TRUTH, 0.2, 5.0, seed=7))
-    found = localize(problem, "bid-lm", replace(FEW, window=0.5, window_samples=24))
+    found = localize(problem, "bid-lm", replace(FEW, depth_window=0.5, window_samples=24))
     assert float(pose_error(found.T_world_camera, TRUTH).translation) < 0.03
 
 
@@ -204,7 +204,7 @@ def test_blur_keeps_means_and_places(size: int) -> None:
 @pytest.mark.parametrize(
     ("setting", "value"),
     [("poses", 0), ("fine_rays", 6), ("coarse_steps", 0), ("blur", 0), ("colour_scale", 0.0),
-     ("least_weight", 1.0), ("play", -1.0), ("stop_step", float("nan")), ("depth_scale", 0.0), ("window", -0.1),
+     ("least_weight", 1.0), ("play", -1.0), ("stop_step", float("nan")), ("depth_scale", 0.0), ("depth_window", -0.1),
      ("centring", -1), ("window_samples", 0), ("depth_rays", -1)],
 )  # fmt: skip
 def test_settings_that_make_no_sense_are_named(setting: str, value: object) -> None:
@@ -225,7 +225,9 @@ def test_so_are_those_of_colour_alone(setting: str, value: object) -> None:
 def test_a_few_steps_alone_are_those_of_a_refinement() -> None:
     problem, near = single(FIELD, BOUNDS, FRAME, None), perturb(TRUTH, 0.05, 1.0, seed=2)
     stage, settings = Stage(3, 512), Refinement()
-    poses = stepped(problem, near, stage, settings, Generator().manual_seed(0))
+    steps = stepped(problem, near, stage, settings, Generator().manual_seed(0))
+    poses = steps.poses
+    assert steps.inliers > 0.95
     whole = refine(problem, near[None], (stage,), settings, Generator().manual_seed(0))
     assert torch.allclose(poses.matrix(), whole.poses.matrix(), atol=1e-3)
     errors = pose_error(poses, TRUTH).translation
@@ -234,5 +236,5 @@ def test_a_few_steps_alone_are_those_of_a_refinement() -> None:
 
 def test_at_the_truth_no_step_leads_away() -> None:
     stage, settings = Stage(3, 256), Refinement(depth_weight=0.0)
-    poses = stepped(single(FIELD, BOUNDS, FRAME, None), TRUTH, stage, settings, Generator().manual_seed(0))
-    assert float(pose_error(poses, TRUTH).translation.max()) < 1e-3
+    steps = stepped(single(FIELD, BOUNDS, FRAME, None), TRUTH, stage, settings, Generator().manual_seed(0))
+    assert float(pose_error(steps.poses, TRUTH).translation.max()) < 1e-3

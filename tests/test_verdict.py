@@ -13,7 +13,7 @@ import baked
 from bidnerf_core.localization.alignment import Cloud
 from bidnerf_core.localization.hypotheses import hypotheses
 from bidnerf_core.localization.search import Found, search
-from bidnerf_core.localization.verdict import Bars, covariance, crossed, evidence
+from bidnerf_core.localization.verdict import Bars, Evidence, covariance, crossed, evidence
 from bidnerf_core.scenes import demo_room
 from bidnerf_core.se3 import SE3
 
@@ -43,6 +43,13 @@ def test_wrong_poses_are_doubted(generator: Generator) -> None:
     for shift in (torch.tensor([0.0, 0, 0, 0, 0, math.pi / 2]), torch.tensor([0.4, 0, 0, 0, 0, 0])):
         assert doubt(cloud.retract(view.T_ref_camera, shift.double()), cloud) is not None
     assert "another pose" in str(doubt(view.T_ref_camera, cloud, lead=0.01))
+
+
+def test_what_the_field_does_not_show_is_doubted() -> None:
+    sound = Evidence(on_surface=1.0, alike=1.0, crossed=0.0, lead=1.0)
+    assert sound.doubt(Bars()) is None
+    for share in (0.5, math.nan):
+        assert "rays that the field renders" in str(replace(sound, shown=share).doubt(Bars()))
 
 
 def test_other_colours_are_doubted() -> None:

@@ -61,10 +61,10 @@ class Beginning:
 
     def judge(self) -> None:
         if self.perturb is not None:
-            for what, value, most in zip(("T", "R"), self.perturb, (math.inf, 180.0), strict=True):
-                if not (math.isfinite(value) and 0 <= value <= most):
-                    expected = "a finite number, 0 or more" if most == math.inf else "degrees from 0 to 180"
-                    raise UsageError(f"--perturb: {what} is {value:g}, expected {expected}")
+            limits = (("T", "metres", protocols.FARTHEST), ("R", "degrees", 180.0))
+            for (what, unit, most), value in zip(limits, self.perturb, strict=True):
+                if not 0 <= value <= most:
+                    raise UsageError(f"--perturb: {what} is {value:g}, expected {unit} from 0 to {most:g}")
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,10 @@ class Similarity:
         return self.T_target_source.apply(self.scale * points)
 
 
+FARTHEST = 1e12
+"""Of a coordinate: the squares of more are no numbers."""
+
+
 def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Similarity:
     """The one that brings ``source`` nearest to ``target`` in least squares (Umeyama 1991, eqs. 34 to 43).
 
@@ -30,6 +34,9 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
     fewer than two points of either set differ.
     """
     source, target = source.double(), target.double()
+    largest = max((float(x.abs().max()) for x in (source, target) if x.numel()), default=0.0)
+    if not largest <= FARTHEST:
+        raise InputError(f"a point {largest:g} away from the origin, expected {FARTHEST:g} at most")
     if len(source) < 2 or spread(source) == 0 or spread(target) == 0:
         raise InputError(f"{len(source)} pairs of points, expected 2 or more at different places")
     from_mean, to_mean = source - source.mean(0), target - target.mean(0)

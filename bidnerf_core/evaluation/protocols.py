@@ -82,6 +82,9 @@ def _require_length(what: str, value: float) -> None:
 
 
 Size = tuple[float, ...]
+FARTHEST = 1e6
+"""Metres that a start may be off."""
+
 Case = tuple[int, int]
 """The place of a frame in its split, and the seed of a trial on it."""
 
@@ -106,9 +109,13 @@ class Protocol:
         return (self.plan or each_in_turn)(frames, trials, seed)
 
     def check_size(self, size: Size) -> None:
-        if len(size) != len(self.units) or not all(math.isfinite(x) and x >= 0 for x in size):
+        most = [180.0 if "deg" in unit else FARTHEST for unit in self.units]
+        if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
             expected = " : ".join(self.units) or "none, for it has no sizes"
-            raise InputError(f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}, expected {expected}")
+            limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""
+            raise InputError(
+                f"size is {':'.join(f'{x:g}' for x in size) or 'missing'}, expected {expected}{limits}"
+            )
 
 
 def each_in_turn(frames: int, trials: int, seed: int) -> list[Case]:

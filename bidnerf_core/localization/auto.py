@@ -63,10 +63,11 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         return _descended(problem, seed, f"{len(cloud)} pixels have depth, expected {LEAST_POINTS} or more")
     with torch.no_grad():
         found = _searched(problem, problem.surface, cloud, config, generator)
+    shown = 1.0
     if config.refine_steps:
-        found = _refined(problem, problem.surface, cloud, found, config, generator)
+        found, shown = _refined(problem, problem.surface, cloud, found, config, generator)
     with torch.no_grad():
-        speaks = evidence(problem.surface, cloud, found)
+        speaks = replace(evidence(problem.surface, cloud, found), shown=shown)
         doubt = speaks.doubt(Bars())
         spread = covariance(problem.surface, cloud, found.T, len(problem.views))
         path = _way(problem.start, found.path)
@@ -105,16 +106,20 @@ def _refined(
     found: Found,
     config: AutoConfig,
     generator: Generator,
-) -> Found:
-    """The surface is as coarse as its cells; the field is not, and has seen every pixel of the training images."""
+) -> tuple[Found, float]:
+    """A finer pose, and the share of rendered rays that see from there what was measured.
+
+    The surface is as coarse as its cells; the field is not, and has seen every pixel of the training images.
+    """
     cell = surface.cell
     stage = Stage(config.refine_steps, config.refine_rays, depth_scale=6 * cell, play=cell / 2)
-    poses = stepped(problem, found.T, stage, Refinement(), generator)
+    steps = stepped(problem, found.T, stage, Refinement(), generator)
     with torch.no_grad():
-        scores = score(surface, cloud, poses).tolist()
-    if scores[-1] > scores[0] + WORSE:
-        return found
-    return replace(found, T=poses[-1], score=scores[-1], path=SE3.cat([found.path, poses[1:]]))
+        scores = score(surface, cloud, steps.poses).tolist()
+    if not scores[-1] <= scores[0] + WORSE:
+        return found, 0.0
+    path = SE3.cat([found.path, steps.poses[1:]])
+    return replace(found, T=steps.poses[-1], score=scores[-1], path=path), steps.inliers
 
 
 def _way(start: SE3 | None, path: SE3) -> SE3:

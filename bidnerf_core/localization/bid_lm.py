@@ -20,7 +20,7 @@ class BidLmConfig(SecondOrderConfig):
     depth_scale: float = 0.1  # of it, in metres: about where an outlier begins
     depth_rays: int = 256  # besides, of a sensor with rays of its own, where there is one
     centring: int = 2  # times that what a pose sees is shifted to the middle of what was measured
-    window: float = 0.0  # metres about the measured depth that fine steps look at; 0: the whole ray
+    depth_window: float = 0.0  # metres about the measured depth that fine steps look at; 0: the whole ray
     window_samples: int = 12  # within it
 
     def __post_init__(self) -> None:
@@ -30,7 +30,7 @@ class BidLmConfig(SecondOrderConfig):
         self._require("centring", 0 <= self.centring <= 100, "0 to 100 times")
         self._require("window_samples", 1 <= self.window_samples <= 10**4, "1 to 10 thousand")
         self._require_one_of(depth_loss=RobustName)
-        for name in ("depth_weight", "window"):
+        for name in ("depth_weight", "depth_window"):
             self._require_not_negative(name)
 
 
@@ -40,5 +40,5 @@ def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization
         config.depth_weight, config.colour_loss, config.depth_loss, config.pixels, config.pivot, config.exposure,
         config.depth_rays, config.least_weight, config.window_samples, config.stop_step,
     )  # fmt: skip
-    depth = Depth(config.depth_scale, config.centring, config.window)
+    depth = Depth(config.depth_scale, config.centring, config.depth_window)
     return second_order(problem, config, depth, settings, seed, "bid-lm")

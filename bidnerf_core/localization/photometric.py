@@ -56,23 +56,32 @@ def refine(
     return _judged(look.anew(generator), SE3.stack(ends[-2:]), trail)
 
 
-def stepped(problem: Problem, start: SE3, stage: Stage, settings: Refinement, generator: Generator) -> SE3:
-    """Poses (s + 1) of up to ``stage.steps`` second-order steps from one pose, on one draw of rays, for what is nearly there.
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Where a few steps led."""
 
-    It ends before a step that does not lower the cost. Nothing is judged afterwards, and the last step needs no derivatives:
-    half of what ``refine`` costs.
+    poses: SE3  # (s + 1)
+    inliers: float  # share of the rays that see what was measured from the last of them
+
+
+def stepped(problem: Problem, start: SE3, stage: Stage, settings: Refinement, generator: Generator) -> Steps:
+    """Up to ``stage.steps`` second-order steps from one pose, on one draw of rays, for what is nearly there.
+
+    It ends before a step that does not lower the cost. Nothing is judged on rays of its own afterwards, and the last step
+    needs no derivatives: half of what ``refine`` costs.
     """
     look = look_at(problem, stage, settings, pivot(settings.pivot, replace(problem, start=start)), generator)
-    T, poses = start[None], [start]
-    system = look.system(T)
+    poses, here = [start], look.residuals(start[None])
     for left in reversed(range(stage.steps)):
-        trial = look.about.moved(T, solve(system, torch.full_like(system.cost, stage.damping)))
-        after = look.system(trial) if left else replace(system, cost=look.cost(trial))
-        if not bool(after.cost[0] < system.cost[0]):
+        system = here.system()
+        delta = solve(system, torch.full_like(system.cost, stage.damping))
+        trial = look.about.moved(poses[-1][None], delta)
+        there = look.residuals(trial, derivatives=left > 0)
+        if not bool(there.system().cost[0] < system.cost[0]):
             break
         poses.append(trial[0])
-        T, system = trial, after
-    return SE3.stack(poses)
+        here = there
+    return Steps(SE3.stack(poses), float(here.inliers()[0]))
 
 
 class Trail:

@@ -32,6 +32,7 @@ class Bars:
     alike: float = 0.42  # share that lies there and has its colour, at least
     crossed: float = 0.15  # share of lines of sight that run through the surface, at most
     lead: float = 0.15  # by how much the next best answer must be worse
+    shown: float = 0.9  # share of rendered rays that see what was measured, at least
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class Evidence:
     alike: float
     crossed: float
     lead: float
+    shown: float = 1.0  # where nothing was rendered, nothing speaks against it
 
     def doubt(self, bars: Bars) -> str | None:
         """What speaks against it most, in words; None where nothing does."""
@@ -53,6 +55,8 @@ class Evidence:
             return f"{self.crossed:.0%} of the lines of sight run through the surface"
         if self.lead < bars.lead:
             return "another pose fits about as well"
+        if not self.shown >= bars.shown:
+            return f"only {self.shown:.0%} of the rays that the field renders see what was measured"
         return None
 
 
