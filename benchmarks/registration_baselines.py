@@ -7,7 +7,7 @@ Compared, alternately, each on one thread, on every frame of the test split:
 - ``open3d icp``: FPFH features and RANSAC, then point-to-plane ICP; no start;
 - ``open3d coloured icp``: the same, then coloured ICP;
 - ``auto``: ours; no start;
-- ``gicp``: small_gicp's GICP from the starts of protocol ``bid``, 0.5 off;
+- ``gicp``: small_gicp's GICP from the starts of protocol ``bid``, 0.5 off (``--off``);
 - ``auto from start``: ours from the same starts;
 - ``auto + gicp``: GICP from the answer of ``auto``, which had no start.
 
@@ -58,9 +58,6 @@ from bidnerf_core.plain import from_plain, to_plain
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map
 
-OFF = 0.5
-"""Size of the starts that are given."""
-
 OPEN3D: dict[str, type] = {"ransac": Ransac, "icp": Refine, "coloured icp": Refine}
 """Settings by name, and of which kind they are."""
 
@@ -73,11 +70,11 @@ def auto(stored: Map, view: View, start: SE3 | None, seed: int) -> Matrix:
     return localize(problem, "auto", seed=seed).T_world_camera.matrix().numpy()
 
 
-def start_of(truth: SE3, seed: int) -> Matrix:
-    return bid(truth, OFF, seed).matrix().numpy()
+def start_of(truth: SE3, off: float, seed: int) -> Matrix:
+    return bid(truth, off, seed).matrix().numpy()
 
 
-def tuning(stored: Map, views: Sequence[View], voxel: float, kept: Kept) -> dict[str, Any]:
+def tuning(stored: Map, views: Sequence[View], voxel: float, off: float, kept: Kept) -> dict[str, Any]:
     """Settings by name, of what is installed."""
     points = map_points(stored.surface)
     tries = cases([(measured_points(view.frame), view.T_ref_camera) for view in views])
@@ -86,7 +83,7 @@ def tuning(stored: Map, views: Sequence[View], voxel: float, kept: Kept) -> dict
         plain = kept.get(["tuned", "open3d"], lambda: open3d_settings(points, tries, voxel))
         chosen = {name: from_plain(OPEN3D[name], plain[name], name) for name in OPEN3D}
     if find_spec("small_gicp"):
-        given = [start_of(case.truth, i) for i, case in enumerate(tries)]
+        given = [start_of(case.truth, off, i) for i, case in enumerate(tries)]
         found = [auto(stored, views[i % len(views)], None, i) for i in range(len(tries))]
         for name, starts in {"gicp": given, "auto + gicp": found}.items():
             plain = kept.get(
@@ -110,13 +107,13 @@ def gicp_settings(
     return plain
 
 
-def registrations(stored: Map, chosen: dict[str, Any]) -> dict[str, Registration]:
+def registrations(stored: Map, chosen: dict[str, Any], off: float) -> dict[str, Registration]:
     """By name, with all made of the map that can be made beforehand."""
     points = map_points(stored.surface)
     result: dict[str, Registration] = {
         "auto": lambda view, seed: auto(stored, view, None, seed),
         "auto from start": lambda view, seed: auto(
-            stored, view, as_pose(start_of(view.T_ref_camera, seed)), seed
+            stored, view, as_pose(start_of(view.T_ref_camera, off, seed)), seed
         ),
     }
     if "ransac" in chosen:
@@ -132,7 +129,7 @@ def registrations(stored: Map, chosen: dict[str, Any]) -> dict[str, Registration
     if "gicp" in chosen:
         gicp = SmallGicp(points)
         result["gicp"] = lambda view, seed: gicp.refine(
-            measured_points(view.frame), start_of(view.T_ref_camera, seed), chosen["gicp"]
+            measured_points(view.frame), start_of(view.T_ref_camera, off, seed), chosen["gicp"]
         )
         result["auto + gicp"] = lambda view, seed: gicp.refine(
             measured_points(view.frame), auto(stored, view, None, seed), chosen["auto + gicp"]
@@ -184,9 +181,8 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def compared(stored: Map, views: Sequence[View], chosen: dict[str, Any], kept: Kept) -> dict[str, Any]:
+def compared(runs: dict[str, Registration], views: Sequence[View], kept: Kept) -> dict[str, Any]:
     """Rows by method, of the frames that settings were not tuned on."""
-    runs = registrations(stored, chosen)
     names = list(runs)
     for run in runs.values():  # what is done once only is not timed
         run(views[1], 0)
@@ -211,6 +207,8 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--name", required=True, help="of the record")
     parser.add_argument("--voxel", type=float, default=0.05, help="metres")
+    parser.add_argument("--off", type=float, default=0.5, help="size of the starts that are given")
+    parser.add_argument("--methods", nargs="+", help="only these, 'auto' among them")
     given = parser.parse_args()
     torch.set_num_threads(1)
     installed = versions()
@@ -219,8 +217,10 @@ def main() -> None:
         raise InputError(f"{given.map}: no baked surface, expected one as 'bidnerf bake' makes it")
     views = dataset.views("test")
     kept = Kept(RESULTS / f"{given.name}.partial.jsonl")
-    chosen = tuning(stored, views[1::5], given.voxel, kept)
-    rows = compared(stored, views, chosen, kept)
+    chosen = tuning(stored, views[1::5], given.voxel, given.off, kept)
+    runs = registrations(stored, chosen, given.off)
+    wanted = given.methods or list(runs)
+    rows = compared({name: run for name, run in runs.items() if name in wanted}, views, kept)
     methods = {
         name: summary(found)
         | {f"{clock}_against_auto": times_slower(rows, name, clock) for clock in ("seconds", "cpu_seconds")}
@@ -230,7 +230,7 @@ def main() -> None:
         "map": given.map.name,
         "data": given.data.name,
         "versions": installed,
-        "start": f"bid:{OFF:g} for gicp and auto from start, none for the others",
+        "start": f"bid:{given.off:g} for gicp and auto from start, none for the others",
         "settings": {name: to_plain(setting) for name, setting in chosen.items()},
         "methods": methods,
         "rows": rows,
