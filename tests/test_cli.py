@@ -703,6 +703,17 @@ def test_a_frame_is_no_rig_by_being_named_twice(bidnerf: Callable[..., Outcome],
     place = ["localize", shared / "map", shared / "data", *QUICK]
     for twice in (["t_0001", "t_0001"], ["t_0000", "t_0001", "--frame", "t_0001"]):
         assert_refused(bidnerf(*place, "--frame", *twice), 2, "--frame names t_0001 more than once")
+    bench = [
+        "evaluate",
+        "demo:blobs",
+        "demo:blobs",
+        "--out",
+        shared / "never.jsonl",
+        "--frame",
+        "0001",
+        "0001",
+    ]
+    assert_refused(bidnerf(*bench), 2, "--frame names 0001 more than once")
 
 
 def test_a_window_is_the_frame_and_those_before_it(

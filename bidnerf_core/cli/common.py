@@ -12,6 +12,7 @@ import re
 import shutil
 import sys
 import textwrap
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
@@ -147,6 +148,13 @@ def require(what: str, value: float, least: float, most: float = math.inf) -> No
     if not least <= value <= most:
         expected = f"{least} or more" if most == math.inf else f"{least} to {most}"
         raise UsageError(f"{what} is {value}, expected {expected}")
+
+
+def require_different(what: str, names: Sequence[str]) -> None:
+    """No name may stand in a list twice."""
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise UsageError(f"{what} names {twice[0]} more than once, expected each once")
 
 
 def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None) -> list[View]:

@@ -21,6 +21,7 @@ from bidnerf_core.cli.common import (
     option,
     parse,
     require,
+    require_different,
     say,
     wrong_usage,
 )
@@ -101,6 +102,7 @@ def run(arguments: list[str]) -> None:
             for asked in _sizes(size) or ():
                 chosen.check_size(asked)
         names = tuple(name for group in frame for name in group) or None
+        require_different("--frame", names or ())
         plan = Plan(
             map, data or _own_data(map), protocol, _sizes(size), method, changed_settings(method, config),
             trials, seed, split, names, images, angle, device, depth,

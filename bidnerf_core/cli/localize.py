@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json as jsonlib
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from bidnerf_core.cli.common import (
     print_json,
     read_views,
     require,
+    require_different,
     say,
 )
 from bidnerf_core.datasets import Dataset, open_dataset
@@ -80,9 +80,7 @@ class Seen:
     def judge(self) -> None:
         if not self.frames:
             raise UsageError("no frame to localize; name at least one with --frame")
-        twice = [name for name, count in Counter(self.frames).items() if count > 1]
-        if twice:
-            raise UsageError(f"--frame names {twice[0]} more than once, expected each frame of a rig once")
+        require_different("--frame", self.frames)
         require("--window", self.window, 1)
         if self.window > 1 and len(self.frames) > 1:
             raise UsageError(
