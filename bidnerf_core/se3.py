@@ -71,13 +71,6 @@ class SE3:
         """Right update ``self @ exp(tangent)``."""
         return self @ SE3.exp(tangent)
 
-    def retract_about(self, middle: Float[Tensor, "3"], tangent: Float[Tensor, "*c 6"]) -> SE3:
-        """``T C exp(tangent) C^-1`` with C the translation to ``middle``, a point of the camera's frame: for points far
-        from the camera, turns and shifts written in its own frame are nearly the same motion.
-        """
-        centre = SE3(torch.eye(3).to(self.rotation), middle.to(self.rotation))
-        return (self @ centre).retract(tangent) @ centre.inverse()
-
     def adjoint(self) -> Float[Tensor, "*b 6 6"]:
         """``T exp(xi) T^-1 = exp(adjoint(T) xi)`` (eq. 175)."""
         turned = skew(self.translation) @ self.rotation

@@ -43,7 +43,7 @@ def test_the_gradient_is_that_of_the_cost(colour_weight: float, generator: Gener
     found = alignment(surface, cloud, scales, T)
     for i in range(4):
         expected = numerical(
-            lambda d, i=i: alignment(surface, cloud, scales, cloud.retract(T[i], d)[None]).cost[0]
+            lambda d, i=i: alignment(surface, cloud, scales, cloud.pivot.moved(T[i], d)[None]).cost[0]
         )
         assert torch.allclose(2 * found.gradient[i], expected, rtol=1e-4, atol=1e-6)
 
@@ -127,6 +127,6 @@ def test_an_update_turns_about_the_middle_of_the_cloud(generator: Generator) -> 
     cloud, T = exact_cloud(), baked.unseen()[0].T_ref_camera
     delta = torch.randn((5, 6), generator=generator, dtype=torch.float64)
     delta[:, :3] = 0
-    moved = cloud.retract(T, delta)
+    moved = cloud.pivot.moved(T, delta)
     assert torch.allclose(moved.apply(cloud.middle), T.apply(cloud.middle).expand(5, 3), atol=1e-12)
     assert torch.allclose(moved.rotation, (T.retract(delta)).rotation)

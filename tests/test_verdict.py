@@ -41,7 +41,7 @@ def test_wrong_poses_are_doubted(generator: Generator) -> None:
     view = baked.unseen()[0]
     cloud = baked.cloud(view)
     for shift in (torch.tensor([0.0, 0, 0, 0, 0, math.pi / 2]), torch.tensor([0.4, 0, 0, 0, 0, 0])):
-        assert doubt(cloud.retract(view.T_ref_camera, shift.double()), cloud) is not None
+        assert doubt(cloud.pivot.moved(view.T_ref_camera, shift.double()), cloud) is not None
     assert "another pose" in str(doubt(view.T_ref_camera, cloud, lead=0.01))
 
 

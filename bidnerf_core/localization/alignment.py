@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.localization.levenberg_marquardt import System
+from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.se3 import SE3, skew
 from bidnerf_core.surface import SurfaceMap
 
@@ -57,9 +58,10 @@ class Cloud:
         """``basis^T basis`` of each point: what an error the same in all directions adds to a system."""
         return (self.basis.mT @ self.basis).flatten(1)
 
-    def retract(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """An update about the middle of the points."""
-        return T.retract_about(self.middle, delta)
+    @cached_property
+    def pivot(self) -> Pivot:
+        """What updates turn about: the middle of the points."""
+        return Pivot.at_point(self.middle)
 
 
 @dataclass(frozen=True, eq=False)

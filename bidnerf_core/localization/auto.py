@@ -19,6 +19,7 @@ from bidnerf_core.localization.photometric import stepped
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search import Found, score, search
+from bidnerf_core.localization.settings import Judged
 from bidnerf_core.localization.stages import Refinement, Stage
 from bidnerf_core.localization.verdict import Bars, covariance, evidence
 from bidnerf_core.se3 import SE3
@@ -31,7 +32,7 @@ WORSE = 0.05
 
 
 @dataclass(frozen=True)
-class AutoConfig:
+class AutoConfig(Judged):
     """Settings of method ``auto``."""
 
     points: int = 2000  # of the measured pixels, at most
@@ -45,8 +46,7 @@ class AutoConfig:
             ("points", LEAST_POINTS, 10**6), ("hypotheses", 8, 10**5), ("rounds", 1, 100),
             ("refine_steps", 0, 1000), ("refine_rays", 64, 10**6),
         ):  # fmt: skip
-            if not least <= getattr(self, name) <= most:
-                raise InputError(f"{name} is {getattr(self, name)}, expected {least} to {most}")
+            self._require(name, least <= getattr(self, name) <= most, f"{least} to {most}")
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:

@@ -41,7 +41,7 @@ def around(start: SE3, surface: SurfaceMap, cloud: Cloud, count: int, generator:
     """The start, and poses up to about a quarter of the scene and 30 degrees from it."""
     shifts = torch.randn((count, 6), generator=generator, dtype=torch.float64)
     scale = torch.tensor([0.1 * surface.extent] * 3 + [0.25] * 3, dtype=torch.float64)
-    return cloud.retract(start, shifts * scale * (torch.arange(count) > 0)[:, None])
+    return cloud.pivot.moved(start, shifts * scale * (torch.arange(count) > 0)[:, None])
 
 
 def drawn(poses: SE3, count: int, generator: Generator) -> SE3:

@@ -22,6 +22,11 @@ class Pivot:
 
     T_camera_pivot: SE3 | None  # a translation; None: the world's own frame
 
+    @staticmethod
+    def at_point(point: Float[Tensor, "3"]) -> Pivot:
+        """A point of the camera's frame, metres."""
+        return Pivot(SE3(torch.eye(3, dtype=torch.float64), point.to("cpu", torch.float64)))
+
     @property
     def reach(self) -> float:
         """Metres by which a turn of one radian moves the camera, if that is more than 1.
@@ -55,9 +60,7 @@ def pivot(name: PivotName, problem: Problem) -> Pivot:
     """
     if name == "world":
         return Pivot(None)
-    return Pivot(
-        SE3.identity() if name == "camera" else SE3(torch.eye(3, dtype=torch.float64), _middle(problem))
-    )
+    return Pivot(SE3.identity()) if name == "camera" else Pivot.at_point(_middle(problem))
 
 
 def _middle(problem: Problem) -> Float[Tensor, "3"]:

@@ -47,7 +47,7 @@ def around(sight: Sight, start: SE3, count: int, generator: Generator) -> SE3:
 
 def _moved(sight: Sight, T: SE3, angle: float, generator: Generator) -> SE3:
     shifts = torch.randn((len(T.translation), 6), generator=generator, dtype=torch.float64)
-    return sight.retract(T, shifts * _spread(sight, angle))
+    return sight.pivot.moved(T, shifts * _spread(sight, angle))
 
 
 def _spread(sight: Sight, angle: float) -> torch.Tensor:

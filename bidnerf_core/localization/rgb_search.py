@@ -14,6 +14,7 @@ from torch import Tensor
 from bidnerf_core.frames import View
 from bidnerf_core.localization.drawing import Looks, compared
 from bidnerf_core.localization.levenberg_marquardt import descend
+from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.sketches import Sketcher
 from bidnerf_core.localization.thumbnails import Thumbnail, thumbnail
 from bidnerf_core.se3 import SE3
@@ -44,9 +45,10 @@ class Sight:
     def thumbnails(self, width: int) -> list[Thumbnail]:
         return [thumbnail(view, width) for view in self.views]
 
-    def retract(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """An update about the middle, as a cloud has it."""
-        return T.retract_about(self.middle, delta)
+    @property
+    def pivot(self) -> Pivot:
+        """What updates turn about, as a cloud has it."""
+        return Pivot.at_point(self.middle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ def search(sight: Sight, start: SE3, stages: Sequence[Stage]) -> Found:
     for stage in stages:
         thumbnails = sight.thumbnails(stage.width)
         evaluate = partial(compared, sight.sketcher, thumbnails, sight.looks, sight.middle)
-        done = descend(evaluate, T, stage.steps, sight.retract, damping=1e-2)
+        done = descend(evaluate, T, stage.steps, sight.pivot.moved, damping=1e-2)
         kept = _kept(sight, done.T, done.system.cost, stage.keep)
         paths = [path[:, kept] for path in (*paths, done.poses[1:])]
         losses = [values[:, kept] for values in (*losses, done.costs[:-1])]

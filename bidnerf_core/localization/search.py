@@ -63,7 +63,7 @@ def search(surface: SurfaceMap, cloud: Cloud, start: SE3, stages: tuple[Stage, .
         some = cloud.first(stage.points)
         distance = stage.distance * surface.extent or FINEST * surface.cell
         evaluate = partial(alignment, surface, some, Scales(distance, colour_weight=stage.colour_weight))
-        done = descend(evaluate, T, stage.steps, some.retract, damping=1e-4)
+        done = descend(evaluate, T, stage.steps, some.pivot.moved, damping=1e-4)
         judged = cloud.first(max(stage.points, LIKE))
         scores = score(surface, judged, done.T) if stage.steps else done.system.cost
         best = scores.argsort()[: stage.keep]

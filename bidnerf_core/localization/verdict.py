@@ -93,6 +93,5 @@ def covariance(surface: SurfaceMap, cloud: Cloud, T: SE3, views: int = 1) -> Flo
     variance = misfit(surface, cloud, scales, T[None])[0].clamp(min=LEAST_VARIANCE) / (INDEPENDENT * views)
     known = torch.tensor([surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
     information = system.hessian[0] / variance + torch.diag(known**-2)
-    centre = SE3(torch.eye(3, dtype=torch.float64), cloud.middle.double()).adjoint()
-    spread = centre @ torch.linalg.inv(information) @ centre.mT
+    spread = cloud.pivot.at_camera(T, torch.linalg.inv(information))
     return (spread + spread.mT) / 2
