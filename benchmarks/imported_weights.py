@@ -35,8 +35,8 @@ from bidnerf_core.evaluation.figures import depth_to_rgb, tile
 from bidnerf_core.field import levels
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, localize, single
-from bidnerf_core.plain import to_plain
 from bidnerf_core.rendering import render_image
+from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import Map, load_map
 from bidnerf_nerf_pytorch.command import main as import_command
 

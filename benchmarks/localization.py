@@ -37,8 +37,8 @@ from bidnerf_core.evaluation.errors import (
 from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.summary import applies
 from bidnerf_core.evaluation.trials import Trial, TrialResult, opened
-from bidnerf_core.plain import to_plain
 from bidnerf_core.se3 import SE3
+from bidnerf_core.serialization import to_plain
 
 BOUND = float(chi2(6).ppf(0.95))
 

@@ -54,8 +54,8 @@ from bidnerf_core.evaluation.protocols import bid
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.frames import View
 from bidnerf_core.localization import localize, rig
-from bidnerf_core.plain import from_plain, to_plain
 from bidnerf_core.se3 import SE3
+from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.storage import Map
 
 OPEN3D: dict[str, type] = {"ransac": Ransac, "icp": Refine, "coloured icp": Refine}

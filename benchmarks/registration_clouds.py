@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.pixels import observe
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap
 
 WITNESSES = 24
 """Keyframes that are asked which side of a surfel they see."""

@@ -6,32 +6,20 @@ and distance that were measured there. This is where planar depth becomes distan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from typing import Literal, Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float, Int
+from kornia.color import rgb_to_grayscale
+from kornia.feature import gftt_response
+from kornia.geometry.subpix import nms2d
+from kornia.morphology import dilation
 from torch import Generator, Tensor
 
-from bidnerf_core.field import Rays, SceneBounds
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.se3 import SE3
-
-
-@dataclass(frozen=True, eq=False)
-class Pixels:
-    """Measurements along half-lines of a reference frame."""
-
-    origins: Float[Tensor, "*p 3"]  # metres, reference frame
-    directions: Float[Tensor, "*p 3"]  # unit, reference frame
-    rgb: Float[Tensor, "*p 3"]
-    distance: Float[Tensor, "*p"]  # metres along the ray; 0 where nothing was measured
-
-    def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
-        """The half-lines where ``T_world_ref`` puts them, limited to the scene; differentiable in the transform."""
-        T = T_world_ref.to(self.origins)
-        return bounds.rays(T.apply(self.origins), T.rotate(self.directions))
+from bidnerf_core.observations import Observations
 
 
 @runtime_checkable
@@ -58,7 +46,7 @@ def observe(
     pixels: Int[Tensor, "n 2"],
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
-) -> Pixels:
+) -> Observations:
     """What ``view`` measured at ``pixels``, as half-lines of its reference frame, on ``device`` (default: the image's)."""
     frame = view.frame
     pixels = pixels.cpu()  # few, and a camera computes there
@@ -72,8 +60,10 @@ def observe(
     directions = T.rotate(ray / length[:, None])
     origins = T.translation.expand_as(directions)
     there = frame.rgb.device if device is None else device
-    parts = (origins, directions, frame.rgb[rows, columns], depth * length)
-    return Pixels(*(part.to(device=there, dtype=dtype) for part in parts))
+    coloured = torch.ones(len(length), dtype=torch.bool)
+    return Observations(origins, directions, frame.rgb[rows, columns], depth * length, coloured).to(
+        there, dtype
+    )
 
 
 def draw(
@@ -83,19 +73,24 @@ def draw(
     generator: Generator,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
-) -> Pixels:
+) -> Observations:
     """``count`` pixels shared out equally among the views; every tensor has leading axes (views, pixels a view).
 
     Images may lie anywhere; what was drawn lies on ``device``, by default where the images are.
     """
     share = max(1, count // len(views))
     parts = [observe(view, drawer(view.frame, share, generator), dtype, device) for view in views]
-    return Pixels(
-        torch.stack([p.origins for p in parts]),
-        torch.stack([p.directions for p in parts]),
-        torch.stack([p.rgb for p in parts]),
-        torch.stack([p.distance for p in parts]),
-    )
+    return Observations.stacked(parts)
+
+
+def depth_rays_of(views: Sequence[View]) -> Observations:
+    """Every pixel at which ``views`` measured depth, as rays without colour in their reference frame; float64.
+
+    For depth images of few points, such as those of structure from motion, which pixels drawn at random would miss. Raises
+    ``InputError`` where nothing was measured.
+    """
+    parts = [observe(view, all_pixels(view.frame), torch.float64, "cpu") for view in views]
+    return Observations.joined(parts).without_colour()
 
 
 def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"] | None:
@@ -103,7 +98,64 @@ def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"
     points = []
     for view in views:
         pixels = observe(view, all_pixels(view.frame)[::stride], torch.float64, "cpu")
-        measured = pixels.distance > 0
-        points.append((pixels.origins + pixels.distance[:, None] * pixels.directions)[measured])
+        points.append(pixels.points[pixels.measured])
     together = torch.cat(points)
     return together.median(0).values if len(together) else None
+
+
+DrawerName = Literal["uniform", "interest-points", "interest-regions"]
+QUALITY = 0.01
+"""Corner response, in parts of the image's strongest, from which a local maximum is an interest point."""
+FAINTEST = 1e-5
+"""The same, absolute: above what noise of a grey level (1/255) does to a blank wall."""
+BORDER = 3
+"""Observations around each that the corner detector looks at; it does not take smaller images."""
+REACH, ROUNDS = 5, 3
+"""Regions are points dilated by squares of so many pixels, so many times."""
+
+
+def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
+    """Corners (column, row) after Shi and Tomasi 1994, "Good features to track"; none where nothing stands out."""
+    if min(frame.rgb.shape[:2]) <= BORDER:
+        return torch.zeros((0, 2), dtype=torch.long)
+    grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
+    response = nms2d(gftt_response(grey), (5, 5))[0, 0]
+    strong = response > max(QUALITY * float(response.max()), FAINTEST)
+    return strong.nonzero().flip(-1)
+
+
+def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
+    """Interest points and their surroundings, row by row."""
+    columns, rows = interest_points(frame).unbind(-1)
+    mask = torch.zeros((1, 1, *frame.rgb.shape[:2]))
+    mask[0, 0, rows, columns] = 1
+    for _ in range(ROUNDS):
+        mask = dilation(mask, torch.ones(REACH, REACH))
+    return (mask[0, 0] > 0).nonzero().flip(-1)
+
+
+class Among:
+    """Draws among the pixels that ``choose`` finds in a frame, each as likely as any other, with replacement.
+
+    A frame is searched once. In one where nothing is found, such as the image of a blank wall, pixels are drawn
+    uniformly: it still tells of depth, and of where the edges are not.
+    """
+
+    def __init__(self, choose: Callable[[Frame], Tensor]) -> None:
+        self._choose = choose
+        self._found: WeakKeyDictionary[Frame, Tensor] = WeakKeyDictionary()
+
+    def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
+        if frame not in self._found:
+            self._found[frame] = self._choose(frame)
+        found = self._found[frame]
+        if len(found) == 0:
+            return uniform(frame, count, generator)
+        return found[torch.randint(len(found), (count,), generator=generator)]
+
+
+def drawer(name: DrawerName) -> PixelDrawer:
+    """A pixel drawer by name, which remembers what it finds in a frame."""
+    if name == "uniform":
+        return uniform
+    return Among(interest_points if name == "interest-points" else interest_regions)

@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.depth_rays import DepthRays
-from bidnerf_core.pixels import Pixels
+from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import Rendering
 from bidnerf_core.robust import Robust, huber
 
@@ -27,7 +26,7 @@ class Objective:
         0.0  # of matter that is rendered more than the scale of depth before what was measured
     )
 
-    def __call__(self, rendering: Rendering, pixels: Pixels) -> Float[Tensor, ""]:
+    def __call__(self, rendering: Rendering, pixels: Observations) -> Float[Tensor, ""]:
         """``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6), for pixels of shape (views, pixels).
 
         The colour term sums rho over the three channels; the depth term is a mean over the rays where depth was measured.
@@ -39,7 +38,7 @@ class Objective:
         loss = (colour + self.depth_weight * distance).mean()
         return loss + self._in_front(rendering, pixels.distance)
 
-    def on_depth_rays(self, rendering: Rendering, measured: DepthRays) -> Float[Tensor, ""]:
+    def on_depth_rays(self, rendering: Rendering, measured: Observations) -> Float[Tensor, ""]:
         """``lambda_d mean_r rho(d)``: the depth terms alone, on rays of their own."""
         loss = self.depth_weight * self.depth(rendering.distance - measured.distance).mean()
         return loss + self._in_front(rendering, measured.distance)
@@ -55,12 +54,12 @@ class Objective:
         return self.free_space_weight * masked_mean(found, distance > 0).mean()
 
 
-def photometric(rendering: Rendering, pixels: Pixels) -> Float[Tensor, "*p 3"]:
+def photometric(rendering: Rendering, pixels: Observations) -> Float[Tensor, "*p 3"]:
     """Rendered minus measured colour."""
     return rendering.rgb - pixels.rgb
 
 
-def depth(rendering: Rendering, pixels: Pixels) -> Float[Tensor, "*p"]:
+def depth(rendering: Rendering, pixels: Observations) -> Float[Tensor, "*p"]:
     """Rendered minus measured distance, metres; 0 where nothing was measured."""
     return torch.where(pixels.distance > 0, rendering.distance - pixels.distance, 0)
 
@@ -81,6 +80,8 @@ def masked_mean(values: Float[Tensor, "*k p"], mask: Bool[Tensor, "*k p"]) -> Fl
     return kept.sum(-1) / mask.sum(-1).clamp(min=1)
 
 
-def objective(rendering: Rendering, pixels: Pixels, delta: float, depth_weight: float) -> Float[Tensor, ""]:
+def objective(
+    rendering: Rendering, pixels: Observations, delta: float, depth_weight: float
+) -> Float[Tensor, ""]:
     """The paper's: Huber's rho for colour and depth alike."""
     return Objective(Robust("huber", delta), Robust("huber", delta), depth_weight)(rendering, pixels)

@@ -28,10 +28,10 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
-from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
 from bidnerf_core.registry import load_backend
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap, surface_from_tensors, surface_tensors
+from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.training import TrainingState
 
 FORMAT = "bidnerf map"

@@ -12,7 +12,7 @@ from bidnerf_core import Intrinsics, load_backend, localize
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.localization import BidConfig, rig
-from bidnerf_core.scenes import demo_object, look_at, orbit, views
+from bidnerf_core.scenes.demo import demo_object, look_at, orbit, views
 from bidnerf_core.training import Silent
 
 parser = argparse.ArgumentParser(description=__doc__)

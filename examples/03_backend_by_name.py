@@ -16,8 +16,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.localization import BidConfig, single
-from bidnerf_core.plain import to_plain
-from bidnerf_core.scenes import demo_object, orbit, views
+from bidnerf_core.scenes.demo import demo_object, orbit, views
+from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import MapInfo, save_map
 from bidnerf_core.training import Silent, TrainingState
 

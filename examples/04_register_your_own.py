@@ -21,9 +21,8 @@ from bidnerf_core.field import FieldValues
 from bidnerf_core.localization import BidConfig, single
 from bidnerf_core.rendering import render
 from bidnerf_core.sampling import Stratified
-from bidnerf_core.scenes import demo_object, orbit, views
-from bidnerf_core.supervision import supervised_loss
-from bidnerf_core.training import RayBank, Silent, StepOutcome, fit
+from bidnerf_core.scenes.demo import demo_object, orbit, views
+from bidnerf_core.training import RayBank, Silent, StepOutcome, fit, supervised_loss
 
 
 @dataclass(frozen=True)

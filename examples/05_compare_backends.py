@@ -14,7 +14,7 @@ from pathlib import Path
 from bidnerf_core import Intrinsics, list_backends
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import write_transforms
-from bidnerf_core.scenes import demo_object, orbit, views
+from bidnerf_core.scenes.demo import demo_object, orbit, views
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--out", type=Path, default=Path("compare-out"))

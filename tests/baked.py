@@ -9,20 +9,20 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_fields import GaussianBlobs
-from bidnerf_core.closed_form import ClosedFormScene
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.localization import Problem, rig
 from bidnerf_core.localization.alignment import Cloud
 from bidnerf_core.localization.clouds import measured_cloud
-from bidnerf_core.primitives import Primitive, Shape
-from bidnerf_core.rigs import orbit
-from bidnerf_core.scenes import demo_object
+from bidnerf_core.mapping import BakeConfig, SurfaceMap, Surfels, bake
+from bidnerf_core.mapping.surface_map import nearest_surfels
+from bidnerf_core.scenes.closed_form import ClosedFormScene
+from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.primitives import Primitive, Shape
+from bidnerf_core.scenes.textures import Texture
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import BakeConfig, SurfaceMap, Surfels, bake
-from bidnerf_core.surface.surface_map import nearest_surfels
-from bidnerf_core.textures import Texture
 
 CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))

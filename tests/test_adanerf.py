@@ -13,16 +13,16 @@ from torch import Generator, Tensor
 from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
 from bidnerf_adanerf.bins import Bins, chosen
 from bidnerf_adanerf.dense import Room, dense_samples, opacity, render_softly, soft_student
-from bidnerf_adanerf.lessons import ENOUGH, by_depth, by_weight, lesson
+from bidnerf_adanerf.oracle_loss import ENOUGH, by_depth, by_weight, oracle_loss
 from bidnerf_adanerf.recipe import Phase, phase_at, sparsity
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_form import views as seen_from
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues, Rays, RaySamples
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import query_samples, render, rendering_weights
-from bidnerf_core.rigs import look_around
-from bidnerf_core.scenes import demo_object, demo_room
+from bidnerf_core.scenes.closed_form import views as seen_from
+from bidnerf_core.scenes.demo import demo_object, demo_room
+from bidnerf_core.scenes.trajectories import look_around
 from bidnerf_core.testing import BackendContract
 from bidnerf_core.testing.recipes import Recorder, colour_error
 from bidnerf_core.testing.scene import BOUNDS, SIDE, awkward_rays, points, rgbd_views
@@ -244,7 +244,7 @@ def lessons(rays: Rays) -> tuple[RaySamples, RayBatch]:
 def test_measured_depth_teaches_the_oracle(lessons: tuple[RaySamples, RayBatch]) -> None:
     samples, batch = lessons
     logits = torch.zeros_like(samples.starts, requires_grad=True)
-    lesson(logits, samples, torch.zeros_like(logits), batch).backward()
+    oracle_loss(logits, samples, torch.zeros_like(logits), batch).backward()
     assert logits.grad is not None
     assert bool((logits.grad[:, 5] < 0).all())  # the score is to rise at the surface
     assert bool((logits.grad[:, [0, 1, 2, 8, 9, 15]] > 0).all())  # and to fall elsewhere
@@ -260,7 +260,7 @@ def test_shaded_bins_teach_the_oracle_without_depth(lessons: tuple[RaySamples, R
     weights = torch.zeros_like(logits)
     weights[:, 9] = 0.9
     weights.requires_grad_()
-    lesson(logits, samples, weights, unmeasured).backward()
+    oracle_loss(logits, samples, weights, unmeasured).backward()
     assert logits.grad is not None
     assert weights.grad is None  # the shading network is the teacher
     assert bool((logits.grad[:, 9] < 0).all())
@@ -281,7 +281,7 @@ def test_rays_that_miss_the_scene_teach_nothing(rays: Rays) -> None:
     samples, count = Bins(BOUNDS, 16)(rays), len(rays.near)
     batch = RayBatch(rays, torch.zeros(count, 3), torch.zeros(count), torch.zeros(count, 3))
     logits = torch.ones_like(samples.starts, requires_grad=True)
-    lesson(logits, samples, torch.zeros_like(logits), batch).backward()
+    oracle_loss(logits, samples, torch.zeros_like(logits), batch).backward()
     assert logits.grad is not None
     assert float(logits.grad[~hit(rays)].abs().max()) == 0
     assert float(logits.grad[hit(rays)].abs().min()) > 0

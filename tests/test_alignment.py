@@ -11,8 +11,8 @@ from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.localization.alignment import Cloud, Scales, alignment, contact, misfit
+from bidnerf_core.mapping import SurfaceMap, Surfels
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap, Surfels
 
 SCALES = Scales(0.1, 0.3, 0.7)
 

@@ -10,7 +10,6 @@ import torch
 
 import baked
 import bidnerf_core.localization.auto as module
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
@@ -19,11 +18,12 @@ from bidnerf_core.localization import AutoConfig, Localization, Problem, localiz
 from bidnerf_core.localization.bid import BidConfig
 from bidnerf_core.localization.clouds import measured_cloud
 from bidnerf_core.localization.search import Found, score
+from bidnerf_core.mapping import bake
 from bidnerf_core.rendering import render_image
-from bidnerf_core.rigs import orbit
-from bidnerf_core.scenes import demo_room
+from bidnerf_core.scenes.demo import demo_room
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import bake
 
 QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)
 """The field of these tests does not show the toy."""

@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 import baked
-from bidnerf_core.closed_fields import HomogeneousBall
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues
 from bidnerf_core.frames import View
 from bidnerf_core.localization.clouds import measured_cloud
-from bidnerf_core.primitives import Box, Sphere
-from bidnerf_core.rigs import orbit
-from bidnerf_core.surface import BakeConfig, SurfaceMap, bake
-from bidnerf_core.textures import blotches
+from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
+from bidnerf_core.scenes.fields import HomogeneousBall
+from bidnerf_core.scenes.primitives import Box, Sphere
+from bidnerf_core.scenes.textures import blotches
+from bidnerf_core.scenes.trajectories import orbit
 
 RADIUS = 0.6
 BALL = baked.one_solid(Sphere(RADIUS), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))

@@ -26,7 +26,7 @@ from bidnerf_core.evaluation.results import ResultsFile, as_line, read_results
 from bidnerf_core.evaluation.sequences import mean_up, seen_middle, sequence, turned_about
 from bidnerf_core.evaluation.trials import Trial, TrialResult, run_trial
 from bidnerf_core.localization import METHODS
-from bidnerf_core.rigs import look_at, orbit
+from bidnerf_core.scenes.trajectories import look_at, orbit
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
 BLOBS = "demo:blobs"

@@ -7,7 +7,7 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.surface.casting import cast
+from bidnerf_core.mapping.casting import cast
 
 
 def rays(count: int, generator: Generator) -> tuple[torch.Tensor, torch.Tensor]:

@@ -15,7 +15,7 @@ import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli import bake as module
 from bidnerf_core.cli import main
-from bidnerf_core.closed_fields import HomogeneousBall
+from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.storage import Map, load_info, load_map
 from tiny import backends_listed_once  # noqa: F401
 

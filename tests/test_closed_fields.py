@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core.closed_fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, Rays, RaySampler, SceneBounds, levels
 from bidnerf_core.rendering import render
-from bidnerf_core.rigs import orbit
 from bidnerf_core.sampling import Stratified
+from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 8.0)

@@ -15,21 +15,20 @@ import sparse_model
 import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.colmap_files import read_model
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, localize, rig
+from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import render, render_image
-from bidnerf_core.rigs import orbit
-from bidnerf_core.scenes import demo_object
+from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
-from bidnerf_core.supervision import depth_term
-from bidnerf_core.training import RayBank, Silent
+from bidnerf_core.training import RayBank, Silent, depth_term
 from bidnerf_hashgrid import backend as hashgrid
 from sparse_model import Known
 
@@ -331,7 +330,7 @@ def test_a_pose_comes_closer_with_the_points_than_without(tmp_path: Path) -> Non
         rays=16, depth_rays=64, max_steps=25, learning_rate=0.03, pivot="camera", level=None
     )  # fmt: skip
 
-    def error(view: View, rays: DepthRays | None, back: float) -> float:
+    def error(view: View, rays: Observations | None, back: float) -> float:
         start = view.T_ref_camera.retract(torch.tensor([0, 0, back, 0, 0, 0], dtype=torch.float64))
         found = localize(rig(FIELD, BOUNDS, [view], start, rays), "bid", config)
         return float(pose_error(found.T_world_camera, view.T_ref_camera).translation)

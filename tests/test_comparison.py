@@ -25,7 +25,7 @@ from bidnerf_core.evaluation.comparison import (
 from bidnerf_core.evaluation.comparison_figure import comparison_figure
 from bidnerf_core.evaluation.trial_process import Measured, TrialProcess, samples_per_ray
 from bidnerf_core.evaluation.trials import Off, Trace, Trial, TrialResult, run_trial
-from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.serialization import from_plain, to_plain
 
 QUICK = json.dumps({"rays": 32, "max_steps": 3})
 

@@ -10,20 +10,19 @@ import torch
 
 import tiny
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.interest import DrawerName
 from bidnerf_core.localization import BidConfig, InerfConfig, Problem, localize, rig, single
-from bidnerf_core.localization.pivots import PivotName, pivot
 from bidnerf_core.localization.sampled import RayCounts, SampledLoss
+from bidnerf_core.localization.solvers.pivots import PivotName, pivot
 from bidnerf_core.localization.trail import WINDOW, Trail
-from bidnerf_core.pixels import draw, uniform
+from bidnerf_core.pixels import DrawerName, draw, uniform
 from bidnerf_core.rendering import render_image
-from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 from bidnerf_hashgrid import backend as hashgrid
 

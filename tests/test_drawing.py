@@ -10,15 +10,15 @@ from scipy.optimize import minimize
 from torch import Generator
 
 import baked
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.drawing import UNKNOWN, Drawing, Looks, brightened, compared, drawn
-from bidnerf_core.localization.levenberg_marquardt import solve
 from bidnerf_core.localization.sketches import ByField, OnSurface, Sketcher
+from bidnerf_core.localization.solvers.levenberg_marquardt import solve
 from bidnerf_core.localization.thumbnails import Thumbnail, thumbnail
 from bidnerf_core.rendering import render_image
-from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from bidnerf_core.localization.levenberg_marquardt import System, descend, solve
+from bidnerf_core.localization.solvers.levenberg_marquardt import System, descend, solve
 from bidnerf_core.se3 import SE3, skew
 
 GENERATOR = torch.Generator().manual_seed(0)

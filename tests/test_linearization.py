@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.field import Rays, SceneBounds
 from bidnerf_core.localization.exposure import fit_exposure
 from bidnerf_core.localization.linearization import Linearization, linearize
 from bidnerf_core.localization.normal_equations import Losses, residuals
-from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.ray_batch import RayBatch
-from bidnerf_core.rigs import orbit
+from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.robust import Robust
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 0.9, 0.8))

@@ -9,8 +9,6 @@ import torch
 from torch import Generator
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_fields import GaussianBlobs
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
@@ -19,11 +17,13 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, BidLmConfig, InerfLmConfig, localize, rig, single
 from bidnerf_core.localization.neighbours import neighbours
 from bidnerf_core.localization.photometric import refine, stepped
-from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.ray_batch import blurred
+from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.localization.stages import Refinement, Stage
+from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.rendering import render
-from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
@@ -115,7 +115,7 @@ def test_a_rig_and_a_lidar() -> None:
     assert float(pose_error(together.T_world_camera, POSES[2]).translation) < 0.03
 
     blind = single(FIELD, BOUNDS, replace(FRAME, depth=None), perturb(TRUTH, 0.2, 5.0, seed=5))
-    lidar = DepthRays.from_views([View(FRAME, SE3.identity())])
+    lidar = depth_rays_of([View(FRAME, SE3.identity())])
     found = localize(replace(blind, depth_rays=lidar), "bid-lm", FEW)
     assert float(pose_error(found.T_world_camera, TRUTH).translation) < 0.03
 

@@ -6,16 +6,17 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import SceneBounds, widened
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, Problem, localize, rig, single
-from bidnerf_core.pixels import Pixels, draw, uniform
+from bidnerf_core.observations import Observations
+from bidnerf_core.pixels import draw, uniform
 from bidnerf_core.rendering import render
 from bidnerf_core.residuals import objective
-from bidnerf_core.rigs import look_at, orbit
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import look_at, orbit
 from bidnerf_core.se3 import SE3
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
@@ -126,7 +127,7 @@ def test_rays_are_shared_out_equally_and_lie_in_the_last_cameras_frame() -> None
     problem = rig(
         field, BOUNDS, [View(photograph(field, T, str(i)), T) for i, T in enumerate(poses)], poses[-1]
     )
-    pixels: Pixels = draw(problem.views, 99, uniform, torch.Generator().manual_seed(0))
+    pixels: Observations = draw(problem.views, 99, uniform, torch.Generator().manual_seed(0))
     assert pixels.rgb.shape == (3, 33, 3)
     world = pixels.rays(poses[-1], BOUNDS)
     for i, T in enumerate(poses):

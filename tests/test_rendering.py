@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_fields import HomogeneousBall
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds, levels, widened
 from bidnerf_core.rendering import query_samples, render, render_image, rendering_weights
 from bidnerf_core.sampling import Importance, Stratified, inverse_transform
+from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.se3 import SE3
 
 BLUE = (0.1, 0.2, 0.9)

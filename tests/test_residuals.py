@@ -5,14 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bidnerf_core.closed_fields import GaussianBlobs
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.field import Rays, RaySamples, SceneBounds
 from bidnerf_core.localization import BidConfig
-from bidnerf_core.pixels import Pixels
+from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import Rendering, render
 from bidnerf_core.residuals import Objective, depth, free_space, masked_mean, objective
 from bidnerf_core.robust import Robust
+from bidnerf_core.scenes.fields import GaussianBlobs
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)
 L2, HUBER = Robust("l2", 0.1), Robust("huber", 0.1)
@@ -27,9 +26,9 @@ def wall(at: float, opacity: float = 1.0) -> Rendering:
     return Rendering(torch.full((*shape, 3), 0.5), seen * at, seen, seen[..., None], samples)
 
 
-def measured(distance: torch.Tensor) -> Pixels:
+def measured(distance: torch.Tensor) -> Observations:
     zero = torch.zeros(2, 3, 3)
-    return Pixels(zero, zero, torch.full((2, 3, 3), 0.5), distance)
+    return Observations(zero, zero, torch.full((2, 3, 3), 0.5), distance, distance > -1)
 
 
 def test_free_space_counts_what_is_in_front_and_nothing_else() -> None:
@@ -59,7 +58,7 @@ def test_the_derivative_by_the_rays_is_the_numerical_one() -> None:
     aims = 0.6 * torch.randn((12, 3), generator=generator, dtype=torch.float64)
     directions = torch.nn.functional.normalize(aims - origins, dim=-1)
     field, here = GaussianBlobs.random(), BOUNDS.rays(origins, directions)
-    probe = DepthRays(origins, directions, torch.full((12,), 4.2, dtype=torch.float64))
+    probe = Observations.of_depth(origins, directions, torch.full((12,), 4.2, dtype=torch.float64))
     judged = Objective(L2, Robust("cauchy", 0.1), 0.0, free_space_weight=1.0)
 
     def loss(shift: torch.Tensor) -> torch.Tensor:

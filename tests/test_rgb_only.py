@@ -9,15 +9,15 @@ import pytest
 import torch
 
 import baked
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import AutoConfig, Localization, Problem, localize, rig
+from bidnerf_core.mapping import SurfaceMap, bake
 from bidnerf_core.rendering import render_image
-from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap, bake
 
 BOUNDS = replace(baked.BOUNDS, lower=(-1.2, -1.2, -1.2), upper=(1.2, 1.2, 1.2))
 FIELD = GaussianBlobs.random(density=60.0)

@@ -16,9 +16,9 @@ from bidnerf_core.localization.polish import without_depth
 from bidnerf_core.localization.rgb_hypotheses import around, hypotheses
 from bidnerf_core.localization.rgb_only import STAGES, surface_sight
 from bidnerf_core.localization.rgb_search import Sight, Stage, different, search
-from bidnerf_core.primitives import Box
+from bidnerf_core.scenes.primitives import Box
+from bidnerf_core.scenes.textures import blotches
 from bidnerf_core.se3 import SE3
-from bidnerf_core.textures import blotches
 
 KEYFRAMES = SE3.from_matrix(baked.toy().keyframes)
 

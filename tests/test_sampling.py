@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.closed_fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.field import Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.rendering import render
 from bidnerf_core.sampling import AroundDepth, Importance, Resampled, Stratified
+from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.testing import samples as laws
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 

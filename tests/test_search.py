@@ -11,8 +11,8 @@ import baked
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.localization.hypotheses import centred, hypotheses, random_rotations
 from bidnerf_core.localization.search import STAGES, score, search
-from bidnerf_core.primitives import Box
-from bidnerf_core.textures import blotches
+from bidnerf_core.scenes.primitives import Box
+from bidnerf_core.scenes.textures import blotches
 
 
 def test_the_pose_is_found_from_random_orientations(generator: Generator) -> None:

@@ -17,11 +17,12 @@ from torch import Tensor, nn
 import baked
 import tiny
 from bidnerf_core import storage
-from bidnerf_core.closed_fields import HomogeneousBall
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
-from bidnerf_core.plain import to_plain
+from bidnerf_core.mapping import SurfaceMap, surface_tensors
 from bidnerf_core.registry import load_backend
+from bidnerf_core.scenes.fields import HomogeneousBall
+from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import (
     MapInfo,
     load_info,
@@ -32,7 +33,6 @@ from bidnerf_core.storage import (
     stored_cameras,
     write_file,
 )
-from bidnerf_core.surface import SurfaceMap, surface_tensors
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
 from tiny import backends_listed_once  # noqa: F401

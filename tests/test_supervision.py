@@ -15,9 +15,8 @@ from bidnerf_adanerf import backend as adanerf
 from bidnerf_core.field import Rays, RaySamples
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render, rendering_weights
-from bidnerf_core.scenes import demo_object
-from bidnerf_core.supervision import depth_term, supervised_loss
-from bidnerf_core.training import RayBank, RayBatch, Silent
+from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.training import RayBank, RayBatch, Silent, depth_term, supervised_loss
 from bidnerf_hashgrid import backend as hashgrid
 from bidnerf_vanilla import VanillaConfig
 from bidnerf_vanilla import backend as vanilla

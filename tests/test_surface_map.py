@@ -9,11 +9,11 @@ from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.errors import InputError
-from bidnerf_core.primitives import Box, Primitive, Shape, Sphere
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.surface_map import nearest_surfels
+from bidnerf_core.scenes.primitives import Box, Primitive, Shape, Sphere
+from bidnerf_core.scenes.textures import blotches
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap
-from bidnerf_core.surface.surface_map import nearest_surfels
-from bidnerf_core.textures import blotches
 
 PAINT = blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1)
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import baked
-from bidnerf_core.surface import surface_from_tensors, surface_tensors
+from bidnerf_core.mapping import surface_from_tensors, surface_tensors
 
 
 def test_there_and_back() -> None:

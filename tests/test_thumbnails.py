@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.thumbnails import slopes, smooth, thumbnail
-from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
 PLAIN = Intrinsics(100.0, 104.0, 47.0, 33.0, 96, 64)

@@ -17,7 +17,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.pixels import all_pixels, observe
-from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.training import (
     MEASURED_SHARE,
     Progress,

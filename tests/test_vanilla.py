@@ -13,15 +13,14 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, RaySampler, RaySamples, SceneBounds, levels
-from bidnerf_core.plain import from_plain, to_plain
 from bidnerf_core.rendering import query_samples, render
 from bidnerf_core.sampling import Importance, Stratified
+from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.storage import MapInfo, load_map, save_map
-from bidnerf_core.supervision import depth_term, supervised_loss
 from bidnerf_core.testing import BackendContract
 from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, SIDE, points, rgb_views, rgbd_views
-from bidnerf_core.training import RayBank, TrainingState
+from bidnerf_core.training import RayBank, TrainingState, depth_term, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.encoding import encoded_width, positional_encoding
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig

@@ -14,7 +14,7 @@ from bidnerf_core.localization.alignment import Cloud
 from bidnerf_core.localization.hypotheses import hypotheses
 from bidnerf_core.localization.search import Found, search
 from bidnerf_core.localization.verdict import Bars, Evidence, covariance, crossed, evidence
-from bidnerf_core.scenes import demo_room
+from bidnerf_core.scenes.demo import demo_room
 from bidnerf_core.se3 import SE3
 
 

@@ -15,10 +15,10 @@ import torch
 
 from bidnerf_core import registry
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_form import views as seen_from
 from bidnerf_core.frames import View
-from bidnerf_core.rigs import orbit
-from bidnerf_core.scenes import demo_object
+from bidnerf_core.scenes.closed_form import views as seen_from
+from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid.encoding import HashEncodingConfig
 

@@ -13,11 +13,10 @@ from bidnerf_adanerf.bins import ray_logits
 from bidnerf_adanerf.config import AdaNerfConfig
 from bidnerf_adanerf.dense import Room, dense_samples, opacity, render_softly, soft_student
 from bidnerf_adanerf.field import AdaNerfField
-from bidnerf_adanerf.lessons import lesson
+from bidnerf_adanerf.oracle_loss import oracle_loss
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import query_samples, render, rendering_weights
-from bidnerf_core.supervision import supervised_loss
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit
+from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
 
 PROBE = 4096
 """Rays from which is learnt how many samples a ray takes."""
@@ -81,7 +80,7 @@ def dense_step(
     loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
     loss = loss + config.empty_weight * opacity(values, samples, empty)
     whole = rendering_weights(values.density, samples)
-    loss = loss + config.oracle_weight * lesson(logits, samples, whole, batch)
+    loss = loss + config.oracle_weight * oracle_loss(logits, samples, whole, batch)
     loss = loss + sparsity(step, config) * scores.mean()
     shaded = (samples.valid & (scores > config.threshold)).sum() / len(scores)
     return StepOutcome(loss, mse, float(shaded))

@@ -11,8 +11,7 @@ from bidnerf_core.carving import occupied_cells
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
-from bidnerf_core.supervision import supervised_loss
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit
+from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 

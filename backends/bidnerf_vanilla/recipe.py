@@ -11,8 +11,7 @@ from torch import Generator
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
-from bidnerf_core.supervision import supervised_loss
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit
+from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
 LEAST = {

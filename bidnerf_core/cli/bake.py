@@ -14,8 +14,8 @@ from bidnerf_core.cli.common import MapFolder, console, option, parse, read_view
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.storage import cameras_of, load_info, load_map, save_surface
-from bidnerf_core.surface import BakeConfig, bake
 
 SPEAK_EVERY = 10.0
 """Seconds, where nobody sees a bar."""

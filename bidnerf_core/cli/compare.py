@@ -37,7 +37,7 @@ from bidnerf_core.evaluation.protocols import PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.trial_process import Measured
 from bidnerf_core.evaluation.trials import Trial
 from bidnerf_core.localization import METHODS
-from bidnerf_core.plain import to_plain
+from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import load_info, write_file
 
 Folders = Annotated[

@@ -28,7 +28,6 @@ from bidnerf_core.cli.common import (
 )
 from bidnerf_core.cli.progress import timed
 from bidnerf_core.cli.train import train_map
-from bidnerf_core.closed_form import views
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.figures import blend, convergence_plot, overlay, save_gif
@@ -37,8 +36,9 @@ from bidnerf_core.frames import View
 from bidnerf_core.localization import BidConfig, Localization, localize, single
 from bidnerf_core.registry import load_backend
 from bidnerf_core.rendering import render_image
-from bidnerf_core.rigs import orbit
-from bidnerf_core.scenes import demo_object
+from bidnerf_core.scenes.closed_form import views
+from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map, load_map
 from bidnerf_core.training import TrainingStopped

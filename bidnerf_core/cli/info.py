@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json
 from bidnerf_core.field import levels
-from bidnerf_core.plain import to_plain
+from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import load_map
 
 

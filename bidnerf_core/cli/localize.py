@@ -32,7 +32,6 @@ from bidnerf_core.cli.common import (
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.datasets.points import read_depth_points
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.evaluation.errors import PoseError, pose_error
@@ -41,6 +40,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.localization import METHODS, InerfConfig, Localization, rig
 from bidnerf_core.localization import localize as find_pose
 from bidnerf_core.localization import window as windowed
+from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map, load_map
 
@@ -100,7 +100,9 @@ class Seen:
                     say(f"--window {self.window}: {said}; a rig of {len(names)}")
         return read_views(dataset, self.split, names)
 
-    def with_points(self, views: list[View], method: str, stored: Map) -> tuple[list[View], DepthRays | None]:
+    def with_points(
+        self, views: list[View], method: str, stored: Map
+    ) -> tuple[list[View], Observations | None]:
         """The views with what ``depth_points`` holds for them: depth images, or rays of the last one's camera."""
         if self.depth_points is None or not self.depth_points.is_dir():
             return views, None if self.depth_points is None else read_depth_points(self.depth_points)

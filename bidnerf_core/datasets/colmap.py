@@ -17,9 +17,9 @@ from torch import Tensor
 
 from bidnerf_core.datasets.colmap_files import ModelImage, ModelPoints, read_model
 from bidnerf_core.datasets.similarity import fit_similarity, spread
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
 SPLITS = frozenset({"train", "val", "test"})
@@ -92,7 +92,7 @@ class SparsePoints:
         points = image.T_camera_model.apply(self._points.positions[place]) * self.unit.metres
         return points[points[:, 2] > 0]
 
-    def rays(self, views: Sequence[View], split: str) -> DepthRays:
+    def rays(self, views: Sequence[View], split: str) -> Observations:
         """What all ``views`` observe, in the frame of the last one's camera, by their relative poses.
 
         Raises ``InputError`` where that is nothing.
@@ -100,14 +100,14 @@ class SparsePoints:
         T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
         found = [(view, self.seen(view.frame.name, split)) for view in views]
         parts = [
-            DepthRays.from_points(points, T_last_ref @ view.T_ref_camera.to("cpu", torch.float64))
+            Observations.from_points(points, T_last_ref @ view.T_ref_camera.to("cpu", torch.float64))
             for view, points in found
             if len(points)
         ]
         if not parts:
             names = ", ".join(view.frame.name for view in views)
             raise InputError(f"{self.folder}: no points that {names} observes; it has {self._images.some}")
-        return DepthRays.joined(parts)
+        return Observations.joined(parts)
 
     def onto(self, view: View, split: str) -> View:
         """The view with the depth (planar z) of the nearest observed point at each pixel, 0 elsewhere.

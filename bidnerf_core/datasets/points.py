@@ -8,14 +8,14 @@ from zipfile import BadZipFile
 import numpy as np
 import torch
 
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
+from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
 EXPECTED = "expected n rows of x, y, z in metres"
 
 
-def read_depth_points(path: Path) -> DepthRays:
+def read_depth_points(path: Path) -> Observations:
     """Points (metres, OpenCV axes) as depth rays of the camera's frame.
 
     Text (.txt, .csv, .xyz: rows of x, y, z, separated by commas or blanks; what follows on a row is not read, and ``#``
@@ -28,7 +28,7 @@ def read_depth_points(path: Path) -> DepthRays:
         raise InputError(f"{path}: an array of shape {points.shape} and type {points.dtype}, {EXPECTED}")
     xyz = torch.from_numpy(points[:, :3].astype(np.float64))
     try:
-        return DepthRays.from_points(xyz, T_camera_sensor)
+        return Observations.from_points(xyz, T_camera_sensor)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

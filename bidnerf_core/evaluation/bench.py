@@ -21,7 +21,7 @@ from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.sequences import sequence
 from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, opened_points, run_trial, settings_of
 from bidnerf_core.localization import find_method
-from bidnerf_core.plain import to_plain
+from bidnerf_core.serialization import to_plain
 
 
 @dataclass(frozen=True)

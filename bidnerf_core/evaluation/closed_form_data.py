@@ -17,15 +17,15 @@ from typing import TypeVar
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.datasets import ReadingProgress
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.sequences import turned_about
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.rendering import render_image
-from bidnerf_core.rigs import look_around, orbit
-from bidnerf_core.scenes import demo_object, demo_room
+from bidnerf_core.scenes.demo import demo_object, demo_room
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import look_around, orbit
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map, MapInfo
 

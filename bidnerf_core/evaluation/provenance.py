@@ -18,7 +18,7 @@ import torch
 
 import bidnerf_core
 from bidnerf_core.errors import InputError
-from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.storage import write_file
 
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")

@@ -16,7 +16,7 @@ from typing import IO, TypeAlias
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trials import Trial, TrialResult
-from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.storage import write_file
 
 Key: TypeAlias = str

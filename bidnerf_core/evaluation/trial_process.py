@@ -17,7 +17,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, run_trial, settings_of
 from bidnerf_core.localization import single
 from bidnerf_core.pixels import draw, uniform
-from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.serialization import from_plain, to_plain
 
 RAYS = 2048
 """On how many the samples are counted."""

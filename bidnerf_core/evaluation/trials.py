@@ -20,7 +20,6 @@ from torch import Tensor
 
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.evaluation.errors import PoseError, pose_error
@@ -29,8 +28,9 @@ from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.frames import View
 from bidnerf_core.localization import Localization, find_method, localize, rig
 from bidnerf_core.localization.auto import LEAST_POINTS
-from bidnerf_core.plain import from_plain, to_plain
+from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
+from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
@@ -177,7 +177,7 @@ def opened_points(folder: str | None, map_folder: str) -> SparsePoints | None:
 
 def with_points(
     points: SparsePoints, views: list[View], split: str, method: str, stored: Map
-) -> tuple[list[View], DepthRays | None]:
+) -> tuple[list[View], Observations | None]:
     """The points that ``views`` observe as method ``auto`` takes them, in images, or as others do: rays of their own.
 
     In an image they are so few that rays drawn anywhere would not meet them; ``auto`` looks at all that was measured. It

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.localization.levenberg_marquardt import System
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.solvers.levenberg_marquardt import System
+from bidnerf_core.localization.solvers.pivots import Pivot
+from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3, skew
-from bidnerf_core.surface import SurfaceMap
 
 BESIDE = 1.5
 """How far along its plane a surfel reaches, in cells of the map."""

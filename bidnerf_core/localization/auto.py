@@ -22,8 +22,8 @@ from bidnerf_core.localization.search import Found, score, search
 from bidnerf_core.localization.settings import Judged
 from bidnerf_core.localization.stages import Refinement, Stage
 from bidnerf_core.localization.verdict import Bars, covariance, evidence
+from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap
 
 LEAST_POINTS = 50
 """With fewer there is no shape to recognise."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bidnerf_core.localization.adam import DescentConfig, descend
-from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.solvers.adam import DescentConfig, descend
+from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.residuals import Objective
 from bidnerf_core.robust import Robust, RobustName
 

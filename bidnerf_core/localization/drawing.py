@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.localization.levenberg_marquardt import System
 from bidnerf_core.localization.sketches import Sketcher
+from bidnerf_core.localization.solvers.levenberg_marquardt import System
 from bidnerf_core.localization.thumbnails import Thumbnail, slopes, smooth
 from bidnerf_core.se3 import SE3
 

@@ -8,8 +8,8 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Generator, Tensor
 
 from bidnerf_core.localization.alignment import Cloud
+from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap
 
 
 def hypotheses(surface: SurfaceMap, cloud: Cloud, start: SE3 | None, count: int, generator: Generator) -> SE3:

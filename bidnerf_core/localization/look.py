@@ -9,13 +9,13 @@ from torch import Generator, Tensor
 
 from bidnerf_core.field import RadianceField, Rays
 from bidnerf_core.localization.centring import centred
-from bidnerf_core.localization.levenberg_marquardt import System
 from bidnerf_core.localization.linearization import linearize
 from bidnerf_core.localization.normal_equations import Losses, Residuals, residuals
-from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.ray_batch import RayBatch, draw_batch
 from bidnerf_core.localization.sampled import RayCounts
+from bidnerf_core.localization.solvers.levenberg_marquardt import System
+from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.localization.stages import Refinement, Stage
 from bidnerf_core.robust import Robust
 from bidnerf_core.sampling import AroundDepth, Resampled

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.localization.exposure import Exposure, fit_exposure
-from bidnerf_core.localization.levenberg_marquardt import System
 from bidnerf_core.localization.linearization import Linearization
 from bidnerf_core.localization.ray_batch import RayBatch
+from bidnerf_core.localization.solvers.levenberg_marquardt import System
 from bidnerf_core.robust import Robust
 
 

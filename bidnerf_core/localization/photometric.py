@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.localization.levenberg_marquardt import descend, solve
 from bidnerf_core.localization.look import Look, look_at
-from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.solvers.levenberg_marquardt import descend, solve
+from bidnerf_core.localization.solvers.pivots import pivot
 from bidnerf_core.localization.stages import Refinement, Stage
 from bidnerf_core.se3 import SE3
 

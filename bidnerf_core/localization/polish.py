@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 from torch import Generator
 
-from bidnerf_core.interest import DrawerName
 from bidnerf_core.localization.photometric import Refined, refine
-from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import Judged
+from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.localization.stages import Refinement, Stage
+from bidnerf_core.pixels import DrawerName
 from bidnerf_core.robust import RobustName
 from bidnerf_core.se3 import SE3
 

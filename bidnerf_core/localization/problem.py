@@ -8,12 +8,12 @@ from typing import TypeVar
 
 import torch
 
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap
 
 Item = TypeVar("Item")
 
@@ -29,7 +29,7 @@ class Problem:
     bounds: SceneBounds
     views: tuple[View, ...]
     start: SE3 | None  # T_world_K; none where nothing is known of it
-    depth_rays: DepthRays | None = None  # of a lidar or the like, in the frame of the last camera
+    depth_rays: Observations | None = None  # of a lidar or the like, in the frame of the last camera
     surface: SurfaceMap | None = None  # baked from the field; on the CPU, wherever the field is
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ def single(
     bounds: SceneBounds,
     frame: Frame,
     start: SE3 | None,
-    depth_rays: DepthRays | None = None,
+    depth_rays: Observations | None = None,
     surface: SurfaceMap | None = None,
 ) -> Problem:
     """One image, and what else was measured from there."""
@@ -86,7 +86,7 @@ def rig(
     bounds: SceneBounds,
     views: Sequence[View],
     start: SE3 | None,
-    depth_rays: DepthRays | None = None,
+    depth_rays: Observations | None = None,
     surface: SurfaceMap | None = None,
 ) -> Problem:
     """Views whose poses are known in any common frame; ``start`` is for the last of them, as are ``depth_rays``."""

@@ -9,13 +9,12 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.field import Rays, SceneBounds
 from bidnerf_core.frames import View
-from bidnerf_core.interest import DrawerName, drawer
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.sampled import RayCounts
-from bidnerf_core.pixels import draw
+from bidnerf_core.observations import Observations
+from bidnerf_core.pixels import DrawerName, draw, drawer
 from bidnerf_core.se3 import SE3
 
 
@@ -67,7 +66,7 @@ def draw_batch(
     return _joined(batch, _of_depth(drawn, depth_weight))
 
 
-def _of_depth(rays: DepthRays, depth_weight: float) -> RayBatch:
+def _of_depth(rays: Observations, depth_weight: float) -> RayBatch:
     """Rays that measured no colour."""
     none = rays.directions.new_zeros((len(rays), 3))
     share = torch.full_like(rays.distance, depth_weight / len(rays))

@@ -16,9 +16,9 @@ from bidnerf_core.localization.rgb_search import Found, Sight, Stage, search
 from bidnerf_core.localization.sketches import OnSurface
 from bidnerf_core.localization.thumbnails import Thumbnail, thumbnail
 from bidnerf_core.localization.verdict import INDEPENDENT
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.casting import Cast, cast
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap
-from bidnerf_core.surface.casting import Cast, cast
 
 STAGES = (Stage(16, 0, 48), Stage(16, 8, 12), Stage(24, 8, 4), Stage(48, 8, 2), Stage(96, 5, 2))
 OPEN = 0.2

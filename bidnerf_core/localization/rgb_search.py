@@ -13,9 +13,9 @@ from torch import Tensor
 
 from bidnerf_core.frames import View
 from bidnerf_core.localization.drawing import Looks, compared
-from bidnerf_core.localization.levenberg_marquardt import descend
-from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.sketches import Sketcher
+from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.localization.thumbnails import Thumbnail, thumbnail
 from bidnerf_core.se3 import SE3
 

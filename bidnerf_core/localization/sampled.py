@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.field import Rays, widened
-from bidnerf_core.interest import DrawerName, drawer
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.pixels import Pixels, draw
+from bidnerf_core.observations import Observations
+from bidnerf_core.pixels import DrawerName, draw, drawer
 from bidnerf_core.rendering import Rendering, render
 from bidnerf_core.residuals import Objective
 from bidnerf_core.se3 import SE3
@@ -35,7 +34,7 @@ class SampledLoss:
         self._problem, self._objective, self._counts = problem, objective, rays
         self._drawer, self._renew, self._generator = drawer(pixels), renew, generator
         self._field, self._wide = problem.level(level), wide
-        self._batch: tuple[Pixels, DepthRays | None] | None = None
+        self._batch: tuple[Observations, Observations | None] | None = None
 
     def __call__(self, T_world_last: SE3) -> Float[Tensor, ""]:
         """Differentiable in the pose of the last view's camera."""
@@ -47,11 +46,11 @@ class SampledLoss:
             loss = loss + self._objective.on_depth_rays(self._seen(depth_rays, T_world_last), depth_rays)
         return loss
 
-    def _seen(self, what: Pixels | DepthRays, T_world_last: SE3) -> Rendering:
+    def _seen(self, what: Observations, T_world_last: SE3) -> Rendering:
         bounds = self._problem.bounds
         return render(self._field, self._widened(what.rays(T_world_last, bounds)), bounds.background)
 
-    def _drawn(self) -> tuple[Pixels, DepthRays | None]:
+    def _drawn(self) -> tuple[Observations, Observations | None]:
         problem, chance = self._problem, self._generator
         pixels = draw(problem.views, self._counts.pixels, self._drawer, chance, device=problem.device)
         if problem.depth_rays is None or not self._objective.heeds_depth or self._counts.depth_rays == 0:

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.localization.alignment import Cloud, Scales, alignment, cost
-from bidnerf_core.localization.levenberg_marquardt import descend
+from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap
 
 FINEST = 2.0
 """Scale of distances at the end, in cells of the map."""

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 from torch import Generator
 
-from bidnerf_core.interest import DrawerName
 from bidnerf_core.localization.neighbours import neighbours
 from bidnerf_core.localization.photometric import Refined, refine
-from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.settings import Judged
+from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.localization.stages import Refinement, Stage
+from bidnerf_core.pixels import DrawerName
 from bidnerf_core.robust import RobustName
 
 

@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.casting import cast
 from bidnerf_core.rendering import render
-from bidnerf_core.surface import SurfaceMap
-from bidnerf_core.surface.casting import cast
 
 CHUNK = 16384
 """Rays that are rendered at a time."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bidnerf_core.interest import DrawerName
-from bidnerf_core.localization.pivots import PivotName
+from bidnerf_core.localization.solvers.pivots import PivotName
+from bidnerf_core.pixels import DrawerName
 from bidnerf_core.robust import RobustName
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bidnerf_core.localization.alignment import Cloud, Scales, alignment, colours, contact, falling, misfit
 from bidnerf_core.localization.search import FINEST, JUDGED, Found
+from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface import SurfaceMap
 
 INDEPENDENT = 10
 """Measurements of an image that are independent of each other, by the normalised errors on several maps and sensors:

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_form import views as seen_from
 from bidnerf_core.field import Rays, widened
 from bidnerf_core.frames import View
-from bidnerf_core.rigs import orbit
-from bidnerf_core.scenes import demo_object
+from bidnerf_core.scenes.closed_form import views as seen_from
+from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
 SIZE = 24

@@ -12,8 +12,8 @@ import torch
 from torch import nn
 
 from bidnerf_core.field import RadianceField, levels
-from bidnerf_core.plain import from_plain, to_plain
 from bidnerf_core.registry import load_backend
+from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.testing import recipes
 from bidnerf_core.testing.faults import query, require, telling
 from bidnerf_core.testing.scene import BOUNDS, points, rgbd_views

@@ -12,7 +12,7 @@ import tyro
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
-from bidnerf_core.plain import to_plain
+from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import MapInfo, save_map
 from bidnerf_core.training import TrainingState
 from bidnerf_nerf_pytorch import NerfPytorchConfig, backend, read_checkpoint

@@ -13,8 +13,7 @@ from bidnerf_core.field import FieldValues, SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
 from bidnerf_core.sampling import Stratified
-from bidnerf_core.supervision import supervised_loss
-from bidnerf_core.training import RayBank, Report, StepOutcome, fit
+from bidnerf_core.training import RayBank, Report, StepOutcome, fit, supervised_loss
 
 __all__ = ["TemplateBackend", "TemplateConfig", "TemplateField", "backend"]
 

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bidnerf_core.interest import DrawerName
-from bidnerf_core.localization.pivots import Pivot, PivotName, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.sampled import RayCounts, SampledLoss
 from bidnerf_core.localization.settings import Judged
+from bidnerf_core.localization.solvers.pivots import Pivot, PivotName, pivot
 from bidnerf_core.localization.trail import AnswerName, Trail
+from bidnerf_core.pixels import DrawerName
 from bidnerf_core.residuals import Objective
 from bidnerf_core.robust import RobustName
 from bidnerf_core.se3 import SE3

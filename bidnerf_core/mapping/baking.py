@@ -14,10 +14,10 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
+from bidnerf_core.mapping.surface_map import SurfaceMap, nearest_surfels
+from bidnerf_core.mapping.surfels import fused, merged
 from bidnerf_core.rendering import RenderedImage, render_image
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface.surface_map import SurfaceMap, nearest_surfels
-from bidnerf_core.surface.surfels import fused, merged
 
 WITNESSES = 8
 """Other views that are asked about each point."""

@@ -17,7 +17,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.primitives import Primitive
+from bidnerf_core.scenes.primitives import Primitive
 from bidnerf_core.se3 import SE3
 
 

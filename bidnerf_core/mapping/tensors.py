@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from bidnerf_core.mapping.surface_map import SurfaceMap
+from bidnerf_core.mapping.surfels import Surfels
 from bidnerf_core.se3 import SE3
-from bidnerf_core.surface.surface_map import SurfaceMap
-from bidnerf_core.surface.surfels import Surfels
 
 KINDS = {
     "positions": ((-1, 3), torch.float32),

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
-from bidnerf_core.surface.surfels import Surfels
+from bidnerf_core.mapping.surfels import Surfels
 
 REACH = 0.7
 """Of the distance to the fourth neighbour of a surfel, how much is its own."""

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues, Rays, RaySampler
-from bidnerf_core.primitives import Sphere
 from bidnerf_core.sampling import Stratified
+from bidnerf_core.scenes.primitives import Sphere
 from bidnerf_core.se3 import SE3
 
 

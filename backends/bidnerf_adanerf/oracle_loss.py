@@ -16,7 +16,7 @@ ENOUGH = 0.1
 """Rendering weight from which on a bin matters fully."""
 
 
-def lesson(
+def oracle_loss(
     logits: Float[Tensor, "r n"],
     samples: RaySamples,
     weights: Float[Tensor, "r n"],

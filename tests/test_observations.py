@@ -9,9 +9,7 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.closed_fields import GaussianBlobs
 from bidnerf_core.datasets.points import read_depth_points
-from bidnerf_core.depth_rays import DepthRays
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
@@ -19,8 +17,11 @@ from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, Problem, localize, single, window
 from bidnerf_core.localization.sampled import RayCounts, SampledLoss
+from bidnerf_core.observations import Observations
+from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.rendering import render, render_image
-from bidnerf_core.rigs import orbit
+from bidnerf_core.scenes.fields import GaussianBlobs
+from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
@@ -42,8 +43,8 @@ def scan() -> torch.Tensor:
     return torch.where((found.opacity > 0.9)[:, None], found.distance[:, None] * directions, torch.nan)
 
 
-def lidar() -> DepthRays:
-    return DepthRays.from_points(scan(), T_CAMERA_LIDAR)
+def lidar() -> Observations:
+    return Observations.from_points(scan(), T_CAMERA_LIDAR)
 
 
 def photograph(depth: bool = False) -> Frame:
@@ -163,7 +164,7 @@ def test_sparse_depth_images_become_rays() -> None:
     depth[index] = dense.depth.reshape(-1)[index]
     frame = Frame("frame", dense.rgb, CAMERA, depth.reshape(40, 48))
     T = SE3.exp(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.0, -0.2], dtype=torch.float64))
-    rays = DepthRays.from_views([View(frame, T)])
+    rays = depth_rays_of([View(frame, T)])
     assert len(rays) == len(index)
     seen = T.inverse().apply(rays.points)
     torch.testing.assert_close(seen[:, 2].float(), depth[index])
@@ -176,7 +177,7 @@ def test_sparse_depth_images_become_rays() -> None:
 def test_nothing_measured_is_told() -> None:
     for points in (torch.zeros(3, 3), torch.full((2, 3), torch.nan), torch.zeros(0, 3)):
         with pytest.raises(InputError, match="nothing was measured"):
-            DepthRays.from_points(points, SE3.identity())
+            Observations.from_points(points, SE3.identity())
 
 
 def test_files_of_points(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.field import SceneBounds
-from bidnerf_core.surface.surface_map import SurfaceMap
+from bidnerf_core.mapping.surface_map import SurfaceMap
 
 ROUND = 6
 """Steps between which rays that are done are put aside."""

@@ -1,0 +1,1 @@
+"""Cost terms: how well poses explain what was measured."""

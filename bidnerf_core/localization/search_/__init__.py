@@ -1,0 +1,1 @@
+"""Search: proposing poses and thinning them out."""

@@ -1,0 +1,1 @@
+"""Solvers: how poses move, whatever the cost."""

@@ -1,0 +1,8 @@
+"""The surface that a field shows: baked once from any field, asked for the nearest piece of it in constant time."""
+
+from bidnerf_core.mapping.baking import BakeConfig, bake
+from bidnerf_core.mapping.surface_map import SurfaceMap
+from bidnerf_core.mapping.surfels import Surfels
+from bidnerf_core.mapping.tensors import surface_from_tensors, surface_tensors
+
+__all__ = ["BakeConfig", "SurfaceMap", "Surfels", "bake", "surface_from_tensors", "surface_tensors"]

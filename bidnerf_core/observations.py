@@ -1,0 +1,128 @@
+"""Measured rays: what a sensor saw, and how far away, along half-lines of a reference frame.
+
+The same bundle serves pixels of an RGB-D image, the returns of a lidar and the points of structure from motion. A ray says
+of itself what was measured along it: ``coloured`` marks the rays with a colour, ``distance`` is 0 where none was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Generator, Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import Rays, SceneBounds
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Half-lines of a reference frame with the colour and the distance that were measured along them."""
+
+    origins: Float[Tensor, "*p 3"]  # metres, reference frame
+    directions: Float[Tensor, "*p 3"]  # unit, reference frame
+    rgb: Float[Tensor, "*p 3"]  # in [0, 1]; 0 where not coloured
+    distance: Float[Tensor, "*p"]  # metres along the ray, not z; 0 where nothing was measured
+    coloured: Bool[Tensor, "*p"]  # whether a colour was measured
+
+    @staticmethod
+    def from_points(points: Float[Tensor, "n 3"], T_ref_sensor: SE3) -> Observations:
+        """Distances to ``points`` (metres), measured by a sensor at the origin of their frame; float64.
+
+        Points that are not finite or lie at the origin are the returns that a lidar did not get, and are left out. Raises
+        ``InputError`` where none is left.
+        """
+        points = points.to(torch.float64)
+        distance = torch.linalg.vector_norm(points, dim=-1)
+        measured = distance.isfinite() & (distance > 0)
+        T = T_ref_sensor.to(points)
+        directions = T.rotate(points[measured] / distance[measured][:, None])
+        return Observations.of_depth(T.translation.expand_as(directions), directions, distance[measured])
+
+    @staticmethod
+    def of_depth(
+        origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], distance: Float[Tensor, "n"]
+    ) -> Observations:
+        """Rays along which a distance (metres, > 0) was measured and no colour. Raises ``InputError`` where there are none."""
+        if len(distance) == 0:
+            raise InputError("depth rays: nothing was measured, expected at least one finite point in front")
+        coloured = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
+        return Observations(origins, directions, torch.zeros_like(directions), distance, coloured)
+
+    @staticmethod
+    def joined(parts: Sequence[Observations]) -> Observations:
+        """All rays of ``parts``, which share a reference frame, along the first axis."""
+        return Observations(
+            *(torch.cat(values) for values in zip(*(part._tensors() for part in parts), strict=True))
+        )
+
+    @staticmethod
+    def stacked(parts: Sequence[Observations]) -> Observations:
+        """Equally many rays of each part, with a new first axis: one row a part."""
+        return Observations(
+            *(torch.stack(values) for values in zip(*(part._tensors() for part in parts), strict=True))
+        )
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+    def __getitem__(self, index: Tensor | slice) -> Observations:
+        """Some of the rays, by their place along the first axis or by a mask."""
+        return Observations(*(part[index] for part in self._tensors()))
+
+    @property
+    def measured(self) -> Bool[Tensor, "*p"]:
+        """Where a distance was measured."""
+        return self.distance > 0
+
+    @property
+    def points(self) -> Float[Tensor, "*p 3"]:
+        """The measured points (metres, reference frame); the ray's origin where no distance was measured."""
+        return self.origins + self.distance[..., None] * self.directions
+
+    def without_colour(self) -> Observations:
+        """The rays along which a distance was measured, without their colours. Raises ``InputError`` where there are none."""
+        measured = self[self.measured]
+        return Observations.of_depth(measured.origins, measured.directions, measured.distance)
+
+    def flattened(self) -> Observations:
+        """The same rays along one axis."""
+        parts = (self.origins, self.directions, self.rgb)
+        flat = (part.reshape(-1, 3) for part in parts)
+        return Observations(*flat, self.distance.reshape(-1), self.coloured.reshape(-1))
+
+    def drawn(
+        self,
+        count: int,
+        generator: Generator,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> Observations:
+        """``count`` of the rays, uniformly with replacement; all of them where there are no more than that."""
+        if count >= len(self):
+            return self.to(device, dtype)
+        index = torch.randint(len(self), (count,), generator=generator)
+        return self[index.to(self.distance.device)].to(device, dtype)
+
+    def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:
+        """The same on another device and in another floating-point type."""
+        floats = (part.to(device=device, dtype=dtype) for part in self._tensors()[:-1])
+        return Observations(*floats, self.coloured.to(device=device))
+
+    def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
+        """The half-lines in the world, limited to the scene's bounds; differentiable in the transform.
+
+        A batch of transforms (h) gives rays of shape (h *p).
+        """
+        T = T_world_ref.to(self.origins)
+        if T.translation.ndim > 1:
+            ones = (1,) * self.distance.ndim
+            batch = T.translation.shape[:-1]
+            T = SE3(T.rotation.reshape(*batch, *ones, 3, 3), T.translation.reshape(*batch, *ones, 3))
+        return bounds.rays(T.apply(self.origins), T.rotate(self.directions))
+
+    def _tensors(self) -> tuple[Tensor, ...]:
+        return self.origins, self.directions, self.rgb, self.distance, self.coloured
