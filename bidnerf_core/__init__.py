@@ -21,7 +21,8 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds, levels
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import Localization, localize
+from bidnerf_core.localization import Localization, Localizer, Outcome
+from bidnerf_core.observations import Observations
 from bidnerf_core.registry import list_backends, load_backend
 from bidnerf_core.rendering import render, render_image
 from bidnerf_core.se3 import SE3
@@ -34,7 +35,10 @@ __all__ = [
     "InputError",
     "Intrinsics",
     "Localization",
+    "Localizer",
     "Map",
+    "Observations",
+    "Outcome",
     "RadianceField",
     "RaySampler",
     "RaySamples",
@@ -45,7 +49,6 @@ __all__ = [
     "list_backends",
     "load_backend",
     "load_map",
-    "localize",
     "render",
     "render_image",
 ]

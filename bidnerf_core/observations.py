@@ -69,8 +69,8 @@ class Observations:
     def __len__(self) -> int:
         return len(self.distance)
 
-    def __getitem__(self, index: Tensor | slice) -> Observations:
-        """Some of the rays, by their place along the first axis or by a mask."""
+    def __getitem__(self, index: Tensor | slice | None) -> Observations:
+        """Return some of the rays, by their place along the first axis or by a mask; None adds an axis of length 1."""
         return Observations(*(part[index] for part in self._tensors()))
 
     @property
@@ -90,9 +90,12 @@ class Observations:
 
     def flattened(self) -> Observations:
         """The same rays along one axis."""
-        parts = (self.origins, self.directions, self.rgb)
-        flat = (part.reshape(-1, 3) for part in parts)
-        return Observations(*flat, self.distance.reshape(-1), self.coloured.reshape(-1))
+        origins, directions, rgb = (part.reshape(-1, 3) for part in (self.origins, self.directions, self.rgb))
+        return Observations(origins, directions, rgb, self.distance.reshape(-1), self.coloured.reshape(-1))
+
+    def repeated(self, times: int) -> Observations:
+        """Return rays of shape (n) as often as ``times`` one after the other, for as many poses."""
+        return Observations(*(part.expand(times, *part.shape).flatten(0, 1) for part in self._tensors()))
 
     def drawn(
         self,
@@ -109,8 +112,11 @@ class Observations:
 
     def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:
         """The same on another device and in another floating-point type."""
-        floats = (part.to(device=device, dtype=dtype) for part in self._tensors()[:-1])
-        return Observations(*floats, self.coloured.to(device=device))
+        origins, directions, rgb, distance = (
+            part.to(device=device, dtype=dtype)
+            for part in (self.origins, self.directions, self.rgb, self.distance)
+        )
+        return Observations(origins, directions, rgb, distance, self.coloured.to(device=device))
 
     def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
         """The half-lines in the world, limited to the scene's bounds; differentiable in the transform.

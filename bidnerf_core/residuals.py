@@ -1,8 +1,15 @@
-"""How far a rendering is from what was measured."""
+"""How far a rendering is from what was measured: the residuals that every rendering method minimises.
+
+A ``Residual`` compares what rays render with what was measured along them; a ``Term`` adds a robust loss, a weight and the
+rays that it applies to; an ``Objective`` is a sum of terms (eq. 5). Adam takes the objective's ``loss``, Levenberg-Marquardt
+its ``residuals``, ``weights`` and robust factors, so that a change of a residual changes every method.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,78 +17,165 @@ from torch import Tensor
 
 from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import Rendering
-from bidnerf_core.robust import Robust, huber
-
-__all__ = ["Objective", "depth", "free_space", "huber", "masked_mean", "objective", "photometric"]
+from bidnerf_core.robust import Robust
 
 
-@dataclass(frozen=True)
-class Objective:
-    """What a rendering is judged by: robust errors of colour, and of depth with its weight (lambda_d)."""
+@runtime_checkable
+class Residual(Protocol):
+    """Compares renderings with measurements, ray by ray; differentiable in the rendering."""
 
-    colour: Robust
-    depth: Robust  # its scale is in metres
-    depth_weight: float
-    free_space_weight: float = (
-        0.0  # of matter that is rendered more than the scale of depth before what was measured
-    )
-
-    def __call__(self, rendering: Rendering, pixels: Observations) -> Float[Tensor, ""]:
-        """``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6), for pixels of shape (views, pixels).
-
-        The colour term sums rho over the three channels; the depth term is a mean over the rays where depth was measured.
-        """
-        colour = self.colour(photometric(rendering, pixels)).sum(-1).mean(-1)
-        if not self.heeds_depth:
-            return colour.mean()
-        distance = masked_mean(self.depth(depth(rendering, pixels)), pixels.distance > 0)
-        loss = (colour + self.depth_weight * distance).mean()
-        return loss + self._in_front(rendering, pixels.distance)
-
-    def on_depth_rays(self, rendering: Rendering, measured: Observations) -> Float[Tensor, ""]:
-        """``lambda_d mean_r rho(d)``: the depth terms alone, on rays of their own."""
-        loss = self.depth_weight * self.depth(rendering.distance - measured.distance).mean()
-        return loss + self._in_front(rendering, measured.distance)
-
-    @property
-    def heeds_depth(self) -> bool:
-        return self.depth_weight > 0 or self.free_space_weight > 0
-
-    def _in_front(self, rendering: Rendering, distance: Float[Tensor, "*k p"]) -> Float[Tensor, ""] | float:
-        if self.free_space_weight == 0:
-            return 0.0
-        found = self.depth(free_space(rendering, distance, self.depth.scale))
-        return self.free_space_weight * masked_mean(found, distance > 0).mean()
+    def __call__(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]: ...
 
 
-def photometric(rendering: Rendering, pixels: Observations) -> Float[Tensor, "*p 3"]:
-    """Rendered minus measured colour."""
-    return rendering.rgb - pixels.rgb
+@runtime_checkable
+class DepthResidual(Protocol):
+    """Compares rendered with measured distances.
+
+    ``miss`` is the residual of a ray that meets nothing; None stands for the paper's, in which such a ray renders the
+    distance 0.
+    """
+
+    def __call__(
+        self, rendering: Rendering, observed: Observations, miss: float | None = None
+    ) -> Float[Tensor, "*p"]: ...
 
 
-def depth(rendering: Rendering, pixels: Observations) -> Float[Tensor, "*p"]:
-    """Rendered minus measured distance, metres; 0 where nothing was measured."""
-    return torch.where(pixels.distance > 0, rendering.distance - pixels.distance, 0)
+def colour_residual(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p 3"]:
+    """Return rendered minus measured colour."""
+    return rendering.rgb - observed.rgb
+
+
+def depth_residual(
+    rendering: Rendering, observed: Observations, miss: float | None = None
+) -> Float[Tensor, "*p"]:
+    """Return rendered minus measured distance, metres (eq. 5).
+
+    With ``miss`` (metres) it is ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``: what passes through the scene counts as if
+    it met something ``miss`` too far. The paper's ``sum_i w_i t_i - d`` leaps by the whole distance at every silhouette,
+    and second-order steps need derivatives that lead somewhere.
+    """
+    if miss is None:
+        return rendering.distance - observed.distance
+    return rendering.distance - rendering.opacity * observed.distance + (1 - rendering.opacity) * miss
+
+
+DEPTH_RESIDUALS: dict[str, DepthResidual] = {"distance": depth_residual}
+"""Depth residuals by the name that the setting ``depth_residual`` takes; add your own."""
 
 
 def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:
-    """How far, on average over the ray, its weight lies before the measured ``distance`` less ``margin``: metres.
+    """Return how far, on average over the ray, rendering weight lies nearer than ``distance - margin``; metres.
 
-    A sensor that measured depth saw nothing before it. Unlike an error of the mean distance, this is not content with
-    matter on both sides. 0 where nothing was measured.
+    A sensor that measured a distance saw nothing in front of it. An error of the mean distance is content with matter on
+    both sides of the measured point, this is not.
     """
     before = (distance[..., None] - margin - rendering.samples.middles).clamp(min=0)
     return (rendering.weights * before).sum(-1)
 
 
 def masked_mean(values: Float[Tensor, "*k p"], mask: Bool[Tensor, "*k p"]) -> Float[Tensor, "*k"]:
-    """Mean over the last axis where ``mask`` holds; 0 where it holds nowhere."""
+    """Return the mean over the last axis where ``mask`` holds; 0 where it holds nowhere."""
     kept = torch.where(mask, values, 0)
     return kept.sum(-1) / mask.sum(-1).clamp(min=1)
 
 
-def objective(
-    rendering: Rendering, pixels: Observations, delta: float, depth_weight: float
-) -> Float[Tensor, ""]:
-    """The paper's: Huber's rho for colour and depth alike."""
-    return Objective(Robust("huber", delta), Robust("huber", delta), depth_weight)(rendering, pixels)
+@dataclass(frozen=True)
+class Term:
+    """One kind of residual with its robust loss and its weight."""
+
+    residual: Residual
+    robust: Robust
+    weight: float
+    applies: Callable[[Observations], Bool[Tensor, "*p"]]  # which rays it is defined for
+    channels: int = 1
+
+    def loss(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*k"]:
+        """Return the weighted mean of rho over the rays (last axis) that the term applies to, summed over channels."""
+        rho = self.robust(self.residual(rendering, observed)).sum(-1)
+        return self.weight * masked_mean(rho, self.applies(observed))
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A sum of terms."""
+
+    terms: tuple[Term, ...]
+
+    def loss(self, rendering: Rendering, observed: Observations) -> Float[Tensor, ""]:
+        """Return ``1/K sum_i [mean_r rho(rgb) + lambda_d mean_r rho(d)]`` (eqs. 5 and 6) of rays of shape (K images, rays).
+
+        Each term is a mean over the rays that it applies to: the depth term over those where depth was measured.
+        """
+        return torch.stack([term.loss(rendering, observed) for term in self.terms]).sum(0).mean()
+
+    def residuals(self, rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
+        """Return the residuals of all terms side by side; meaningless where ``weights`` is 0."""
+        return torch.cat([term.residual(rendering, observed) for term in self.terms], -1)
+
+    def weights(self, observed: Observations) -> Float[Tensor, "k p c"]:
+        """Return how much each residual counts in the objective, for rays of shape (K images, rays); 0: not at all."""
+        parts = []
+        for term in self.terms:
+            mask = term.applies(observed)
+            weight = term.weight * mask / (len(mask) * mask.sum(-1, keepdim=True).clamp(min=1))
+            parts.append(weight[..., None].expand(*mask.shape, term.channels))
+        return torch.cat(parts, -1)
+
+    def rho(self, residuals: Float[Tensor, "*p c"]) -> Float[Tensor, "*p c"]:
+        """Return the robust loss of each residual."""
+        return self._by_term(residuals, lambda term, part: term.robust(part))
+
+    def robust_weights(self, residuals: Float[Tensor, "*p c"]) -> Float[Tensor, "*p c"]:
+        """Return ``rho'(r) / r`` of each residual, the factors of iteratively reweighted least squares."""
+        return self._by_term(residuals, lambda term, part: term.robust.weight(part))
+
+    @property
+    def scales(self) -> list[float]:
+        """The residual at which outliers begin, a channel each."""
+        return [term.robust.scale for term in self.terms for _ in range(term.channels)]
+
+    @property
+    def uses_depth(self) -> bool:
+        """Whether any term needs measured distances."""
+        return any(term.applies is measured for term in self.terms)
+
+    def _by_term(
+        self, residuals: Float[Tensor, "*p c"], function: Callable[[Term, Tensor], Tensor]
+    ) -> Float[Tensor, "*p c"]:
+        parts = residuals.split([term.channels for term in self.terms], -1)
+        return torch.cat([function(term, part) for term, part in zip(self.terms, parts, strict=True)], -1)
+
+
+def coloured(observed: Observations) -> Bool[Tensor, "*p"]:
+    """Return which rays measured a colour."""
+    return observed.coloured
+
+
+def measured(observed: Observations) -> Bool[Tensor, "*p"]:
+    """Return which rays measured a distance."""
+    return observed.measured
+
+
+def colour_term(robust: Robust) -> Term:
+    """Return the photometric term, of weight 1 and three channels."""
+    return Term(colour_residual, robust, 1.0, coloured, channels=3)
+
+
+def depth_term(
+    robust: Robust, weight: float, residual: DepthResidual = depth_residual, miss: float | None = None
+) -> Term:
+    """Return the depth term with its weight lambda_d; ``robust`` is in the unit of ``residual``."""
+
+    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
+        return torch.where(observed.measured, residual(rendering, observed, miss), 0)[..., None]
+
+    return Term(channel, robust, weight, measured)
+
+
+def free_space_term(robust: Robust, weight: float) -> Term:
+    """Return the term of matter in front of what was measured, by more than the scale of ``robust`` (metres)."""
+
+    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
+        return free_space(rendering, observed.distance, robust.scale)[..., None]
+
+    return Term(channel, robust, weight, measured)

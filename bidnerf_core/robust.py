@@ -1,4 +1,4 @@
-"""Robust losses: how much a residual counts.
+"""Robust losses, and the weights by which least squares minimises them.
 
 All are ``r^2 / 2`` for residuals that are small beside their scale, so that one may stand in for another without a change
 of weights; ``l1`` is the slope that ``huber`` ends in. Names and shapes are those of Barron 2019, "A general and adaptive
@@ -60,6 +60,14 @@ WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "geman-mcclure": lambda r, c: (1 + 0.25 * (r / c) ** 2) ** -2,
 }
 """``rho'(r) / r`` of each; that of ``l1``, which has no end at 0, stops short of it."""
+
+
+def geman_mcclure_inlier(squared: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
+    """Return how much of an inlier a squared residual is: 1 at 0, a half at ``scale`` (Geman and McClure 1985).
+
+    One minus it is their loss, and its square is that loss's weight in least squares.
+    """
+    return 1 / (1 + squared / scale**2)
 
 
 @dataclass(frozen=True)

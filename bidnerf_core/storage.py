@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 import secrets
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from bidnerf_core.backend import Backend
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.files import write_file as write_file
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
 from bidnerf_core.registry import load_backend
@@ -270,31 +270,3 @@ def _sweep(folder: Path) -> None:
         if OURS.fullmatch(file.name) and file.name not in kept:
             with contextlib.suppress(OSError):  # it is only in the way
                 file.unlink()
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """All of it or nothing, and on the disk before it has its name. Raises ``OSError``, which names the file."""
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
-        with beside.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            beside.unlink()
-        if isinstance(error, OSError):
-            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
-        raise
-    _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Names reach the disk as well, where the system can do that."""
-    with contextlib.suppress(OSError):
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)

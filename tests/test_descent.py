@@ -17,7 +17,7 @@ from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, InerfConfig, Problem, localize, rig, single
 from bidnerf_core.localization.sampled import RayCounts, SampledLoss
-from bidnerf_core.localization.solvers.pivots import PivotName, pivot
+from bidnerf_core.localization.pivots import PivotName, pivot
 from bidnerf_core.localization.trail import WINDOW, Trail
 from bidnerf_core.pixels import DrawerName, draw, uniform
 from bidnerf_core.rendering import render_image

@@ -12,7 +12,7 @@ from bidnerf_core.localization.exposure import fit_exposure
 from bidnerf_core.localization.linearization import Linearization, linearize
 from bidnerf_core.localization.normal_equations import Losses, residuals
 from bidnerf_core.localization.ray_batch import RayBatch
-from bidnerf_core.localization.solvers.pivots import Pivot
+from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.robust import Robust
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit

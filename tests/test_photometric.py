@@ -18,7 +18,7 @@ from bidnerf_core.localization import BidConfig, BidLmConfig, InerfLmConfig, loc
 from bidnerf_core.localization.neighbours import neighbours
 from bidnerf_core.localization.photometric import refine, stepped
 from bidnerf_core.localization.ray_batch import blurred
-from bidnerf_core.localization.solvers.pivots import PivotName
+from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.stages import Refinement, Stage
 from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.rendering import render

@@ -15,9 +15,12 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, run_trial, settings_of
-from bidnerf_core.localization import single
+from bidnerf_core.field import levels
+from bidnerf_core.frames import View
 from bidnerf_core.pixels import draw, uniform
+from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.settings import to_flat
 
 RAYS = 2048
 """On how many the samples are counted."""
@@ -74,11 +77,13 @@ def samples_per_ray(trial: Trial) -> float:
     """Valid samples on uniformly drawn rays."""
     stored, dataset = opened(trial.map, trial.data)
     (view,) = dataset.views(trial.split, trial.frames[-1:])
-    problem = single(stored.field, stored.bounds, view.frame, view.T_ref_camera)
-    level = problem.level(getattr(settings_of(trial.method, trial.config), "level", None))
-    pixels = draw(problem.views, RAYS, uniform, torch.Generator().manual_seed(trial.seed))
+    number = to_flat(settings_of(trial.method, trial.config)).get("level")
+    field = stored.field if number is None else levels(stored.field)[number]
+    pixels = draw(
+        [View(view.frame, SE3.identity())], RAYS, uniform, torch.Generator().manual_seed(trial.seed)
+    )
     with torch.no_grad():
-        samples = level.sampler(pixels.rays(problem.start_for(trial.method), problem.bounds))
+        samples = field.sampler(pixels.rays(view.T_ref_camera, stored.bounds))
     return float(samples.valid.sum()) / RAYS
 
 

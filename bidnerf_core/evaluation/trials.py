@@ -26,11 +26,11 @@ from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.frames import View
-from bidnerf_core.localization import Localization, find_method, localize, rig
-from bidnerf_core.localization.auto import LEAST_POINTS
-from bidnerf_core.observations import Observations
+from bidnerf_core.localization import Localization, Localizer
+from bidnerf_core.localization import settings_of as checked_settings
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.settings import to_flat
 from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
@@ -106,6 +106,7 @@ class TrialResult:
     settings: dict[str, Any]  # of the method, all of them
     weights: str  # which training of the map
     trial: Trial  # with the names of folders only
+    outcome: str = ""  # the judgement's kind; empty in results of earlier versions
 
 
 def run_trial(trial: Trial) -> TrialResult:
@@ -121,9 +122,9 @@ def run_trial(trial: Trial) -> TrialResult:
         points = opened_points(trial.depth_points, trial.map)
         rays = None
         if points is not None:
-            views, rays = with_points(points, views, trial.split, trial.method, stored)
-        problem = rig(stored.field, stored.bounds, views, start, rays, stored.surface)
-        found = localize(problem, trial.method, settings, trial.seed)
+            rays = points.rays(views, trial.split)
+        localizer = Localizer(stored, trial.method, settings, warm_up=False)
+        found = localizer(views, start, rays, trial.seed)
         return _result(trial, stored, found, start, truth, settings)
 
 
@@ -141,7 +142,7 @@ def settings_of(method: str, config: str) -> Any:
         plain = json.loads(config)
     except (ValueError, RecursionError) as error:
         raise InputError(f"config: not JSON ({error}), expected an object of settings of {method}") from error
-    return from_plain(find_method(method).config_type, plain, "config")
+    return checked_settings(method, plain)
 
 
 @contextmanager
@@ -175,21 +176,6 @@ def opened_points(folder: str | None, map_folder: str) -> SparsePoints | None:
     return SparsePoints(Path(folder), places_of(load_info(Path(map_folder))), SparseChoice())
 
 
-def with_points(
-    points: SparsePoints, views: list[View], split: str, method: str, stored: Map
-) -> tuple[list[View], Observations | None]:
-    """The points that ``views`` observe as method ``auto`` takes them, in images, or as others do: rays of their own.
-
-    In an image they are so few that rays drawn anywhere would not meet them; ``auto`` looks at all that was measured. It
-    takes rays as well where it can do no better than ``bid``. Raises ``InputError`` where nothing is observed.
-    """
-    if method == "auto" and stored.surface is not None and not any(v.frame.has_depth for v in views):
-        seen = [points.onto(view, split) for view in views]
-        if sum(int((v.frame.depth > 0).sum()) for v in seen if v.frame.depth is not None) >= LEAST_POINTS:
-            return seen, None
-    return views, points.rays(views, split)
-
-
 def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
     """Names of the training images, and T_world_camera, float64."""
     return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
@@ -197,15 +183,8 @@ def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
 
 def plain_localization(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
     """The object that ``bidnerf localize --json`` prints."""
-    return {
-        "T_world_camera": _rows(found.T_world_camera.matrix()),
-        "converged": found.converged,
-        "steps": found.steps,
-        "seconds": found.seconds,
-        "covariance": None if found.covariance is None else _rows(found.covariance),
-        "loss": found.loss if math.isfinite(found.loss) else None,
+    return found.plain() | {
         "backend": backend,
-        "method": found.method,
         "error": None if error is None else to_plain(_off(error)),
     }
 
@@ -220,9 +199,8 @@ def _result(
         "seed": trial.seed,
         "start_error": None if start is None else to_plain(_off(pose_error(start, truth))),
         "errors": {"translation": _finite(trace.translation), "rotation_deg": _finite(trace.rotation_deg)},
-        "reason": found.reason,
         "peak_memory_bytes": peak_memory_bytes(),
-        "settings": to_plain(settings),
+        "settings": to_flat(settings),
         "weights": stored.info.weights,
         "trial": to_plain(trial.portable),
     }

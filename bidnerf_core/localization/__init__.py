@@ -1,13 +1,14 @@
-"""Finding poses: ``localize`` and its parts."""
+"""Finding poses: ``Localizer``, the methods by name, and their settings."""
 
 from bidnerf_core.localization.auto import AutoConfig
 from bidnerf_core.localization.bid import BidConfig
 from bidnerf_core.localization.bid_lm import BidLmConfig
 from bidnerf_core.localization.inerf import InerfConfig
 from bidnerf_core.localization.inerf_lm import InerfLmConfig
-from bidnerf_core.localization.methods import METHODS, Method, find_method, localize
-from bidnerf_core.localization.problem import Problem, rig, single, window
-from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.localizer import Localizer, pose_from_matrix
+from bidnerf_core.localization.methods import METHODS, Method, find_method, settings_of
+from bidnerf_core.localization.problem import window
+from bidnerf_core.localization.result import Localization, Outcome
 
 __all__ = [
     "METHODS",
@@ -17,11 +18,11 @@ __all__ = [
     "InerfConfig",
     "InerfLmConfig",
     "Localization",
+    "Localizer",
     "Method",
-    "Problem",
+    "Outcome",
     "find_method",
-    "localize",
-    "rig",
-    "single",
+    "pose_from_matrix",
+    "settings_of",
     "window",
 ]

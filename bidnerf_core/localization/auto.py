@@ -1,130 +1,169 @@
-"""Method ``auto``: find the pose on the baked surface, with a start or without one, refine it on what the field itself
-shows, and say whether to believe it.
+"""Method ``auto``: find the pose with a start or without one, by whatever was measured, and say whether to trust it.
+
+What it does is decided here and nowhere else. Where enough depth was measured and the map has a surface, measured points are
+aligned with it; images without depth are compared with renderings of the surface; a map without a surface needs a start, and
+``auto`` then descends as ``bid`` does.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Generator
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.alignment import Cloud
+from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.bid import BidConfig, bid
-from bidnerf_core.localization.clouds import measured_cloud
-from bidnerf_core.localization.hypotheses import hypotheses
-from bidnerf_core.localization.photometric import stepped
+from bidnerf_core.localization.by_colour import (
+    ByColourConfig,
+    ColourAnswer,
+    localization_of,
+    refine_by_colour,
+)
+from bidnerf_core.localization.costs.rendered import RenderedCostSettings
+from bidnerf_core.localization.costs.surface import PointCloud
+from bidnerf_core.localization.covariance import surface_covariance
+from bidnerf_core.localization.method_settings import (
+    ColourSettings,
+    DepthSettings,
+    RefinementSettings,
+    RefinementStage,
+)
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.search import Found, score, search
-from bidnerf_core.localization.settings import Judged
-from bidnerf_core.localization.stages import Refinement, Stage
-from bidnerf_core.localization.verdict import Bars, covariance, evidence
+from bidnerf_core.localization.search.by_images import ImageSearch
+from bidnerf_core.localization.search.by_points import PointSearch
+from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
+from bidnerf_core.settings import EXPERT, Range, Settings
 
 LEAST_POINTS = 50
-"""With fewer there is no shape to recognise."""
+"""Measured pixels below which there is no shape to recognise."""
 WORSE = 0.05
-"""By how much refinement may raise the cost on the surface; a field that asks for more does not show what was baked."""
+"""How much refinement may raise the cost on the surface; a field that asks for more does not show what was baked."""
+LOSS_POINTS = 200
+"""Points on which the losses of the path are computed."""
 
 
 @dataclass(frozen=True)
-class AutoConfig(Judged):
+class AutoConfig(Settings):
     """Settings of method ``auto``."""
 
-    points: int = 2000  # of the measured pixels, at most
-    hypotheses: int = 256  # that a round of the search begins with
-    rounds: int = 3  # of search, each with fresh hypotheses, until an answer is believed
-    refine_steps: int = 2  # on rendered rays, of the answer; 0: the surface has the last word
-    refine_rays: int = 512
-
-    def __post_init__(self) -> None:
-        for name, least, most in (
-            ("points", LEAST_POINTS, 10**6), ("hypotheses", 8, 10**5), ("rounds", 1, 100),
-            ("refine_steps", 0, 1000), ("refine_rays", 64, 10**6),
-        ):  # fmt: skip
-            self._require(name, least <= getattr(self, name) <= most, f"{least} to {most}")
+    points: Annotated[int, Range(LEAST_POINTS, 10**6)] = 2000  # of the measured pixels, at most
+    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # with which each round of the search begins
+    rounds: Annotated[int, Range(1, 100)] = 3  # of search with fresh hypotheses, until an answer is accepted
+    refine_steps: Annotated[int, Range(0, 1000)] = 2  # on rendered rays, of an answer by depth; 0: none
+    refine_rays: Annotated[int, Range(64, 10**6)] = 512
+    by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
-    """Search and align where there is measured depth and a baked surface; descend as ``bid`` does where there is not.
+    """Find the pose by depth where there is enough of it, else by colour, else by descent from a start.
 
-    Raises ``InputError`` where that needs a start and there is none.
+    Raises ``InputError`` where a start is needed, for want of a baked surface, and there is none.
     """
-    began = time.perf_counter()
-    generator = Generator().manual_seed(seed)
     if problem.surface is None:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
-    cloud = measured_cloud(problem, config.points, generator)
-    if len(cloud) < LEAST_POINTS:
-        return _descended(problem, seed, f"{len(cloud)} pixels have depth, expected {LEAST_POINTS} or more")
+    if _measured_points(problem) >= LEAST_POINTS:
+        return _by_points(problem, problem.surface, config, seed)
+    return _by_images(problem.without_depth(), problem.surface, config, seed)
+
+
+def _measured_points(problem: Problem) -> int:
+    images = [view.frame.depth for view in problem.views if view.frame.depth is not None]
+    pixels = sum(int(((depth > 0) & depth.isfinite()).sum()) for depth in images)
+    return pixels + (0 if problem.depth_rays is None else len(problem.depth_rays))
+
+
+def _by_points(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
+    """Align measured points with the surface, then refine on rendered rays."""
+    began, generator = time.perf_counter(), Generator().manual_seed(seed)
+    search = PointSearch(
+        surface, PointCloud.measured(problem.views, problem.depth_rays, config.points, generator)
+    )
     with torch.no_grad():
-        found = _searched(problem, problem.surface, cloud, config, generator)
-    shown = 1.0
+        found = _searched(problem, search, config, generator)
+    inliers = 1.0
     if config.refine_steps:
-        found, shown = _refined(problem, problem.surface, cloud, found, config, generator)
+        found, inliers = _refined(problem, search, found, config, generator)
     with torch.no_grad():
-        speaks = replace(evidence(problem.surface, cloud, found), shown=shown)
-        doubt = speaks.doubt(Bars())
-        spread = covariance(problem.surface, cloud, found.T, len(problem.views))
-        path = _way(problem.start, found.path)
-        losses = score(problem.surface, cloud.first(200), path)
+        diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers)
+        verdict = diagnostics.verdict()
+        path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
+        losses = search.judge(LOSS_POINTS).cost(path)
+        covariance = surface_covariance(search.judge(), found.T[0], len(problem.views))
     return Localization(
-        T_world_camera=found.T.normalized(),
-        converged=doubt is None,
-        reason=doubt or f"{speaks.alike:.0%} of the measured points have place and colour of the surface",
+        T_world_camera=found.T[0].normalized(),
+        outcome=verdict.outcome,
+        reason=verdict.reason,
         steps=len(losses) - 1,
         seconds=time.perf_counter() - began,
-        loss=found.score,
+        loss=float(found.scores[0]),
         method="auto",
         poses=path,
         losses=losses[:-1],
-        covariance=spread,
+        covariance=covariance,
     )
 
 
 def _searched(
-    problem: Problem, surface: SurfaceMap, cloud: Cloud, config: AutoConfig, generator: Generator
-) -> Found:
-    """Rounds of search until an answer is believed; else the best of them."""
-    answers: list[Found] = []
+    problem: Problem, search: PointSearch, config: AutoConfig, generator: Generator
+) -> SearchResult:
+    """Search in rounds until an answer is acceptable; return the best."""
+    answers: list[SearchResult] = []
     while True:
-        pool = hypotheses(surface, cloud, problem.start, config.hypotheses, generator)
-        answers.append(search(surface, cloud, pool))
-        best = min(answers, key=lambda found: found.score)
-        if len(answers) == config.rounds or evidence(surface, cloud, best).doubt(Bars()) is None:
+        answers.append(search(problem.start, config.hypotheses, generator))
+        best = min(answers, key=lambda found: float(found.scores[0]))
+        if len(answers) == config.rounds or _diagnostics(search, best).rejection() is None:
             return best
 
 
-def _refined(
-    problem: Problem,
-    surface: SurfaceMap,
-    cloud: Cloud,
-    found: Found,
-    config: AutoConfig,
-    generator: Generator,
-) -> tuple[Found, float]:
-    """A finer pose, and the share of rendered rays that see from there what was measured.
+def _diagnostics(search: PointSearch, found: SearchResult) -> SurfaceDiagnostics:
+    return surface_diagnostics(search.judge(), found.T[0], found.margin)
 
-    The surface is as coarse as its cells; the field is not, and has seen every pixel of the training images.
+
+def _refined(
+    problem: Problem, search: PointSearch, found: SearchResult, config: AutoConfig, generator: Generator
+) -> tuple[SearchResult, float]:
+    """Return a finer pose, and the share of rendered rays that agree there with what was measured.
+
+    The surface is as coarse as its cells; the field has seen every pixel of the training images.
     """
-    cell = surface.cell
-    stage = Stage(config.refine_steps, config.refine_rays, depth_scale=6 * cell, play=cell / 2)
-    steps = stepped(problem, found.T, stage, Refinement(), generator)
+    cell = search.surface.cell
+    stage = RefinementStage(
+        config.refine_steps, config.refine_rays, depth_scale=6 * cell, surface_sigma=cell / 2
+    )
+    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
+    steps = take_few_steps(problem, found.T[0], stage, settings, generator)
     with torch.no_grad():
-        scores = score(surface, cloud, steps.poses).tolist()
-    if not scores[-1] <= scores[0] + WORSE:
+        scores = search.score(steps.poses)
+    if not float(scores[-1]) <= float(scores[0]) + WORSE:
         return found, 0.0
     path = SE3.cat([found.path, steps.poses[1:]])
-    return replace(found, T=steps.poses[-1], score=scores[-1], path=path), steps.inliers
+    return replace(found, T=steps.poses[-1:], scores=scores[-1:], path=path), steps.inliers
 
 
-def _way(start: SE3 | None, path: SE3) -> SE3:
-    """It begins at the start if there is one: to choose a hypothesis is part of the first step."""
-    return path if start is None else SE3.cat([start[None], path[1:]])
+def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
+    """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer."""
+    began, generator = time.perf_counter(), Generator().manual_seed(seed)
+    search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
+    # Over a background, images were rendered and are as bright as the map; others may have been exposed otherwise.
+    refinement = replace(config.by_colour.refinement, exposure=not search.has_background)
+    by_colour = replace(config.by_colour, refinement=refinement)
+    known = Surroundings(SE3.from_matrix(surface.keyframes), surface.extent, torch.zeros(3), search.middle)
+    while True:
+        with torch.no_grad():
+            found = search(hypotheses_for_images(known, problem.start, config.hypotheses, generator))
+        answers.append(refine_by_colour(problem, found, by_colour, generator))
+        best = min(answers, key=lambda answer: answer.refined.loss)
+        if best.verdict.accepted or len(answers) == config.rounds:
+            return localization_of(problem, best, by_colour, began, "auto")
 
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:

@@ -2,43 +2,99 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
+from typing import Annotated
 
+from torch import Generator
+
+from bidnerf_core.localization.acceptance import rendered_verdict
+from bidnerf_core.localization.costs.rendered import RenderedCostSettings
+from bidnerf_core.localization.method_settings import (
+    ColourSettings,
+    DepthSettings,
+    RefinementSettings,
+    RefinementStage,
+    RenderedThresholds,
+    SpreadSettings,
+)
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.refinement import refine
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.second_order import Depth, SecondOrderConfig, second_order
-from bidnerf_core.localization.stages import Refinement
-from bidnerf_core.robust import RobustName
+from bidnerf_core.localization.search.hypotheses import neighbours
+from bidnerf_core.settings import EXPERT, NotNegative, Range, Settings
+
+Poses = Annotated[int, Range(1, 10**5), EXPERT]
+Steps = Annotated[int, Range(1, 10**5)]
+ExpertSteps = Annotated[int, Range(1, 10**5), EXPERT]
+Rays = Annotated[int, Range(7, 10**7)]
+ExpertRays = Annotated[int, Range(7, 10**7), EXPERT]
 
 
 @dataclass(frozen=True)
-class BidLmConfig(SecondOrderConfig):
+class BidLmStages(Settings):
+    """From many poses and few rays at the coarsest level to one pose and many rays in full detail."""
+
+    search_rays: ExpertRays = 128  # for each of the poses about the start
+    coarse_poses: Poses = 6  # the best of these, which take steps at the coarsest level
+    coarse_steps: ExpertSteps = 4
+    coarse_rays: ExpertRays = 128  # for each of them
+    middle_poses: Poses = 2  # the best of these, which take more
+    middle_steps: ExpertSteps = 4
+    middle_rays: ExpertRays = 256
+    fine_steps: Steps = 6  # of the best one, in full detail
+    fine_rays: Rays = 1024
+    blur: Annotated[int, Range(1, 10**4), EXPERT] = 8  # colours of coarse steps are means over so many pixels
+    centring: Annotated[int, Range(0, 100), EXPERT] = (
+        2  # times that poses are first centred on what was measured
+    )
+    depth_window: Annotated[NotNegative, EXPERT] = (
+        0.0  # metres about the depth that fine steps sample; 0: all
+    )
+
+
+@dataclass(frozen=True)
+class BidLmConfig(Settings):
     """Settings of method ``bid-lm``."""
 
-    depth_weight: float = 3.0  # lambda_d
-    depth_loss: RobustName = "huber"  # robust loss of depth differences
-    depth_scale: float = 0.1  # of it, in metres: about where an outlier begins
-    depth_rays: int = 256  # besides, of a sensor with rays of its own, where there is one
-    centring: int = 2  # times that what a pose sees is shifted to the middle of what was measured
-    depth_window: float = 0.0  # metres about the measured depth that fine steps look at; 0: the whole ray
-    window_samples: int = 12  # within it
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require("depth_scale", 0 < self.depth_scale <= 1e6, "a positive number, at most 1e+06")
-        self._require("depth_rays", 0 <= self.depth_rays <= 10**7, "0 to 10 million")
-        self._require("centring", 0 <= self.centring <= 100, "0 to 100 times")
-        self._require("window_samples", 1 <= self.window_samples <= 10**4, "1 to 10 thousand")
-        self._require_one_of(depth_loss=RobustName)
-        for name in ("depth_weight", "depth_window"):
-            self._require_not_negative(name)
+    spread: SpreadSettings = SpreadSettings()
+    stages: BidLmStages = BidLmStages()
+    colour: ColourSettings = ColourSettings()
+    depth: DepthSettings = DepthSettings(depth_weight=3.0, depth_rays=256)
+    refinement: RefinementSettings = RefinementSettings()
+    thresholds: RenderedThresholds = RenderedThresholds()
 
 
 def bid_lm(problem: Problem, config: BidLmConfig, seed: int = 0) -> Localization:
-    """From ``problem.start``; poses about it and pixels are drawn from ``seed``."""
-    settings = Refinement(
-        config.depth_weight, config.colour_loss, config.depth_loss, config.pixels, config.pivot, config.exposure,
-        config.depth_rays, config.least_weight, config.window_samples, config.stop_step,
-    )  # fmt: skip
-    depth = Depth(config.depth_scale, config.centring, config.depth_window)
-    return second_order(problem, config, depth, settings, seed, "bid-lm")
+    """Refine poses about ``problem.start``; they and the pixels are drawn from ``seed``."""
+    began, spread = time.perf_counter(), config.spread
+    start = problem.start_for("bid-lm")
+    poses = neighbours(start, spread.poses, spread.spread_translation, spread.spread_rotation, seed)
+    settings = RenderedCostSettings(config.colour, config.depth, config.refinement)
+    found = refine(problem, poses, stages(config), settings, Generator().manual_seed(seed))
+    verdict = rendered_verdict(found, config.thresholds)
+    return Localization(
+        T_world_camera=found.T,
+        outcome=verdict.outcome,
+        reason=verdict.reason,
+        steps=len(found.losses),
+        seconds=time.perf_counter() - began,
+        loss=found.loss,
+        method="bid-lm",
+        poses=found.poses,
+        losses=found.losses,
+        covariance=found.covariance if bool(found.covariance.isfinite().all()) else None,
+    )
+
+
+def stages(config: BidLmConfig) -> tuple[RefinementStage, ...]:
+    """Return the stages that the settings describe."""
+    s, sigma = config.stages, config.refinement.surface_sigma
+    scales = (config.colour.colour_scale, config.depth.depth_scale)
+    wide = (3 * scales[0], 3 * scales[1])
+    return (
+        RefinementStage(0, s.search_rays, config.spread.poses, 0, s.blur, *wide, centring=s.centring),
+        RefinementStage(s.coarse_steps, s.coarse_rays, s.coarse_poses, 0, s.blur, *scales, sigma),
+        RefinementStage(s.middle_steps, s.middle_rays, s.middle_poses, 0, s.blur, *scales, sigma),
+        RefinementStage(s.fine_steps, s.fine_rays, 1, None, 1, *scales, sigma / 3, s.depth_window),
+    )

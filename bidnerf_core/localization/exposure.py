@@ -1,4 +1,4 @@
-"""How much brighter an image is than the map: a gain and a bias for each colour, found along with the pose."""
+"""How much brighter an image is than the map: a gain and a bias for each colour channel."""
 
 from __future__ import annotations
 
@@ -8,40 +8,35 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.robust import Robust
-
-ROUNDS = 3
-"""Of robust weighting."""
-
-TRUST = 0.001
-"""How much a gain of 1 and a bias of 0 count beside what is seen: enough where that is of one colour."""
-
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """Measured colour is ``gain * rendered + bias``."""
+    """The model ``measured = gain * rendered + bias``, of each channel from each of h poses."""
 
-    gain: Float[Tensor, "h 3"]
-    bias: Float[Tensor, "h 3"]
+    gain: Float[Tensor, "h c"]
+    bias: Float[Tensor, "h c"]
 
-    def applied(self, rendered: Float[Tensor, "h n 3"]) -> Float[Tensor, "h n 3"]:
-        return self.gain[:, None] * rendered + self.bias[:, None]
+    def applied(self, rendered: Float[Tensor, "h c n"]) -> Float[Tensor, "h c n"]:
+        return self.gain[..., None] * rendered + self.bias[..., None]
 
 
 def fit_exposure(
-    rendered: Float[Tensor, "h n 3"],
-    measured: Float[Tensor, "n 3"],
-    share: Float[Tensor, "n 3"],
-    colour: Robust,
+    rendered: Float[Tensor, "h c n"],
+    measured: Float[Tensor, "#h c n"],
+    weights: Float[Tensor, "h #c n"],
+    gain_precision: Float[Tensor, "*#h"] | float,
+    bias_precision: float = 0.0,
 ) -> Exposure:
-    """Least squares with robust weights, for each pose and colour on its own."""
-    exposure = Exposure(torch.ones_like(rendered[:, 0]), torch.zeros_like(rendered[:, 0]))
-    for _ in range(ROUNDS):
-        weights = share * colour.weight(exposure.applied(rendered) - measured)
-        total = weights.sum(1).clamp(min=torch.finfo(weights.dtype).tiny)
-        mean_x = (weights * rendered).sum(1) / total
-        mean_y = (weights * measured).sum(1) / total
-        x, y = rendered - mean_x[:, None], measured - mean_y[:, None]
-        gain = ((weights * x * y).sum(1) / total + TRUST) / ((weights * x * x).sum(1) / total + TRUST)
-        exposure = Exposure(gain, mean_y - gain * mean_x)
-    return exposure
+    """Return the gain and the bias of weighted least squares with Gaussian priors about 1 and 0.
+
+    A precision is the inverse variance of its prior, in the unit of ``weights``: what a channel of a single colour cannot
+    tell, the prior decides.
+    """
+    off = measured - rendered
+    total = weights.sum(-1).expand(rendered.shape[:2]) + bias_precision
+    mean, square = (weights * rendered).sum(-1), (weights * rendered**2).sum(-1) + gain_precision
+    shift, grow = (weights * off).sum(-1), (weights * rendered * off).sum(-1)
+    # Of no weight at all: no correction.
+    determinant = (total * square - mean**2).clamp(min=torch.finfo(rendered.dtype).tiny)
+    gain = 1 + (total * grow - mean * shift) / determinant
+    return Exposure(gain, (square * shift - mean * grow) / determinant)

@@ -4,73 +4,75 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import Annotated
 
-import torch
 from torch import Generator
 
-from bidnerf_core.localization.neighbours import neighbours
-from bidnerf_core.localization.polish import PolishConfig, polished, without_depth
+from bidnerf_core.localization.by_colour import (
+    ByColourConfig,
+    ColourRefinementSettings,
+    localization_of,
+    refine_by_colour,
+)
+from bidnerf_core.localization.method_settings import (
+    ColourSettings,
+    RefinementSettings,
+    RenderedThresholds,
+    SpreadSettings,
+)
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.rgb_only import answered, doubted
-from bidnerf_core.localization.rgb_search import Sight, Stage, search
-from bidnerf_core.localization.sketches import ByField
-from bidnerf_core.localization.thumbnails import thumbnail
-from bidnerf_core.se3 import SE3
+from bidnerf_core.localization.search.by_images import ImageSearch, ImageStage
+from bidnerf_core.localization.search.hypotheses import neighbours
+from bidnerf_core.settings import EXPERT, Range, Settings
+
+Count = Annotated[int, Range(1, 10**5), EXPERT]
 
 
 @dataclass(frozen=True)
-class InerfLmConfig(PolishConfig):
+class ImageSearchSettings(Settings):
+    """Small renderings of the poses about the start, ever larger and of ever fewer."""
+
+    search_poses: Count = 24  # the best of the poses, which take steps on small renderings
+    search_steps: Count = 8
+    middle_poses: Count = 6  # the best of these, which take more on larger ones
+    middle_steps: Count = 6
+    last_steps: Count = 4  # of the best two, on the largest renderings
+    width: Annotated[int, Range(4, 1000)] = (
+        16  # pixels along the first renderings' longer side; the last have 3 times
+    )
+
+    def stages(self) -> tuple[ImageStage, ...]:
+        return (
+            ImageStage(self.width, 0, self.search_poses),
+            ImageStage(self.width, self.search_steps, self.middle_poses),
+            ImageStage(self.width * 3 // 2, self.middle_steps, 2),
+            ImageStage(self.width * 3, self.last_steps, 2),
+        )
+
+
+@dataclass(frozen=True)
+class InerfLmConfig(Settings):
     """Settings of method ``inerf-lm``."""
 
-    poses: int = 256  # looked at first: the start, and others about it; 1: the start alone
-    spread_translation: float = 0.12  # their standard deviation along each axis of the camera, metres
-    spread_rotation: float = 0.25  # and about each, radians
-    search_poses: int = 24  # the best of these, which take steps on small renderings
-    search_steps: int = 8
-    middle_poses: int = 6  # the best of these, which take more on larger ones
-    middle_steps: int = 6
-    last_steps: int = 4  # of the best two, on the largest renderings
-    width: int = 16  # pixels along the longer side of the first renderings; later ones have half and twice as many more
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("poses", "search_poses", "middle_poses"):
-            self._require(name, 1 <= getattr(self, name) <= 10**5, "1 to 100 thousand")
-        for name in ("search_steps", "middle_steps", "last_steps"):
-            self._require(name, 1 <= getattr(self, name) <= 10**5, "1 to 100 thousand")
-        self._require("width", 4 <= self.width <= 1000, "4 to 1000 pixels")
-        for name in ("spread_translation", "spread_rotation"):
-            self._require_not_negative(name)
+    spread: SpreadSettings = SpreadSettings(256, 0.12, 0.25)
+    search: ImageSearchSettings = ImageSearchSettings()
+    steps: ColourRefinementSettings = ColourRefinementSettings()
+    colour: ColourSettings = ColourSettings()
+    refinement: RefinementSettings = RefinementSettings(surface_sigma=0.006)
+    thresholds: RenderedThresholds = RenderedThresholds()
 
 
 def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localization:
-    """From ``problem.start``; poses about it and pixels are drawn from ``seed``. It needs the field alone: measured depth is
-    not looked at, nor is a baked surface.
+    """Refine poses about ``problem.start``; they and the pixels are drawn from ``seed``.
+
+    It needs the field alone, and uses neither measured depth nor a baked surface.
     """
-    began, generator = time.perf_counter(), Generator().manual_seed(seed)
+    began, generator, spread = time.perf_counter(), Generator().manual_seed(seed), config.spread
     start = problem.start_for("inerf-lm")
-    problem = without_depth(problem)
-    many = neighbours(start, config.poses, config.spread_translation, config.spread_rotation, seed)
-    stages = (
-        Stage(config.width, 0, config.search_poses),
-        Stage(config.width, config.search_steps, config.middle_poses),
-        Stage(config.width * 3 // 2, config.middle_steps, 2),
-        Stage(config.width * 3, config.last_steps, 2),
-    )
-    found = search(rendered_sight(problem, start), many, stages)
-    refined = polished(replace(problem, start=start), found.T, config, generator)
-    return replace(
-        answered(problem, refined, found, config, began, doubted(refined, found, config)), method="inerf-lm"
-    )
-
-
-def rendered_sight(problem: Problem, start: SE3) -> Sight:
-    """At the coarsest level. How far things are is what renderings from the start tell."""
-    sketcher = ByField(problem.level(0), problem.bounds, problem.device)
-    small = thumbnail(problem.views[-1], 16)
-    T = start.to(small.flat)
-    directions = T.rotate(torch.nn.functional.normalize(small.flat, dim=-1))
-    away = float(sketcher(T.translation.expand_as(directions), directions).along.median())
-    extent = float(torch.linalg.vector_norm(torch.tensor(problem.bounds.size)))
-    return Sight(problem.views, sketcher, torch.tensor([0.0, 0.0, away]), extent)
+    problem = problem.without_depth()
+    many = neighbours(start, spread.poses, spread.spread_translation, spread.spread_rotation, seed)
+    found = ImageSearch.in_field(problem, start)(many, config.search.stages())
+    refinement = ByColourConfig(config.steps, config.colour, config.refinement, config.thresholds)
+    answer = refine_by_colour(replace(problem, start=start), found, refinement, generator)
+    return localization_of(problem, answer, refinement, began, "inerf-lm")

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.auto import AutoConfig
+from bidnerf_core.localization.auto import AutoConfig, auto
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.bid_lm import BidLmConfig, bid_lm
-from bidnerf_core.localization.by_depth import by_depth_or_colour
 from bidnerf_core.localization.inerf import InerfConfig, inerf
 from bidnerf_core.localization.inerf_lm import InerfLmConfig, inerf_lm
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.settings import from_flat
 
 
 @dataclass(frozen=True)
@@ -24,35 +24,38 @@ class Method:
     run: Callable[[Problem, Any, int], Localization]
     config_type: type
     summary: str
+    needs_start: bool
 
 
 METHODS = {
     "auto": Method(
-        by_depth_or_colour, AutoConfig, "search on the baked surface, by depth or colour; no start needed"
+        auto, AutoConfig, "search on the baked surface, by depth or colour; no start needed", False
     ),
-    "bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)"),
-    "inerf": Method(inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)"),
-    "bid-lm": Method(bid_lm, BidLmConfig, "second-order steps on colour and depth, from coarse to fine"),
-    "inerf-lm": Method(inerf_lm, InerfLmConfig, "second-order steps on colour alone, from coarse to fine"),
+    "bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)", True),
+    "inerf": Method(inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)", True),
+    "bid-lm": Method(
+        bid_lm, BidLmConfig, "second-order steps on colour and depth, from coarse to fine", True
+    ),
+    "inerf-lm": Method(
+        inerf_lm, InerfLmConfig, "second-order steps on colour alone, from coarse to fine", True
+    ),
 }
+
+RENAMED = {"play": "surface_sigma"}
+"""Settings that earlier versions stored under other names."""
 
 
 def find_method(name: str) -> Method:
+    """Return a method by name. Raises ``InputError`` for an unknown one."""
     chosen = METHODS.get(name)
     if chosen is None:
         raise InputError(f"method {name!r} is unknown, expected one of {', '.join(sorted(METHODS))}")
     return chosen
 
 
-def localize(problem: Problem, method: str = "auto", config: Any = None, seed: int = 0) -> Localization:
-    """Find the pose of ``problem``'s last camera.
+def settings_of(method: str, values: dict[str, Any], where: str = "config") -> Any:
+    """Return a method's settings from those that differ from its defaults, by their flat names.
 
-    ``config`` is an instance of the method's config type, by default with all defaults. The same seed gives the same
-    answer on the same machine. Raises ``InputError`` for an unknown method.
+    Raises ``InputError``, which begins with ``where``, for an unknown method or name, or a value that is not allowed.
     """
-    chosen = find_method(method)
-    settings = chosen.config_type() if config is None else config
-    if not isinstance(settings, chosen.config_type):
-        expected, found = chosen.config_type.__name__, type(settings).__name__
-        raise InputError(f"method {method!r} takes a {expected}, got a {found}")
-    return chosen.run(problem, settings, seed)
+    return from_flat(find_method(method).config_type, values, where, RENAMED)

@@ -1,16 +1,16 @@
-"""What is to be localized."""
+"""The localization problem: images with known relative poses in a map, and what is known of the pose sought."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import View
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
@@ -18,9 +18,23 @@ from bidnerf_core.se3 import SE3
 Item = TypeVar("Item")
 
 
+@runtime_checkable
+class SceneMap(Protocol):
+    """What a localization needs of a map; ``bidnerf_core.Map`` is one."""
+
+    @property
+    def field(self) -> RadianceField: ...
+
+    @property
+    def bounds(self) -> SceneBounds: ...
+
+    @property
+    def surface(self) -> SurfaceMap | None: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """K images with known relative poses in a map; the pose sought is that of the last one's camera.
+    """K images with known relative poses in a map; the pose sought is that of the last image's camera.
 
     ``views[i].T_ref_camera`` is T_K_i, camera i in the frame of the last camera K, so the last view's is the identity.
     """
@@ -28,9 +42,9 @@ class Problem:
     field: RadianceField
     bounds: SceneBounds
     views: tuple[View, ...]
-    start: SE3 | None  # T_world_K; none where nothing is known of it
+    start: SE3 | None  # T_world_K; None where nothing is known of it
     depth_rays: Observations | None = None  # of a lidar or the like, in the frame of the last camera
-    surface: SurfaceMap | None = None  # baked from the field; on the CPU, wherever the field is
+    surface: SurfaceMap | None = None  # baked from the field
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -41,7 +55,7 @@ class Problem:
                 raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
 
     def start_for(self, method: str) -> SE3:
-        """The start, for a method that cannot do without one."""
+        """Return the start. Raises ``InputError`` where there is none, for a method that cannot do without."""
         if self.start is None:
             raise InputError(f"method {method!r} needs a start; give one, or take method 'auto'")
         return self.start
@@ -52,7 +66,7 @@ class Problem:
 
     @property
     def device(self) -> torch.device:
-        """Where the field computes; rays are brought there."""
+        """The device on which the field computes; rays are moved there."""
         for kind in ("parameters", "buffers"):
             first = next(iter(getattr(self.field, kind, tuple)()), None)
             if isinstance(first, torch.Tensor):
@@ -60,7 +74,7 @@ class Problem:
         return torch.device("cpu")
 
     def level(self, number: int | None) -> RadianceField:
-        """A level of the field, counted from the coarsest, negative from the finest; ``None`` is the field itself."""
+        """Return a level of the field: 0 is the coarsest, -1 the finest, None the field itself."""
         if number is None:
             return self.field
         offered = levels(self.field)
@@ -68,46 +82,33 @@ class Problem:
             raise InputError(f"level is {number}, expected 0 (coarsest) to {len(offered) - 1}")
         return offered[number]
 
-
-def single(
-    field: RadianceField,
-    bounds: SceneBounds,
-    frame: Frame,
-    start: SE3 | None,
-    depth_rays: Observations | None = None,
-    surface: SurfaceMap | None = None,
-) -> Problem:
-    """One image, and what else was measured from there."""
-    return Problem(field, bounds, (View(frame, SE3.identity()),), _exact(start), depth_rays, surface)
+    def without_depth(self) -> Problem:
+        """Return the problem with colours alone."""
+        views = tuple(replace(view, frame=replace(view.frame, depth=None)) for view in self.views)
+        return replace(self, views=views, depth_rays=None)
 
 
 def rig(
-    field: RadianceField,
-    bounds: SceneBounds,
-    views: Sequence[View],
-    start: SE3 | None,
-    depth_rays: Observations | None = None,
-    surface: SurfaceMap | None = None,
+    scene: SceneMap, views: Sequence[View], start: SE3 | None, depth_rays: Observations | None = None
 ) -> Problem:
-    """Views whose poses are known in any common frame; ``start`` is for the last of them, as are ``depth_rays``."""
+    """Return the problem of ``views`` whose poses are known in any common frame.
+
+    ``start`` and ``depth_rays`` belong to the last view.
+    """
     if not views:
         raise InputError("nothing to localize: expected at least one view")
     T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
     relative = tuple(
         View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views
     )
-    return Problem(field, bounds, relative, _exact(start), depth_rays, surface)
-
-
-def _exact(pose: SE3 | None) -> SE3 | None:
-    return None if pose is None else pose.to("cpu", torch.float64)
+    start = None if start is None else start.to("cpu", torch.float64)
+    return Problem(scene.field, scene.bounds, relative, start, depth_rays, scene.surface)
 
 
 def window(sequence: Sequence[Item], last: int, size: int, stride: int = 1) -> tuple[Item, ...]:
-    """Item ``last`` and those before it, ``size`` of them, ``stride`` apart; fewer where the sequence begins.
+    """Return item ``last`` and those before it, ``size`` of them, ``stride`` apart; fewer at the sequence's beginning.
 
-    Of views in the order of time, it is what ``rig`` takes for a moving window. Raises ``InputError`` where there is no
-    such item.
+    Views in the order of time give the paper's moving window. Raises ``InputError`` where there is no such item.
     """
     if size < 1 or stride < 1:
         raise InputError(f"a window of {size} with stride {stride}, expected 1 or more of both")

@@ -1,13 +1,46 @@
-"""What a localization gives back, whatever the method."""
+"""The answer of a localization, whatever the method."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.files import write_file
 from bidnerf_core.se3 import SE3
+
+
+class Outcome(StrEnum):
+    """Why a pose is accepted or rejected. Only ``CONVERGED`` accepts it."""
+
+    CONVERGED = "converged"
+    AMBIGUOUS = "ambiguous"  # another pose explains the measurements about as well
+    OFF_SURFACE = "off surface"  # too few of the measured points lie on the map's surface
+    COLOUR_MISMATCH = "colour mismatch"  # too few of them have its colour
+    FREE_SPACE_VIOLATED = "free space violated"  # lines of sight pass through the surface
+    RENDERING_MISMATCH = "rendering mismatch"  # the field renders something else from there
+    UNDETERMINED = "undetermined"  # the measurements do not constrain all six degrees of freedom
+    NOT_SETTLED = "not settled"  # fresh rays still ask for a long step
+    HIGH_LOSS = "high loss"  # a descent ended above the loss that counts as converged
+    DIVERGED = "diverged"  # the loss or the pose became infinite or not a number
+    TOO_FEW_MATCHES = "too few matches"  # of image features with the map's landmarks
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """An outcome and the sentence that explains it."""
+
+    outcome: Outcome
+    reason: str
+
+    @property
+    def accepted(self) -> bool:
+        return self.outcome is Outcome.CONVERGED
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,16 +48,37 @@ class Localization:
     """The pose found for the last view's camera, and how it was found."""
 
     T_world_camera: SE3
-    converged: bool  # the method's own judgement, made without knowing the truth
-    reason: str  # why it stopped
+    outcome: Outcome  # judged without knowledge of the true pose
+    reason: str  # the outcome in a sentence
     steps: int
     seconds: float
     loss: float
     method: str
-    poses: (
-        SE3  # (steps + 1): the start, or the hypothesis that led to the answer, then the pose after each step
-    )
-    losses: Float[Tensor, "s"]  # after the start and before each step
-    covariance: Float[Tensor, "6 6"] | None = (
-        None  # of a right update: translation in metres, rotation in radians
-    )
+    poses: SE3  # (steps + 1): the start or the winning hypothesis, then the pose after each step
+    losses: Float[Tensor, "s"]  # at the start and before each further step
+    # Of a right update at the camera: translation in metres first, then rotation in radians. None where unknown.
+    covariance: Float[Tensor, "6 6"] | None = None
+
+    @property
+    def converged(self) -> bool:
+        """Whether the method accepts its own answer."""
+        return self.outcome is Outcome.CONVERGED
+
+    def plain(self) -> dict[str, Any]:
+        """Return the answer as JSON can hold it, with the keys of ``bidnerf localize --json``; not finite numbers as None."""
+        finite = bool(self.T_world_camera.matrix().isfinite().all())
+        return {
+            "T_world_camera": self.T_world_camera.matrix().tolist() if finite else None,
+            "converged": self.converged,
+            "outcome": str(self.outcome),
+            "reason": self.reason,
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "loss": self.loss if self.loss == self.loss and abs(self.loss) != float("inf") else None,
+            "method": self.method,
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write ``plain()`` as a JSON file, whole or not at all. ``localize --start`` reads it back as a start."""
+        write_file(Path(path), (json.dumps(self.plain(), indent=1, allow_nan=False) + "\n").encode())

@@ -55,6 +55,10 @@ class SurfaceMap:
         last = len(ordered) - 1
         return ordered[round(0.05 * last)], ordered[round(0.95 * last)]
 
+    def warm_up(self) -> None:
+        """Compute now what is derived from the surfels once and cached: the extent and the reach."""
+        _ = self.extent, self.reach
+
     def touch(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
         """Index of the surfel nearest to each point; beyond the grid, what is nearest to its border counts."""
         return self.nearest.view(-1)[self._cells(points)].long()

@@ -1,4 +1,4 @@
-"""The way that a descent took: its poses and losses, when to stop on it, and which pose of it to answer with."""
+"""The history of a descent: its poses and losses, when to stop, and which pose to answer with."""
 
 from __future__ import annotations
 
@@ -13,37 +13,43 @@ from torch import Tensor
 from bidnerf_core.se3 import SE3
 
 WINDOW = 20
-"""Steps over which the noisy loss is averaged before it is trusted."""
+"""Steps over which the noisy loss of a few rays is averaged."""
 
 AnswerName = Literal["last", "best"]
 
 
 @dataclass(eq=False)
-class Trail:
-    """Poses from the start on, and the loss that was found at each but the last."""
+class History:
+    """Poses from the start on, and the loss at each but the last."""
 
     poses: list[SE3]
     losses: list[float] = field(default_factory=list)
 
     @property
     def T(self) -> SE3:
-        """Where the descent is."""
+        """The current pose."""
         return self.poses[-1]
 
+    def add_batch(self, poses: SE3, costs: Float[Tensor, "t h"]) -> None:
+        """Add the best pose after each step of a batch: ``poses`` (t h) and their costs, the first before any step."""
+        best = costs.argmin(-1).tolist()
+        self.poses += [poses[i, best[i]] for i in range(1, len(best))]
+        self.losses += (costs.amin(-1)[:-1] / 2).tolist()
+
     def recent_loss(self) -> float:
-        """Mean of the last ``WINDOW`` losses; NaN where there are none."""
+        """Return the mean of the last ``WINDOW`` losses; NaN where there are none."""
         last = self.losses[-WINDOW:]
         return sum(last) / len(last) if last else math.nan
 
     def recent_step(self) -> float:
-        """Mean size of the last ``WINDOW`` steps: the length of their tangent vectors, metres and radians alike."""
+        """Return the mean length of the last ``WINDOW`` steps' tangent vectors, metres and radians alike."""
         if len(self.poses) < 2:
             return math.inf
         way = SE3.stack(self.poses[-WINDOW - 1 :])
         return float((way[:-1].inverse() @ way[1:]).log().norm(dim=-1).mean())
 
     def stop(self, loss_below: float, step_below: float) -> str | None:
-        """Why to stop, if there is a reason; a bar of 0 is never reached."""
+        """Return why to stop, or None; a threshold of 0 never stops."""
         if len(self.losses) < WINDOW:
             return None
         if self.recent_loss() < loss_below:
@@ -53,18 +59,13 @@ class Trail:
         return None
 
     def answer(self, name: AnswerName) -> tuple[SE3, float]:
-        """A pose and the mean loss of the steps up to it.
+        """Return a pose and the mean loss of the steps up to it.
 
-        ``last`` is the last pose, ``best`` the pose at the end of the ``WINDOW`` losses whose mean is least, or the last one
-        of a way shorter than that: a single loss is that of a few pixels, and says little.
+        ``last`` is the last pose. ``best`` is the pose at the end of those ``WINDOW`` steps whose mean loss is least, since
+        the loss of a single step is that of a few pixels; of a shorter history, the last pose.
         """
         if name == "last" or len(self.losses) < WINDOW:
             return self.T, self.recent_loss()
-        means = _moving_mean(torch.tensor(self.losses, dtype=torch.float64))
+        means = torch.tensor(self.losses, dtype=torch.float64).unfold(0, WINDOW, 1).mean(-1)
         least = int(means.argmin())
         return self.poses[least + WINDOW - 1], float(means[least])
-
-
-def _moving_mean(values: Float[Tensor, "s"]) -> Float[Tensor, "m"]:
-    """Of ``WINDOW`` values each."""
-    return values.unfold(0, WINDOW, 1).mean(-1)

@@ -1,4 +1,4 @@
-"""Images made small and smooth: what drawings of a surface are compared with, and where their rays run."""
+"""Thumbnails: small, smooth images, which renderings of a map from many poses are compared with."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A view seen by a small camera without distortion, on the CPU."""
+    """A view resampled to a small camera without distortion, on the CPU."""
 
     camera: Intrinsics
     T_last_camera: SE3
@@ -25,17 +25,17 @@ class Thumbnail:
 
     @cached_property
     def flat(self) -> Float[Tensor, "n 3"]:
-        """Points of the camera frame on the plane z = 1 that its pixels see, row by row."""
+        """The pixels' points on the plane z = 1 of the camera frame, row by row."""
         return self.camera.unproject(self.camera.pixel_centres()).reshape(-1, 3)
 
     @cached_property
     def directions(self) -> Float[Tensor, "n 3"]:
-        """Unit; in the last camera's frame."""
+        """The pixels' unit directions, in the last camera's frame."""
         return self.T_last_camera.to(self.flat).rotate(torch.nn.functional.normalize(self.flat, dim=-1))
 
     @cached_property
     def directness(self) -> Float[Tensor, "n"]:
-        """Metres of depth in a metre along each ray."""
+        """Depth per distance along each ray."""
         return 1 / torch.linalg.vector_norm(self.flat, dim=-1)
 
     @cached_property
@@ -48,11 +48,11 @@ class Thumbnail:
 
 
 def thumbnail(view: View, width: int) -> Thumbnail:
-    """``view`` made smaller, so that its longer side has ``width`` pixels at most, and ``smooth``."""
+    """Return ``view`` reduced to at most ``width`` pixels on its longer side, without distortion, smoothed."""
     camera = view.frame.intrinsics
     small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
     rgb = view.frame.rgb.cpu().float().permute(2, 0, 1)[None]
-    # Averaged first, so that nothing between the small camera's rays is left out.
+    # Averaged first, so that every pixel of the image contributes.
     rgb = interpolate(rgb, (small.height, small.width), mode="area")
     if camera.distortion:
         seen = camera.project(small.unproject(small.pixel_centres())) / torch.tensor(
@@ -63,7 +63,7 @@ def thumbnail(view: View, width: int) -> Thumbnail:
 
 
 def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
-    """Convolved with a binomial kernel of 5x5 pixels, a Gaussian of one pixel; beyond the border, what is at the border."""
+    """Convolve with a binomial kernel of 5x5 pixels, about a Gaussian of one pixel; the border is repeated."""
     kernel = image.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
     flat = image.reshape(-1, 1, *image.shape[-2:])
     flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
@@ -72,7 +72,7 @@ def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
 
 
 def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, "*b n 2"]:
-    """Central differences, per unit to the right and down on the plane z = 1."""
+    """Return central differences to the right and down, per unit on the plane z = 1."""
     flat = image.reshape(-1, 1, *image.shape[-2:])
     wide = pad(flat, (1, 1, 1, 1), mode="replicate")
     across = (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) * (camera.fx / 2)

@@ -1,4 +1,4 @@
-"""What many rays see, quickly and without derivatives: on the baked surface, or by rendering a field."""
+"""Fast renderings without derivatives of what many rays see: from the baked surface, or from a field."""
 
 from __future__ import annotations
 
@@ -19,49 +19,50 @@ CHUNK = 16384
 
 
 @dataclass(frozen=True, eq=False)
-class Sketch:
-    """On the CPU."""
+class RayColours:
+    """What rays see, on the CPU."""
 
-    rgb: Float[Tensor, "r 3"]  # times ``known``, where less than all is known
-    known: Float[Tensor, "r"]  # 0 where a ray leads to where the map knows nothing
-    along: Float[
-        Tensor, "r"
-    ]  # metres to what is seen or, where that is the background, to what the ray passes by
+    rgb: Float[Tensor, "r 3"]  # times ``known``, where that is less than 1
+    known: Float[Tensor, "r"]  # 0 where a ray leads to where the map has nothing
+    # Metres to what is seen or, where that is the background, to where the ray passes closest to the scene.
+    along: Float[Tensor, "r"]
 
 
 @runtime_checkable
-class Sketcher(Protocol):
-    """Looks along half-lines with unit directions, world frame, on the CPU."""
+class ViewRenderer(Protocol):
+    """Renders half-lines with unit directions (world frame, on the CPU)."""
 
-    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> Sketch: ...
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours: ...
 
 
 @dataclass(frozen=True, eq=False)
-class OnSurface:
-    """Colours of surfels; of what lies behind, too, where there is a background."""
+class SurfaceRenderer:
+    """Renders the colours of surfels and, where the scene has a background, that behind them."""
 
     surface: SurfaceMap
-    background: tuple[float, float, float] | None  # none: what meets nothing looks through a hole of the map
+    background: (
+        tuple[float, float, float] | None
+    )  # None: a ray that meets nothing looks through a hole of the map
 
-    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> Sketch:
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours:
         found = cast(self.surface, origins, directions)
         met = found.met[:, None].to(origins)
         behind = origins.new_tensor(self.background or (0.0, 0.0, 0.0))
         rgb = met * self.surface.surfels.rgb[found.index] + (1 - met) * behind
         known = met[:, 0] if self.background is None else torch.ones_like(found.along)
-        return Sketch(rgb, known, found.along.clamp(min=self.surface.cell))
+        return RayColours(rgb, known, found.along.clamp(min=self.surface.cell))
 
 
 @dataclass(frozen=True, eq=False)
-class ByField:
-    """Renderings, background and all."""
+class FieldRenderer:
+    """Renders a field, with its background."""
 
     field: RadianceField
     bounds: SceneBounds
     device: torch.device
 
     @torch.no_grad()
-    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> Sketch:
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours:
         middle = origins.new_tensor([self.bounds.lower, self.bounds.upper]).mean(0)
         passing = ((middle - origins) * directions).sum(-1)
         parts = [
@@ -70,7 +71,7 @@ class ByField:
         ]
         rgb, along, opacity = (torch.cat(values) for values in zip(*parts, strict=True))
         along = torch.where(opacity > 0.5, along / opacity.clamp(min=0.5), passing)
-        return Sketch(rgb, torch.ones_like(along), along.clamp(min=self.bounds.near))
+        return RayColours(rgb, torch.ones_like(along), along.clamp(min=self.bounds.near))
 
     def _rendered(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = render(self.field, self.bounds.rays(origins, directions), self.bounds.background)

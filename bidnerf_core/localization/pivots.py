@@ -1,4 +1,4 @@
-"""What a step turns about: the frame in which updates of the pose are written."""
+"""Pivots: the frame in which updates of a pose are written, and about which they turn."""
 
 from __future__ import annotations
 
@@ -18,45 +18,45 @@ PivotName = Literal["scene", "camera", "world"]
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """A place that is fixed to the camera, or the world's origin."""
+    """A point fixed to the camera, or the world's origin."""
 
     T_camera_pivot: SE3 | None  # a translation; None: the world's own frame
 
     @staticmethod
     def at_point(point: Float[Tensor, "3"]) -> Pivot:
-        """A point of the camera's frame, metres."""
+        """Return the pivot at a point of the camera's frame, metres."""
         return Pivot(SE3(torch.eye(3, dtype=torch.float64), point.to("cpu", torch.float64)))
 
     @property
     def reach(self) -> float:
-        """Metres by which a turn of one radian moves the camera, if that is more than 1.
+        """Metres by which a turn of one radian moves the camera, at least 1.
 
-        Steps of both kinds are to move it equally far; in the world's frame, iNeRF takes them as they come.
+        It balances steps of translation and of rotation; in the world's frame iNeRF does not balance them.
         """
         return 1.0 if self.T_camera_pivot is None else max(1.0, float(self.T_camera_pivot.translation.norm()))
 
     def moved(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """``T``, or each of many, after the update ``delta``; differentiable in it."""
+        """Return ``T``, one pose or a batch, after the update ``delta``; differentiable in it."""
         if self.T_camera_pivot is None:
             return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
 
     def at(self, T: SE3) -> SE3:
-        """T_world_pivot: the frame in which ``moved`` makes its right update, for poses with any leading axes."""
+        """Return T_world_pivot, in which ``moved`` makes a right update, for poses with any leading axes."""
         return T @ (T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot)
 
     def at_camera(self, T: SE3, covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
-        """The covariance of an update here as one of a right update of ``T`` (Sola et al. 2018, eq. 54)."""
+        """Convert the covariance of an update at the pivot to that of a right update of ``T`` (Sola et al. 2018, eq. 54)."""
         T_camera_pivot = T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot
         carried = T_camera_pivot.adjoint()
         return carried @ covariance @ carried.mT
 
 
 def pivot(name: PivotName, problem: Problem) -> Pivot:
-    """A pivot by name: the camera (the paper's), the world's origin (iNeRF's), or the middle of what is seen.
+    """Return a pivot by name: the camera (the paper's), the world's origin (iNeRF's), or the middle of what is seen.
 
-    For a camera some metres away, a turn and a sideways motion look almost alike: in its own frame the objective is a
-    long narrow valley, along which first-order steps crawl. About the middle of what the camera sees, the two part.
+    To a camera some metres away a turn and a sideways motion look almost alike: in its own frame the objective is a long
+    narrow valley, along which first-order steps crawl. About the middle of what the camera sees, the two separate.
     """
     if name == "world":
         return Pivot(None)
@@ -64,7 +64,7 @@ def pivot(name: PivotName, problem: Problem) -> Pivot:
 
 
 def _middle(problem: Problem) -> Float[Tensor, "3"]:
-    """Of what was measured or, failing that, of the scene: in the last camera's frame. Where nothing tells, the camera."""
+    """Return the middle of what was measured, else of the scene, else the camera; in the last camera's frame, metres."""
     point = measured_middle(problem.views)
     if point is not None:
         return point

@@ -1,0 +1,117 @@
+"""Acceptance: whether an answer is to be trusted, judged without knowledge of the true pose.
+
+Every method's judgement is made here. Diagnostics are measured where the answer was found; thresholds turn them into an
+``Outcome`` and a sentence.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from bidnerf_core.localization.costs.surface import SurfaceCost
+from bidnerf_core.localization.method_settings import RenderedThresholds
+from bidnerf_core.localization.refinement import RefinementResult
+from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.se3 import SE3
+
+WELL_BEFORE = 0.04
+"""Share of the extent by which a line of sight must meet the surface too early to count as a violation."""
+SIGHT_LINES = 300
+"""Lines of sight that are traced, at most."""
+IMAGE_MARGIN = 0.01
+"""Share of its cost by which the next best answer of a search by images must be worse."""
+AMBIGUOUS = Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
+
+
+@dataclass(frozen=True)
+class SurfaceThresholds:
+    """What an answer on the baked surface must show."""
+
+    on_surface: float = 0.85  # share of the measured points that lie on the surface, at least
+    colour_inliers: float = 0.42  # share that lies there and has its colour, at least
+    free_space_violations: float = 0.15  # share of lines of sight that pass through the surface, at most
+    runner_up_margin: float = 0.15  # by how much the next best answer must be worse
+    rendered_inliers: float = 0.9  # share of rendered rays that agree with what was measured, at least
+
+
+@dataclass(frozen=True)
+class SurfaceDiagnostics:
+    """What measured points show of a pose; all but the margin are shares between 0 and 1."""
+
+    on_surface: float
+    colour_inliers: float
+    free_space_violations: float
+    runner_up_margin: float
+    rendered_inliers: float = 1.0  # where nothing was rendered
+
+    def rejection(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict | None:
+        """Return the gravest reason against the pose, or None."""
+        if self.on_surface < thresholds.on_surface:
+            return Verdict(
+                Outcome.OFF_SURFACE, f"only {self.on_surface:.0%} of the measured points lie on the surface"
+            )
+        if self.colour_inliers < thresholds.colour_inliers:
+            share = f"{self.colour_inliers:.0%} of the measured points have the colour of the surface"
+            return Verdict(Outcome.COLOUR_MISMATCH, f"only {share}")
+        if self.free_space_violations > thresholds.free_space_violations:
+            share = f"{self.free_space_violations:.0%} of the lines of sight"
+            return Verdict(Outcome.FREE_SPACE_VIOLATED, f"{share} pass through the surface")
+        if self.runner_up_margin < thresholds.runner_up_margin:
+            return AMBIGUOUS
+        if not self.rendered_inliers >= thresholds.rendered_inliers:
+            share = f"{self.rendered_inliers:.0%} of the rendered rays agree with what was measured"
+            return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}")
+        return None
+
+    def verdict(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict:
+        share = f"{self.colour_inliers:.0%} of the measured points have the surface's place and colour"
+        return self.rejection(thresholds) or Verdict(Outcome.CONVERGED, share)
+
+
+def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDiagnostics:
+    """Measure how the points of ``judge`` lie on the surface from one pose.
+
+    Each point counts by how much of an inlier it is, so that no threshold on single points decides.
+    """
+    near, alike = judge.inliers(judge.correspondences(T[None]))
+    violations = free_space_violations(judge, T)
+    return SurfaceDiagnostics(float(near.mean()), float((near * alike).mean()), violations, margin)
+
+
+def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
+    """Return the share of lines of sight that meet the surface well before the point that was measured."""
+    some, surface = cost.cloud.first(SIGHT_LINES), cost.surface
+    origins, ends = (T.apply(x.double()).to(some.points) for x in (some.origins, some.points))
+    length = torch.linalg.vector_norm(ends - origins, dim=-1)
+    met = surface.trace(origins, (ends - origins) / length.clamp(min=1e-9)[:, None])
+    # Grazing lines meet coarse cells early.
+    slack = max(WELL_BEFORE * surface.extent, 4 * surface.cell)
+    return float((met < length - slack).float().mean())
+
+
+def rendered_verdict(
+    found: RefinementResult, thresholds: RenderedThresholds, search: SearchResult | None = None
+) -> Verdict:
+    """Judge a pose by fresh rendered rays and, where it came from a search by images, by the runner-up."""
+    if not bool(found.covariance.isfinite().all()):
+        return Verdict(Outcome.UNDETERMINED, "what was measured does not determine the pose")
+    share = f"{found.inliers:.0%} of fresh rays agree with what was measured"
+    if not found.inliers >= thresholds.converged_inliers:
+        return Verdict(Outcome.RENDERING_MISMATCH, f"{share}, expected {thresholds.converged_inliers:.0%}")
+    if not found.step <= thresholds.converged_step:
+        most = f"expected {thresholds.converged_step:g} at most"
+        return Verdict(Outcome.NOT_SETTLED, f"fresh rays ask for a step of {found.step:.3g}, {most}")
+    if search is not None and search.margin < IMAGE_MARGIN * max(float(search.scores[0]), 1e-6):
+        return AMBIGUOUS
+    return Verdict(Outcome.CONVERGED, share)
+
+
+def descent_verdict(mean_loss: float, threshold: float, finite: bool, reason: str) -> Verdict:
+    """Judge a first-order descent by the mean loss of its last steps; ``reason`` says why it ended."""
+    if not finite or not math.isfinite(mean_loss):
+        return Verdict(Outcome.DIVERGED, reason)
+    return Verdict(Outcome.CONVERGED if mean_loss < threshold else Outcome.HIGH_LOSS, reason)

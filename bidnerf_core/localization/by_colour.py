@@ -1,0 +1,99 @@
+"""Poses by colour alone: a search by small images, then second-order steps on rendered rays, then a verdict."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from torch import Generator
+
+from bidnerf_core.localization.acceptance import rendered_verdict
+from bidnerf_core.localization.costs.rendered import RenderedCostSettings
+from bidnerf_core.localization.covariance import INDEPENDENT
+from bidnerf_core.localization.method_settings import (
+    ColourSettings,
+    RefinementSettings,
+    RefinementStage,
+    RenderedThresholds,
+)
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.refinement import RefinementResult, refine
+from bidnerf_core.localization.result import Localization, Verdict
+from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.se3 import SE3
+from bidnerf_core.settings import EXPERT, Range, Settings
+
+
+@dataclass(frozen=True)
+class ColourRefinementSettings(Settings):
+    """The last steps on colour alone."""
+
+    coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = (
+        4  # of each pose that the search left, coarsest level
+    )
+    coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256  # for each of them
+    fine_steps: Annotated[int, Range(1, 10**5)] = 8  # of the best one, in full detail
+    fine_rays: Annotated[int, Range(7, 10**7)] = 1024
+
+
+@dataclass(frozen=True)
+class ByColourConfig(Settings):
+    """Settings of the steps on rendered rays and of their acceptance."""
+
+    steps: ColourRefinementSettings = ColourRefinementSettings()
+    colour: ColourSettings = ColourSettings()
+    refinement: RefinementSettings = RefinementSettings(surface_sigma=0.006)
+    thresholds: RenderedThresholds = RenderedThresholds()
+
+
+@dataclass(frozen=True, eq=False)
+class ColourAnswer:
+    """A search, the refinement of what it found, and what fresh rays show of that."""
+
+    search: SearchResult
+    refined: RefinementResult
+    verdict: Verdict
+
+
+def refine_by_colour(
+    problem: Problem, search: SearchResult, config: ByColourConfig, generator: Generator
+) -> ColourAnswer:
+    """Refine the poses that a search left, on colour alone."""
+    s, scale, sigma = config.steps, config.colour.colour_scale, config.refinement.surface_sigma
+    count = len(search.T.translation)
+    stages = (
+        RefinementStage(s.coarse_steps, s.coarse_rays, count, 0, 2, scale, surface_sigma=sigma),
+        RefinementStage(s.fine_steps, s.fine_rays, 1, None, 1, scale, surface_sigma=sigma / 2),
+    )
+    settings = RenderedCostSettings(config.colour, None, config.refinement)
+    refined = refine(problem, search.T, stages, settings, generator)
+    return ColourAnswer(search, refined, rendered_verdict(refined, config.thresholds, search))
+
+
+def localization_of(
+    problem: Problem, answer: ColourAnswer, config: ByColourConfig, began: float, method: str
+) -> Localization:
+    """Return an answer as a localization.
+
+    The path through the search and over rendered rays is one; it begins at the start where there is one, since choosing a
+    hypothesis is part of the first step.
+    """
+    refined, search = answer.refined, answer.search
+    path = [T[i] for T in (search.path[:-1], refined.poses) for i in range(len(T.translation))]
+    path[0] = problem.start or path[0]
+    # Neighbouring rays err alike, so that those of a view count for a few independent ones only.
+    covariance = refined.covariance * max(1.0, config.steps.fine_rays / (INDEPENDENT * len(problem.views)))
+    return Localization(
+        T_world_camera=refined.T.normalized(),
+        outcome=answer.verdict.outcome,
+        reason=answer.verdict.reason,
+        steps=len(path) - 1,
+        seconds=time.perf_counter() - began,
+        loss=refined.loss,
+        method=method,
+        poses=SE3.stack(path),
+        losses=torch.cat([search.losses, refined.losses]),
+        covariance=covariance if bool(covariance.isfinite().all()) else None,
+    )

@@ -1,0 +1,123 @@
+"""Residuals of rendered rays and their Jacobian by the pose: one backward pass a channel, for any differentiable field.
+
+Rays are independent of each other, so the derivative of a channel's sum over all rays by their origins and directions holds
+every ray's own. Four passes give the whole Jacobian of an RGB-D objective.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.field import RadianceField, Rays, RaySamples
+from bidnerf_core.observations import Observations
+from bidnerf_core.rendering import Rendering, render_samples
+from bidnerf_core.residuals import Residual
+from bidnerf_core.se3 import SE3
+
+Background = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """The residuals of n rays from each of h poses, and how they change with the pose."""
+
+    residuals: Float[Tensor, "h n c"]
+    rgb: Float[Tensor, "h n 3"]  # rendered
+    steepness: Float[Tensor, "h n c"]  # length of the derivative by the ray's origin, per metre
+    jacobian: Float[Tensor, "h n c 6"]  # by a right update at the pivot: translation, rotation
+
+
+def linearize(
+    field: RadianceField,
+    rays: Rays,
+    observed: Observations,
+    residual: Residual,
+    T_world_pivot: SE3,
+    background: Background,
+    least_weight: float = 0.0,
+    channels: tuple[int, ...] | None = None,
+) -> Linearization:
+    """Render ``rays`` (h n), which move with the pivots (h), and differentiate their residuals against ``observed`` (n).
+
+    ``least_weight``: samples of less rendering weight contribute to what is rendered, but not to its derivative; most of
+    them are air, and nearly all of the time goes into derivatives. ``channels``: those that are differentiated, by default
+    all; the Jacobian of the others is 0.
+    """
+    flat, shape = flattened(rays), rays.near.shape
+    repeated = observed.repeated(shape[0])
+    with torch.no_grad():
+        rendering = render_samples(field, flat, field.sampler(flat), background)
+        # Colours nearly cancel at the answer: their difference is taken in float64.
+        precise = replace(rendering, rgb=rendering.rgb.double())
+        residuals = residual(precise, replace(repeated, rgb=repeated.rgb.double()))
+    kept = rendering.samples.valid
+    if least_weight > 0:
+        kept = kept & (rendering.weights > least_weight)
+    count = residuals.shape[-1]
+    wanted = tuple(range(count)) if channels is None else channels
+    gradients = _ray_gradients(
+        field, flat, repeated, residual, rendering.samples, kept, background, wanted, count
+    )
+    by_origin, by_direction = (part.reshape(*shape, count, 3) for part in gradients)
+    jacobian = _by_update(rays, T_world_pivot, by_origin, by_direction)
+    steepness = torch.linalg.vector_norm(by_origin, dim=-1)
+    return Linearization(
+        residuals.reshape(*shape, count), rendering.rgb.reshape(*shape, 3), steepness, jacobian
+    )
+
+
+def flattened(rays: Rays) -> Rays:
+    """Return rays of shape (h n) along one axis."""
+    parts = (rays.origins, rays.directions, rays.near, rays.far)
+    origins, directions, near, far = (part.flatten(0, 1) for part in parts)
+    return Rays(origins, directions, near, far)
+
+
+def _ray_gradients(
+    field: RadianceField, rays: Rays, observed: Observations, residual: Residual, samples: RaySamples,
+    kept: Bool[Tensor, "r s"], background: Background, channels: tuple[int, ...], count: int,
+) -> tuple[Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]:  # fmt: skip
+    """Return the derivatives of each ray's residuals by its origin and by its direction, from the ``kept`` samples."""
+    results = [rays.origins.new_zeros((len(rays.near), count, 3)) for _ in range(2)]
+    busy = kept.any(-1).nonzero()[:, 0]
+    if len(busy) == 0 or not channels:
+        return results[0], results[1]
+    leaves = [part[busy].detach().requires_grad_() for part in (rays.origins, rays.directions)]
+    few = Rays(leaves[0], leaves[1], rays.near[busy], rays.far[busy])
+    rendering: Rendering = render_samples(field, few, _gathered(samples, kept, busy), background)
+    found = residual(rendering, observed[busy])
+    for channel in channels:
+        gradients = torch.autograd.grad(
+            found[:, channel].sum(), leaves, retain_graph=channel != channels[-1], allow_unused=True
+        )
+        for result, gradient in zip(results, gradients, strict=True):
+            if gradient is not None:
+                result[busy, channel] = gradient
+    return results[0], results[1]
+
+
+def _gathered(samples: RaySamples, kept: Bool[Tensor, "r s"], rays: Tensor) -> RaySamples:
+    """Return the kept samples of some rays, moved to the front of rows that are as short as possible."""
+    kept = kept[rays]
+    order = (~kept).sort(dim=-1, stable=True).indices[:, : int(kept.sum(-1).amax())]
+    parts = (samples.starts[rays], samples.ends[rays], kept)
+    return RaySamples(*(part.gather(-1, order) for part in parts))
+
+
+def _by_update(
+    rays: Rays,
+    T_world_pivot: SE3,
+    by_origin: Float[Tensor, "h n c 3"],
+    by_direction: Float[Tensor, "h n c 3"],
+) -> Float[Tensor, "h n c 6"]:
+    """Apply the chain rule to ``T exp(xi)`` at the pivot: ``do = R rho + R phi x (o - c)`` and ``dv = R phi x v``."""
+    T = T_world_pivot.to(rays.origins)
+    arm = (rays.origins - T.translation[:, None])[:, :, None]
+    turning = torch.linalg.cross(arm.expand_as(by_origin), by_origin) + torch.linalg.cross(
+        rays.directions[:, :, None].expand_as(by_direction), by_direction
+    )
+    return torch.cat([part @ T.rotation[:, None] for part in (by_origin, turning)], -1)

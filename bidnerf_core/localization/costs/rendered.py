@@ -1,0 +1,185 @@
+"""The cost of rendered rays: what the field renders from a pose against what was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Generator, Tensor
+
+from bidnerf_core.field import RadianceField, Rays
+from bidnerf_core.localization.costs.linearization import Linearization, linearize
+from bidnerf_core.localization.costs.weighted_rays import RayCounts, WeightedRays, draw_weighted_rays
+from bidnerf_core.localization.exposure import Exposure, fit_exposure
+from bidnerf_core.localization.method_settings import (
+    ColourSettings,
+    DepthSettings,
+    RefinementSettings,
+    RefinementStage,
+    objective_of,
+)
+from bidnerf_core.localization.normal_equations import NormalEquations
+from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.residuals import Objective
+from bidnerf_core.sampling import AroundDepth, Resampled
+from bidnerf_core.se3 import SE3
+
+MISS_SCALES = 3.0
+"""Depth residual of a ray that meets nothing, in depth scales: an outlier, but not by the whole distance."""
+EXPOSURE_ROUNDS = 3
+"""Rounds of robust reweighting in which the exposure is fitted."""
+EXPOSURE_PRIOR = 0.001
+"""Precision of the gain's prior, relative to all weights: it decides only where all that is seen has one colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Rendered minus measured, for each of n rays from each of h poses, c channels each; float64."""
+
+    value: Float[Tensor, "h n c"]
+    jacobian: Float[Tensor, "h n c 6"]
+    weights: Float[Tensor, "n c"]  # of each in the objective; 0 where nothing was measured
+    confidence: Float[Tensor, "h n c"]  # 1, or less where a residual is too steep for the map's accuracy
+    objective: Objective
+
+    @property
+    def _pull(self) -> Float[Tensor, "h n c"]:
+        """The weight of each square in a step."""
+        return self.weights * self.confidence**2 * self.objective.robust_weights(self.confidence * self.value)
+
+    def cost(self) -> Float[Tensor, "h"]:
+        """Return ``2 sum weight rho(r)``, the plain weighted sum of squares where residuals are small.
+
+        Confidence steers a step, but does not judge it: a step would otherwise be rewarded for finding steep places.
+        """
+        return 2 * (self.weights * self.objective.rho(self.value)).sum((-1, -2)).cpu()
+
+    def normal_equations(self) -> NormalEquations:
+        """Return the equations of iteratively reweighted least squares."""
+        pull = self._pull
+        return NormalEquations(
+            self.cost(),
+            torch.einsum("hnc,hnci->hi", pull * self.value, self.jacobian).cpu(),
+            torch.einsum("hnc,hnci,hncj->hij", pull, self.jacobian, self.jacobian).cpu(),
+        )
+
+    def scores(self) -> Float[Tensor, "h n 6"]:
+        """Return each ray's contribution to the gradient."""
+        return torch.einsum("hnc,hnci->hni", self._pull * self.value, self.jacobian).cpu()
+
+    def inliers(self) -> Float[Tensor, "h"]:
+        """Return the share of rays none of whose residuals exceeds three times the scale at which outliers begin."""
+        limits = self.value.new_tensor(self.objective.scales)
+        off = (self.value.abs() > 3 * limits) & (self.weights > 0)
+        agreeing: Bool[Tensor, "h n"] = ~off.any(-1)
+        return agreeing.double().mean(-1).cpu()
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedCost:
+    """The objective on one draw of rays, at one stage's level of detail."""
+
+    problem: Problem
+    rays: WeightedRays
+    objective: Objective
+    stage: RefinementStage
+    settings: RefinementSettings
+    pivot: Pivot
+
+    def __call__(self, T: SE3) -> NormalEquations:
+        return self.residuals(T).normal_equations()
+
+    def cost(self, T: SE3) -> Float[Tensor, "h"]:
+        """Return the cost without the time that derivatives take."""
+        return self.residuals(T, derivatives=False).cost()
+
+    def residuals(self, T: SE3, derivatives: bool = True) -> Residuals:
+        """Return the residuals from poses T (h); without ``derivatives`` their Jacobian is 0."""
+        used = (self.rays.weights > 0).any(0).tolist()
+        channels = tuple(c for c, use in enumerate(used) if use and derivatives)
+        rays = self.rays.observed.rays(T, self.problem.bounds)
+        found = linearize(
+            self._field(rays), rays, self.rays.observed, self.objective.residuals, self.pivot.at(T),
+            self.problem.bounds.background, self.settings.least_weight, channels,
+        )  # fmt: skip
+        return _residuals(found, self.rays, self.objective, self.settings.exposure, self.stage.surface_sigma)
+
+    @property
+    def field(self) -> RadianceField:
+        """The stage's level of detail."""
+        return self.problem.level(self.stage.level)
+
+    def _field(self, rays: Rays) -> RadianceField:
+        """Return the stage's level, sampled only about the measured depth where the stage has a window."""
+        if self.stage.window == 0:
+            return self.field
+        distance = self.rays.observed.distance.expand(rays.near.shape).flatten()
+        count = self.settings.window_samples
+        return Resampled(self.field, AroundDepth(distance, self.stage.window, count, self.field.sampler))
+
+
+@dataclass(frozen=True)
+class RenderedCostSettings:
+    """What all stages of a refinement share."""
+
+    colour: ColourSettings
+    depth: DepthSettings | None  # None: colour alone
+    refinement: RefinementSettings
+
+    def drawn(
+        self, problem: Problem, stage: RefinementStage, pivot: Pivot, generator: Generator
+    ) -> RenderedCost:
+        """Draw a stage's rays."""
+        depth = self.depth
+        objective = objective_of(self.colour, depth, stage.colour_scale, stage.depth_scale, MISS_SCALES)
+        counts = RayCounts(stage.rays, 0 if depth is None else depth.depth_rays)
+        rays = draw_weighted_rays(problem, objective, counts, self.refinement.pixels, stage.blur, generator)
+        return RenderedCost(problem, rays, objective, stage, self.refinement, pivot)
+
+
+def _residuals(
+    found: Linearization, rays: WeightedRays, objective: Objective, exposure: bool, surface_sigma: float
+) -> Residuals:
+    """Turn a linearization into weighted residuals; with ``exposure``, rendered as bright as the image was taken.
+
+    ``surface_sigma`` (metres): a residual varies by its steepness times that, beside its own scale, and counts for so much
+    less.
+    """
+    value, jacobian, weights = found.residuals.double(), found.jacobian.double(), rays.weights.double()
+    if exposure:
+        rendered, measured = found.rgb.double(), rays.observed.rgb.double()
+        fitted = _robust_exposure(rendered, measured, weights[:, :3], objective)
+        value = torch.cat([fitted.applied(rendered.mT).mT - measured, value[..., 3:]], -1)
+        jacobian = _without_exposure(rendered, jacobian, weights, fitted)
+    confidence = (
+        1 + (surface_sigma / value.new_tensor(objective.scales) * found.steepness.double()) ** 2
+    ).rsqrt()
+    return Residuals(torch.where(weights > 0, value, 0), jacobian, weights, confidence, objective)
+
+
+def _robust_exposure(
+    rendered: Float[Tensor, "h n 3"], measured: Float[Tensor, "n 3"], weights: Float[Tensor, "n 3"], objective: Objective
+) -> Exposure:  # fmt: skip
+    """Fit the exposure of each pose by iteratively reweighted least squares."""
+    robust = objective.terms[0].robust
+    x, y, w = rendered.mT, measured.mT[None], weights.mT
+    exposure = Exposure(torch.ones_like(x[..., 0]), torch.zeros_like(x[..., 0]))
+    for _ in range(EXPOSURE_ROUNDS):
+        factors = w * robust.weight(exposure.applied(x) - y)
+        exposure = fit_exposure(x, y, factors, EXPOSURE_PRIOR * factors.sum(-1))
+    return exposure
+
+
+def _without_exposure(
+    rendered: Float[Tensor, "h n 3"], jacobian: Float[Tensor, "h n c 6"], weights: Float[Tensor, "n c"], fitted: Exposure
+) -> Float[Tensor, "h n c 6"]:  # fmt: skip
+    """Return the Jacobian less what a change of gain and bias could do as well (variable projection)."""
+    by_pose = fitted.gain[:, None, :, None] * jacobian[..., :3, :]
+    share = weights[:, :3] / weights[:, :3].sum(0).clamp(min=torch.finfo(weights.dtype).tiny)
+    basis = rendered - (share * rendered).sum(1, keepdim=True)
+    basis = basis * (share * basis**2).sum(1, keepdim=True).clamp(min=1e-12).rsqrt()
+    by_pose = by_pose - torch.einsum("nc,hnci->hci", share, by_pose)[:, None]
+    by_pose = by_pose - basis[..., None] * torch.einsum("nc,hnc,hnci->hci", share, basis, by_pose)[:, None]
+    return torch.cat([by_pose, jacobian[..., 3:, :]], -2)

@@ -1,0 +1,262 @@
+"""The cost of measured points on a baked surface, with exact derivatives, for many poses at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor
+
+from bidnerf_core.frames import View
+from bidnerf_core.localization.normal_equations import NormalEquations
+from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.observations import Observations
+from bidnerf_core.pixels import observe
+from bidnerf_core.robust import geman_mcclure_inlier
+from bidnerf_core.se3 import SE3, skew
+
+SURFEL_RADIUS = 1.5
+"""How far along its plane a surfel reaches, in cells of the surface's grid."""
+MOST_COLOUR_CHANGE = 0.2
+"""The largest change of a surfel's colour along its plane that its gradient is trusted for."""
+
+
+@dataclass(frozen=True)
+class PointScales:
+    """The residuals at which a point is half an inlier, and what colour counts beside distance."""
+
+    distance: float  # metres
+    colour: float = 0.15  # norm of the difference over the three channels, each in [0, 1]
+    colour_weight: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Measured points with their colours, in the frame of the camera whose pose is sought."""
+
+    points: Float[Tensor, "p 3"]  # metres
+    rgb: Float[Tensor, "p 3"]
+    origins: Float[Tensor, "p 3"]  # metres: where each was measured from
+    coloured: Bool[Tensor, "p"]  # whether a colour was measured
+
+    @staticmethod
+    def measured(
+        views: tuple[View, ...], depth_rays: Observations | None, count: int, generator: Generator
+    ) -> PointCloud:
+        """Return up to ``count`` measured points in random order, shared out equally among the sensors; on the CPU.
+
+        Points of ``depth_rays`` take their colours from the views that see them.
+        """
+        share = -(-count // (len(views) + (depth_rays is not None)))
+        parts = [_cloud_of(view, share, generator) for view in views]
+        if depth_rays is not None:
+            parts.append(_cloud_of_rays(depth_rays, views, share, generator))
+        order = torch.randperm(sum(map(len, parts)), generator=generator)[:count]
+        names = ("points", "rgb", "origins", "coloured")
+        return PointCloud(*(torch.cat([getattr(part, name) for part in parts])[order] for name in names))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def first(self, count: int) -> PointCloud:
+        """Return the first ``count`` points: a random sample, since their order is random."""
+        parts = (self.points, self.rgb, self.origins, self.coloured)
+        return PointCloud(*(part[:count] for part in parts))
+
+    @cached_property
+    def all_coloured(self) -> bool:
+        return bool(self.coloured.all())
+
+    @cached_property
+    def middle(self) -> Float[Tensor, "3"]:
+        """The median of the points by axis."""
+        return self.points.median(0).values
+
+    @cached_property
+    def basis(self) -> Float[Tensor, "p 3 6"]:
+        """Derivative of the points, in the camera's axes, by an update about their middle."""
+        turned = -skew(self.points - self.middle)
+        return torch.cat([torch.eye(3).to(turned).expand_as(turned), turned], dim=-1)
+
+    @cached_property
+    def squares(self) -> Float[Tensor, "p 36"]:
+        """``basis^T basis`` of each point: what an isotropic residual adds to the Hessian."""
+        return (self.basis.mT @ self.basis).flatten(1)
+
+    @cached_property
+    def pivot(self) -> Pivot:
+        """The middle of the points, about which updates turn."""
+        return Pivot.at_point(self.middle)
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Each measured point's nearest surfel and its offset from it, from each of h poses."""
+
+    index: Int[Tensor, "h p"]  # of the surfel
+    across: Float[Tensor, "h p"]  # metres out of its plane
+    normal: Float[Tensor, "h p 3"]  # world
+    along: Float[Tensor, "h p 3"]  # metres, the offset within the plane; world
+    beyond: Float[Tensor, "h p"]  # the part of that offset that lies beyond the surfel's own disc, 0 to 1
+    rotation: Float[Tensor, "h 3 3"]
+
+    @property
+    def squared(self) -> Float[Tensor, "h p"]:
+        """Squared distance from the surfel's disc (metres^2)."""
+        return self.across**2 + self.beyond**2 * (self.along**2).sum(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceCost:
+    """Mean over points of ``(1 - n) + w (1 - n a)``: n falls from 1 to 0 with the distance from the nearest surfel, a with
+    the difference between the colour there and the measured one.
+
+    Its normal equations are those of iteratively reweighted least squares: the gradient is exact, the Hessian positive
+    semidefinite.
+    """
+
+    surface: SurfaceMap
+    cloud: PointCloud
+    scales: PointScales
+
+    def __call__(self, T: SE3) -> NormalEquations:
+        scales, found = self.scales, self.correspondences(T)
+        near = geman_mcclure_inlier(found.squared, scales.distance)
+        weight = near**2 / scales.distance**2
+        if not scales.colour_weight:
+            return NormalEquations((1 - near).mean(-1).double(), *_distance_terms(found, self.cloud, weight))
+        difference, derivative = self.colour_differences(found)
+        alike = geman_mcclure_inlier((difference**2).sum(-1), scales.colour)
+        gradient, hessian = _distance_terms(found, self.cloud, weight * (1 + scales.colour_weight * alike))
+        colour_weight = scales.colour_weight * near * alike**2 / scales.colour**2
+        by_colour = _colour_terms(difference, derivative, colour_weight, found, self.cloud)
+        return NormalEquations(self._cost(near, alike), gradient + by_colour[0], hessian + by_colour[1])
+
+    def cost(self, T: SE3) -> Float[Tensor, "h"]:
+        """Return the cost without the time that derivatives take."""
+        near, alike = self.inliers(self.correspondences(T))
+        if not self.scales.colour_weight:
+            return (1 - near).mean(-1).double()
+        return self._cost(near, alike)
+
+    def inliers(self, found: Correspondences) -> tuple[Float[Tensor, "h p"], Float[Tensor, "h p"]]:
+        """Return how much of an inlier each point is, by its distance and by its colour."""
+        near = geman_mcclure_inlier(found.squared, self.scales.distance)
+        difference, _ = self.colour_differences(found)
+        return near, geman_mcclure_inlier((difference**2).sum(-1), self.scales.colour)
+
+    def residual_variance(self, T: SE3) -> Float[Tensor, "h"]:
+        """Return the weighted mean of the squared residuals, in units of their scales."""
+        found, scales = self.correspondences(T), self.scales
+        difference, _ = self.colour_differences(found)
+        squared = torch.stack(
+            [found.squared / scales.distance**2, (difference**2).sum(-1) / scales.colour**2]
+        )
+        near, alike = geman_mcclure_inlier(squared, 1.0)
+        weights = torch.stack([near**2, scales.colour_weight * near * alike**2])
+        total = (weights * squared).sum((0, -1))
+        return (total / weights.sum((0, -1)).clamp(min=1e-12)).double()
+
+    def correspondences(self, T: SE3) -> Correspondences:
+        """Match each point with its nearest surfel.
+
+        A point beside an edge lies in the plane of the surfel there, but not on the surfel; ``beyond`` accounts for it.
+        """
+        surface, points = self.surface, self.cloud.points
+        rotation, translation = T.rotation.to(points), T.translation.to(points)
+        world = points @ rotation.mT + translation[:, None]
+        index = surface.touch(world)
+        offset = world - surface.surfels.positions[index]
+        normal = surface.surfels.normals[index]
+        across = (offset * normal).sum(-1)
+        along = offset - across[..., None] * normal
+        length = torch.linalg.vector_norm(along, dim=-1)
+        beyond = (1 - SURFEL_RADIUS * surface.cell / length.clamp(min=1e-12)).clamp(min=0)
+        return Correspondences(index, across, normal, along, beyond, rotation)
+
+    def colour_differences(
+        self, found: Correspondences
+    ) -> tuple[Float[Tensor, "h p 3"], Float[Tensor, "h p 3 3"]]:
+        """Return the surface's colour at each point minus the measured one, and its derivative by place (channel by axis,
+        world).
+        """
+        gradient = self.surface.surfels.rgb_gradient[found.index]
+        change = (gradient @ found.along[..., None])[..., 0]
+        trusted = change.abs() < MOST_COLOUR_CHANGE
+        rgb = self.surface.surfels.rgb[found.index] + change.clamp(-MOST_COLOUR_CHANGE, MOST_COLOUR_CHANGE)
+        difference, gradient = rgb - self.cloud.rgb, gradient * trusted[..., None]
+        if self.cloud.all_coloured:
+            return difference, gradient
+        coloured = self.cloud.coloured[:, None]
+        return difference * coloured, gradient * coloured[..., None]
+
+    def _cost(self, near: Float[Tensor, "h p"], alike: Float[Tensor, "h p"]) -> Float[Tensor, "h"]:
+        return ((1 - near).mean(-1) + self.scales.colour_weight * (1 - near * alike).mean(-1)).double()
+
+
+def _cloud_of(view: View, count: int, generator: Generator) -> PointCloud:
+    depth = torch.zeros((0, 0)) if view.frame.depth is None else view.frame.depth.cpu()
+    measured = ((depth > 0) & depth.isfinite()).nonzero()
+    rows, columns = measured[torch.randperm(len(measured), generator=generator)[:count]].unbind(-1)
+    seen = observe(view, torch.stack([columns, rows], dim=-1), device="cpu")
+    return PointCloud(seen.points, seen.rgb, seen.origins, seen.coloured)
+
+
+def _cloud_of_rays(
+    depth_rays: Observations, views: tuple[View, ...], count: int, generator: Generator
+) -> PointCloud:
+    """Return points of rays in the last camera's frame, with the colours of the pixels at which views see them."""
+    some = depth_rays.drawn(count, generator, device="cpu")
+    rgb, coloured = torch.zeros_like(some.points), torch.zeros(len(some), dtype=torch.bool)
+    for view in views:
+        camera = view.frame.intrinsics
+        local = view.T_ref_camera.to(some.points).inverse().apply(some.points)
+        pixels = camera.project(local)
+        size = pixels.new_tensor([camera.width, camera.height])
+        seen = ((pixels >= 0) & (pixels < size)).all(-1)  # never where it is NaN, behind the camera
+        columns, rows = pixels[seen].long().unbind(-1)
+        rgb[seen] = view.frame.rgb.cpu()[rows, columns].to(rgb)
+        coloured |= seen
+    return PointCloud(some.points, rgb, some.origins, coloured)
+
+
+def _distance_terms(
+    found: Correspondences, cloud: PointCloud, weight: Float[Tensor, "h p"]
+) -> tuple[Tensor, Tensor]:
+    """Return the gradient and the Hessian of half the weighted squared distances.
+
+    A distance is split into one across the plane and one in all directions, ``n n^T + s (1 - n n^T) = (1 - s) n n^T + s``;
+    the derivative of s itself is left out.
+    """
+    count = len(cloud)
+    spread = weight * found.beyond
+    flat = weight - spread
+    normal = found.normal @ found.rotation  # in the camera's axes
+    rows = torch.cat(
+        [normal, torch.linalg.cross((cloud.points - cloud.middle).expand_as(normal), normal)], -1
+    )
+    hessian = (rows * flat[..., None]).mT @ rows + (spread @ cloud.squares).unflatten(-1, (6, 6))
+    pull = (weight * found.across)[..., None] * found.normal + spread[..., None] * found.along
+    return _gradient(pull, found, cloud) / count, (hessian / count).double()
+
+
+def _colour_terms(
+    error: Float[Tensor, "h p 3"], derivative: Float[Tensor, "h p 3 3"], weight: Tensor, found: Correspondences, cloud: PointCloud
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return the gradient and the Hessian of half the weighted squares of three residuals a point."""
+    count = len(cloud)
+    rows = ((derivative @ found.rotation[:, None]) @ cloud.basis).flatten(1, 2)
+    hessian = (rows * weight.repeat_interleave(3, dim=-1)[..., None]).mT @ rows
+    pull = weight[..., None] * (derivative.mT @ error[..., None])[..., 0]
+    return _gradient(pull, found, cloud) / count, (hessian / count).double()
+
+
+def _gradient(
+    pull: Float[Tensor, "h p 3"], found: Correspondences, cloud: PointCloud
+) -> Float[Tensor, "h 6"]:
+    """Return the sum over points of ``basis^T R^T pull``."""
+    local = (pull @ found.rotation).flatten(1)
+    return (local @ cloud.basis.reshape(-1, 6)).double()

@@ -1,0 +1,173 @@
+"""``Localizer``: a map made ready once, then called with frames."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.methods import METHODS, Method, find_method
+from bidnerf_core.localization.problem import SceneMap, rig
+from bidnerf_core.localization.result import Localization
+from bidnerf_core.observations import Observations
+from bidnerf_core.rendering import render
+from bidnerf_core.se3 import SE3
+
+WARM_UP_RAYS = 64
+
+Start = SE3 | Float[Tensor, "4 4"] | np.ndarray | Sequence[Sequence[float]]
+"""A pose T_world_camera: an ``SE3``, or a 4x4 matrix of any kind, by rows."""
+
+
+class Localizer:
+    """Finds the poses of frames in one map, by one method.
+
+    The map, the method and its settings are checked once, when the localizer is made. It keeps no state between calls, so
+    threads may share it; the same seed gives the same answer on the same machine.
+    """
+
+    def __init__(
+        self,
+        map: Any,
+        method: str = "auto",
+        config: Any = None,
+        device: torch.device | str | None = None,
+        warm_up: bool = True,
+    ) -> None:
+        """Prepare ``map`` for ``method``.
+
+        ``config``: an instance of the method's settings (``METHODS[method].config_type``), by default with its defaults.
+        ``device``: where the field computes, by default where it is; a field that lies elsewhere is copied. ``warm_up``:
+        do now what the first call would otherwise have to wait for. Raises ``InputError`` for what does not fit.
+        """
+        if not isinstance(map, SceneMap):
+            hint = (
+                "; load_map(folder) gives one"
+                if isinstance(map, str | bytes) or hasattr(map, "__fspath__")
+                else ""
+            )
+            raise InputError(f"Localizer: got a {type(map).__name__}, expected a Map{hint}")
+        self.method = method
+        self.map: SceneMap = map if device is None else _on_device(map, torch.device(device))
+        self.config = _checked_config(find_method(method), method, config)
+        if warm_up:
+            self._warm_up()
+
+    def __call__(
+        self,
+        query: Frame | View | Sequence[View],
+        start: Start | None = None,
+        depth_rays: Observations | None = None,
+        seed: int = 0,
+    ) -> Localization:
+        """Find T_world_camera of a frame, or of the last of several views.
+
+        ``query``: a frame, or views with known relative poses (``T_ref_camera`` in any common frame): a rig, or a window of
+        a sequence. ``start``: a guess at T_world_camera of the last view, which method ``auto`` does without.
+        ``depth_rays``: distances that another sensor measured, such as a lidar, in the frame of the last camera. Raises
+        ``InputError`` for a query that cannot be localized at all; a pose that is merely doubtful is returned, with an
+        ``outcome`` other than ``CONVERGED``.
+        """
+        problem = rig(self.map, _views(query), None if start is None else _pose(start), depth_rays)
+        return METHODS[self.method].run(problem, self.config, seed)
+
+    @torch.no_grad()
+    def _warm_up(self) -> None:
+        """Render some rays and compute what a surface derives once: threads, caches and lazy modules are then ready."""
+        bounds, field = self.map.bounds, self.map.field
+        device = next((p.device for p in getattr(field, "parameters", list)()), torch.device("cpu"))
+        middle = torch.tensor([bounds.lower, bounds.upper], device=device).mean(0)
+        directions = torch.nn.functional.normalize(
+            torch.randn((WARM_UP_RAYS, 3), generator=torch.Generator().manual_seed(0)), dim=-1
+        ).to(device)
+        render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
+        if self.map.surface is not None:
+            self.map.surface.warm_up()
+
+
+def _checked_config(method: Method, name: str, config: Any) -> Any:
+    if config is None:
+        return method.config_type()
+    if not isinstance(config, method.config_type):
+        expected, found = method.config_type.__name__, type(config).__name__
+        raise InputError(f"method {name!r} takes a {expected}, got a {found}")
+    return config
+
+
+def _on_device(map: SceneMap, device: torch.device) -> SceneMap:
+    """Return the map with its field on ``device``; the user's own is left where it is."""
+    field = map.field
+    if not isinstance(field, nn.Module):
+        raise InputError(
+            f"device {device}: the map's field is a {type(field).__name__}, expected an nn.Module"
+        )
+    here = next((p.device for p in field.parameters()), torch.device("cpu"))
+    if here == device:
+        return map
+    moved = copy.copy(map)
+    object.__setattr__(moved, "field", copy.deepcopy(field).to(device))
+    return moved
+
+
+def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
+    if isinstance(query, Frame):
+        return [View(query, SE3.identity())]
+    if isinstance(query, View):
+        return [query]
+    if isinstance(query, Sequence) and all(isinstance(item, View) for item in query):
+        return query
+    if isinstance(query, Sequence) and len(query) == 1 and isinstance(query[0], Frame):
+        return [View(query[0], SE3.identity())]
+    if isinstance(query, Sequence) and any(isinstance(item, Frame) for item in query):
+        raise InputError(
+            f"{len(query)} frames without relative poses, expected views: View(frame, T_ref_camera)"
+        )
+    raise InputError(
+        f"query is a {type(query).__name__}, expected a Frame (Frame.open reads a file, Frame.from_numpy takes an"
+        " array), a View, or a list of views"
+    )
+
+
+def _pose(start: Start) -> SE3:
+    """Return a start given in any form as a rigid transform; float64."""
+    if isinstance(start, SE3):
+        if start.translation.ndim > 1:
+            raise InputError(f"start holds {len(start.translation)} poses, expected one")
+        return start.to("cpu", torch.float64)
+    try:
+        matrix = torch.as_tensor(np.asarray(start, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"start is a {type(start).__name__}, expected an SE3 or a 4x4 matrix") from error
+    return pose_from_matrix(matrix, "start")
+
+
+def pose_from_matrix(matrix: Float[Tensor, "..."], what: str) -> SE3:
+    """Return T_world_camera of a homogeneous 4x4 matrix, by rows.
+
+    Raises ``InputError``, which begins with ``what``, for another shape, another last row than 0 0 0 1, and a rotation that
+    is not orthonormal.
+    """
+    if matrix.shape != (4, 4):
+        raise InputError(f"{what} has shape {tuple(matrix.shape)}, expected a 4x4 matrix T_world_camera")
+    last = matrix[3].tolist()
+    if not _is_last_row(last):
+        transposed = _is_last_row(matrix[:, 3].tolist())
+        hint = "; its last column is, so it is written by columns: transpose it" if transposed else ""
+        raise InputError(f"{what} has the last row {last}, expected [0, 0, 0, 1]{hint}")
+    pose = SE3.from_matrix(matrix.to(torch.float64))
+    if not bool(pose.is_rigid()):
+        raise InputError(
+            f"{what} is not a rigid transform, expected an orthonormal rotation of determinant 1"
+        )
+    return pose.normalized()
+
+
+def _is_last_row(numbers: Sequence[float]) -> bool:
+    return max(abs(a - b) for a, b in zip(numbers, (0.0, 0.0, 0.0, 1.0), strict=True)) <= 1e-6

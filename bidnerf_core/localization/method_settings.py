@@ -1,0 +1,137 @@
+"""Groups of settings that methods share, and the stages of coarse-to-fine methods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from bidnerf_core.localization.pivots import PivotName
+from bidnerf_core.localization.solvers.history import AnswerName
+from bidnerf_core.pixels import DrawerName
+from bidnerf_core.residuals import (
+    DEPTH_RESIDUALS,
+    Objective,
+    colour_term,
+    depth_term,
+    free_space_term,
+)
+from bidnerf_core.robust import Robust, RobustName
+from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
+
+
+@dataclass(frozen=True)
+class ColourSettings(Settings):
+    """The photometric term."""
+
+    colour_loss: RobustName = "huber"  # robust loss of colour differences
+    colour_scale: Positive = 0.1  # colour difference, in [0, 1], at which outliers begin
+
+    def robust(self, scale: float | None = None) -> Robust:
+        return Robust(self.colour_loss, self.colour_scale if scale is None else scale)
+
+
+@dataclass(frozen=True)
+class DepthSettings(Settings):
+    """The depth term, where depth was measured."""
+
+    depth_weight: NotNegative = 1.0  # lambda_d, beside the photometric term's 1
+    depth_loss: RobustName = "huber"  # robust loss of depth differences
+    depth_scale: Positive = 0.1  # depth difference, metres, at which outliers begin
+    depth_residual: Annotated[str, OneOf(DEPTH_RESIDUALS), EXPERT] = "distance"  # how depths are compared
+    depth_rays: Annotated[int, Range(0, 10**7), EXPERT] = 512  # drawn from a sensor with rays of its own
+    free_space_weight: Annotated[float, Range(0.0), EXPERT] = 0.0  # of matter in front of what was measured
+
+
+def objective_of(
+    colour: ColourSettings,
+    depth: DepthSettings | None,
+    colour_scale: float | None = None,
+    depth_scale: float | None = None,
+    miss_scales: float | None = None,
+) -> Objective:
+    """Return the objective of some settings; scales in place of theirs are those of a stage.
+
+    ``miss_scales``: what the depth residual of a ray is that meets nothing, in depth scales; None: the paper's.
+    """
+    terms = [colour_term(colour.robust(colour_scale))]
+    if depth is not None and (depth.depth_weight > 0 or depth.free_space_weight > 0):
+        scale = depth.depth_scale if depth_scale is None else depth_scale
+        robust = Robust(depth.depth_loss, scale)
+        miss = None if miss_scales is None else miss_scales * scale
+        terms.append(depth_term(robust, depth.depth_weight, DEPTH_RESIDUALS[depth.depth_residual], miss))
+        if depth.free_space_weight > 0:
+            terms.append(free_space_term(robust, depth.free_space_weight))
+    return Objective(tuple(terms))
+
+
+@dataclass(frozen=True)
+class AdamSettings(Settings):
+    """Adam's steps, and when they end."""
+
+    max_steps: Count = 200  # at most
+    learning_rate: Annotated[float, Above(0.0, 1e3)] = 0.01  # metres and radians a step, at first
+    decay: Annotated[float, Above(0.0, 1.0)] = 0.8  # factor on the learning rate ...
+    decay_steps: Count = 100  # ... after so many steps
+    stop_loss: NotNegative = (
+        0.0  # stop once the mean loss of 20 steps is below it (epsilon of Alg. 1); 0: never
+    )
+    stop_step: Annotated[float, Range(0.0), EXPERT] = (
+        0.0  # stop once the mean length of 20 steps is; 0: never
+    )
+    answer: Annotated[AnswerName, EXPERT] = (
+        "last"  # the last pose, or that after the 20 steps of least mean loss
+    )
+    converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
+
+
+@dataclass(frozen=True)
+class SpreadSettings(Settings):
+    """Poses about the start that are tried beside it."""
+
+    poses: Annotated[int, Range(1, 10**5)] = 32  # how many, the start among them; 1: the start alone
+    spread_translation: NotNegative = 0.3  # standard deviation along each axis of the camera, metres
+    spread_rotation: NotNegative = 0.12  # standard deviation about each, radians
+
+
+@dataclass(frozen=True)
+class RefinementSettings(Settings):
+    """Second-order steps on rendered rays."""
+
+    pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
+    pivot: Annotated[PivotName, EXPERT] = (
+        "scene"  # what an update turns about: middle of the scene, camera, world
+    )
+    exposure: bool = False  # estimate a gain and a bias of each colour channel
+    surface_sigma: NotNegative = 0.03  # metres by which the map's surfaces may be off, in coarse steps
+    least_weight: Annotated[float, Range(0.0, 0.999999), EXPERT] = 0.01  # samples below it have no derivative
+    stop_step: Annotated[float, Range(0.0), EXPERT] = 1e-4  # a stage ends at a shorter step (metres, radians)
+    window_samples: Annotated[int, Range(1, 10**4), EXPERT] = (
+        12  # within the depth window of a stage that has one
+    )
+
+
+@dataclass(frozen=True)
+class RenderedThresholds(Settings):
+    """What fresh rendered rays must show for an answer to be accepted."""
+
+    converged_inliers: NotNegative = 0.93  # share of the rays that render what was measured, at least
+    converged_step: NotNegative = 0.02  # length of the step that they ask for, at most (metres, radians)
+
+
+@dataclass(frozen=True)
+class RefinementStage:
+    """Some steps at one level of detail on one draw of rays; without steps, poses are only ranked."""
+
+    steps: int
+    rays: int  # a pose
+    keep: int = 1  # poses that the stage begins with: the best so far
+    level: int | None = None  # of the field: 0 is the coarsest, None the field itself
+    blur: int = 1  # observed colours are means over squares of so many pixels
+    colour_scale: float = 0.1  # colour difference at which outliers begin
+    depth_scale: float = 0.1  # depth difference, metres, at which outliers begin
+    surface_sigma: float = 0.0  # metres by which surfaces may be off: steep residuals count for less
+    window: float = 0.0  # metres about the measured depth that are sampled; 0: the whole ray
+    damping: float = 1e-3  # at first
+    centring: int = (
+        0  # times that each pose is first shifted to bring what it renders to the middle of what was measured
+    )

@@ -1,0 +1,126 @@
+"""Second-order refinement on rendered rays, for any differentiable field, from coarse to fine.
+
+Within a stage the rays stay the same, so that a step which does not lower the cost can be recognised and taken back; each
+stage draws its own. Poses are a batch axis: several are refined at once, and each stage goes on with the best of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
+from bidnerf_core.localization.covariance import sandwich_covariance
+from bidnerf_core.localization.method_settings import RefinementStage
+from bidnerf_core.localization.pivots import pivot
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.search.centring import centred
+from bidnerf_core.localization.solvers.history import History
+from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementResult:
+    """The best pose, and what rays show of it that it was not fitted to."""
+
+    T: SE3
+    loss: float  # by the measure of the last stage
+    inliers: float  # share of the rays that render what was measured
+    covariance: Float[
+        Tensor, "6 6"
+    ]  # of a right update at the camera: translation (metres), rotation (radians)
+    step: float  # length of the step that these rays ask for (metres, radians)
+    poses: SE3  # (steps + 1): the first pose given, then the best one after each step
+    losses: Float[Tensor, "s"]  # before each step
+
+
+def refine(
+    problem: Problem,
+    start: SE3,
+    stages: Sequence[RefinementStage],
+    settings: RenderedCostSettings,
+    generator: Generator,
+) -> RefinementResult:
+    """Refine poses (h), of which each stage takes the best; ``problem.start`` plays no part.
+
+    The answer is the best of the last two stages' poses on rays that neither was fitted to.
+    """
+    about = pivot(settings.refinement.pivot, replace(problem, start=start[0]))
+    history = History([start[0]])
+    T, ends = start, []
+    for stage in stages:
+        cost = settings.drawn(problem, stage, about, generator)
+        for _ in range(stage.centring):
+            T = centred(cost.field, cost.rays.observed, problem.bounds, T)
+        T = _ranked(cost, T, history) if stage.steps == 0 else _descended(cost, T[: stage.keep], history)
+        ends.append(T[0])
+    fresh = settings.drawn(problem, stages[-1], about, generator)
+    return _assessed(fresh, SE3.stack(ends[-2:]), history)
+
+
+@dataclass(frozen=True, eq=False)
+class FewSteps:
+    """Where a few steps from a pose led."""
+
+    poses: SE3  # (s + 1)
+    inliers: float  # share of the rays that render what was measured from the last of them
+
+
+def take_few_steps(
+    problem: Problem, start: SE3, stage: RefinementStage, settings: RenderedCostSettings, generator: Generator
+) -> FewSteps:
+    """Take up to ``stage.steps`` second-order steps from one pose that is nearly right, on one draw of rays.
+
+    It ends before a step that does not lower the cost. The last pose is assessed on the same rays and without derivatives,
+    at half of what ``refine`` costs.
+    """
+    about = pivot(settings.refinement.pivot, replace(problem, start=start))
+    cost = settings.drawn(problem, stage, about, generator)
+    poses, here = [start], cost.residuals(start[None])
+    for left in reversed(range(stage.steps)):
+        equations = here.normal_equations()
+        delta = equations.solve(torch.full_like(equations.cost, stage.damping))
+        trial = about.moved(poses[-1][None], delta)
+        there = cost.residuals(trial, derivatives=left > 0)
+        if not bool(there.cost()[0] < equations.cost[0]):
+            break
+        poses.append(trial[0])
+        here = there
+    return FewSteps(SE3.stack(poses), float(here.inliers()[0]))
+
+
+def _ranked(cost: RenderedCost, T: SE3, history: History) -> SE3:
+    costs = cost.cost(T)
+    order = costs.argsort()
+    history.poses.append(T[order[0]])
+    history.losses.append(float(costs[0]) / 2)
+    return T[order]
+
+
+def _descended(cost: RenderedCost, T: SE3, history: History) -> SE3:
+    stage = cost.stage
+    found = descend(cost, T, stage.steps, cost.pivot.moved, stage.damping, cost.settings.stop_step)
+    history.add_batch(found.poses, found.costs)
+    return found.T[found.equations.cost.argsort()].normalized()
+
+
+def _assessed(cost: RenderedCost, T: SE3, history: History) -> RefinementResult:
+    residuals = cost.residuals(T)
+    equations = residuals.normal_equations()
+    best = int(equations.cost.argmin())
+    history.poses[-1] = T[best]
+    covariance = sandwich_covariance(residuals.scores(), equations.hessian)[best]
+    return RefinementResult(
+        T=T[best],
+        loss=float(equations.cost[best]) / 2,
+        inliers=float(residuals.inliers()[best]),
+        covariance=cost.pivot.at_camera(T[best], covariance),
+        step=float(torch.linalg.vector_norm(equations.solve(torch.zeros_like(equations.cost))[best])),
+        poses=SE3.stack(history.poses),
+        losses=torch.tensor(history.losses, dtype=torch.float64),
+    )

@@ -1,0 +1,104 @@
+"""Search by colour alone: small renderings of the map, ever larger and of ever fewer poses, against the query's images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.frames import View
+from bidnerf_core.localization.costs.images import ColourScales, ImageCost
+from bidnerf_core.localization.costs.thumbnails import Thumbnail, thumbnail
+from bidnerf_core.localization.costs.view_renderers import FieldRenderer, SurfaceRenderer, ViewRenderer
+from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.casting import Cast, cast
+from bidnerf_core.se3 import SE3
+
+APART, TURNED = 0.15, math.radians(20)
+"""Share of the extent, and radians, from which on two poses are different answers: farther than one step has to go."""
+OPEN = 0.2
+"""Share of the keyframes' rays that meet nothing, from which on the map counts as having a background."""
+
+
+@dataclass(frozen=True)
+class ImageStage:
+    """Some steps of the poses that are left."""
+
+    width: int  # pixels of the longer side of thumbnails
+    steps: int
+    keep: int
+
+
+STAGES = (
+    ImageStage(16, 0, 48),
+    ImageStage(16, 8, 12),
+    ImageStage(24, 8, 4),
+    ImageStage(48, 8, 2),
+    ImageStage(96, 5, 2),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSearch:
+    """Compares a query's images with renderings of a map from many poses."""
+
+    views: Sequence[View]
+    renderer: ViewRenderer
+    middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of what it sees
+    extent: float  # metres: size of the scene
+    has_background: bool
+    scales: ColourScales = field(default_factory=ColourScales)
+
+    @staticmethod
+    def on_surface(problem: Problem, surface: SurfaceMap) -> ImageSearch:
+        """Search on a baked surface. Keyframes show how far away things are and whether there is a background."""
+        seen = _from_keyframes(surface, thumbnail(problem.views[-1], 16))
+        away = float(seen.along[seen.met].median()) if bool(seen.met.any()) else surface.extent
+        has_background = float(seen.met.float().mean()) < 1 - OPEN
+        renderer = SurfaceRenderer(surface, problem.bounds.background if has_background else None)
+        middle = torch.tensor([0.0, 0.0, away])
+        return ImageSearch(problem.views, renderer, middle, surface.extent, has_background)
+
+    @staticmethod
+    def in_field(problem: Problem, start: SE3) -> ImageSearch:
+        """Search in a field's coarsest level. A rendering from the start shows how far away things are."""
+        renderer = FieldRenderer(problem.level(0), problem.bounds, problem.device)
+        small = thumbnail(problem.views[-1], 16)
+        T = start.to(small.flat)
+        directions = T.rotate(torch.nn.functional.normalize(small.flat, dim=-1))
+        away = float(renderer(T.translation.expand_as(directions), directions).along.median())
+        extent = float(torch.linalg.vector_norm(torch.tensor(problem.bounds.size)))
+        return ImageSearch(problem.views, renderer, torch.tensor([0.0, 0.0, away]), extent, True)
+
+    def __call__(self, T: SE3, stages: Sequence[ImageStage] = STAGES) -> SearchResult:
+        """Search from the hypotheses T (h)."""
+        distinct = Distinct(self.middle, APART * self.extent, TURNED)
+        return search(T, self._stages(stages), distinct, keep_runner_up=True)
+
+    def thumbnails(self, width: int) -> list[Thumbnail]:
+        return [thumbnail(view, width) for view in self.views]
+
+    @property
+    def pivot(self) -> Pivot:
+        return Pivot.at_point(self.middle)
+
+    def _stages(self, stages: Sequence[ImageStage]) -> Iterator[SearchStage]:
+        for stage in stages:
+            cost = ImageCost(self.renderer, self.thumbnails(stage.width), self.scales, self.middle)
+            yield SearchStage(cost, self.pivot, stage.steps, stage.keep, damping=1e-2)
+
+
+def _from_keyframes(surface: SurfaceMap, small: Thumbnail, most: int = 16) -> Cast:
+    """Return what a thumbnail's rays meet from some of the keyframes."""
+    every = max(1, len(surface.keyframes) // most)
+    keyframes = SE3.from_matrix(surface.keyframes[::every]).to(small.flat)
+    directions = torch.nn.functional.normalize(small.flat, dim=-1) @ keyframes.rotation.mT
+    origins = keyframes.translation[:, None].expand_as(directions)
+    return cast(surface, origins.reshape(-1, 3), directions.reshape(-1, 3))

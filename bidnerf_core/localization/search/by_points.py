@@ -1,0 +1,87 @@
+"""Search by measured depth: points of the query aligned with the baked surface."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
+from bidnerf_core.localization.covariance import FINEST
+from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
+from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_points
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.se3 import SE3
+
+JUDGED = 0.02
+"""Scale of distances at which poses are compared, as a share of the scene's extent."""
+COMPARED_POINTS = 200
+"""Points on which they are compared, at least."""
+APART, TURNED = 0.05, math.radians(10)
+"""Share of the extent, and radians, from which on two poses are different answers."""
+
+
+@dataclass(frozen=True)
+class PointStage:
+    """Some steps of all poses that are left."""
+
+    points: int
+    steps: int
+    keep: int
+    distance: float  # scale of distances as a share of the scene's extent; 0: the finest
+    colour_weight: float
+
+
+# Colour has no weight at first: its derivatives reach no farther than a surfel, and from afar only hold a pose back.
+STAGES = (
+    PointStage(48, 0, 96, 0.3, 0.0),
+    PointStage(48, 8, 24, 0.3, 0.0),
+    PointStage(100, 10, 6, 0.2, 0.0),
+    PointStage(400, 6, 2, 0.05, 0.1),
+    PointStage(2000, 4, 1, 0.0, 1.0),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PointSearch:
+    """Aligns measured points with a surface, from hypotheses all over the scene."""
+
+    surface: SurfaceMap
+    cloud: PointCloud
+
+    def __call__(self, start: SE3 | None, count: int, generator: Generator) -> SearchResult:
+        """Search once, from ``count`` fresh hypotheses."""
+        return self.from_poses(hypotheses_for_points(self.surroundings, start, count, generator))
+
+    def from_poses(self, T: SE3, stages: tuple[PointStage, ...] = STAGES) -> SearchResult:
+        """Search from the hypotheses T (h)."""
+        apart = APART * self.surface.extent
+        return search(
+            T, self._stages(stages), Distinct(self.cloud.middle, apart, TURNED), keep_runner_up=False
+        )
+
+    @property
+    def surroundings(self) -> Surroundings:
+        surface = self.surface
+        middle = surface.surfels.positions.median(0).values
+        return Surroundings(SE3.from_matrix(surface.keyframes), surface.extent, middle, self.cloud.middle)
+
+    def judge(self, points: int | None = None) -> SurfaceCost:
+        """Return the cost at the one scale by which poses are compared, of the first ``points``."""
+        cloud = self.cloud if points is None else self.cloud.first(points)
+        return SurfaceCost(self.surface, cloud, PointScales(JUDGED * self.surface.extent))
+
+    def score(self, T: SE3) -> Float[Tensor, "h"]:
+        """Return what poses are compared by, between 0 and 2."""
+        return self.judge().cost(T)
+
+    def _stages(self, stages: tuple[PointStage, ...]) -> Iterator[SearchStage]:
+        for stage in stages:
+            some = self.cloud.first(stage.points)
+            distance = stage.distance * self.surface.extent or FINEST * self.surface.cell
+            cost = SurfaceCost(self.surface, some, PointScales(distance, colour_weight=stage.colour_weight))
+            score = self.judge(max(stage.points, COMPARED_POINTS)).cost if stage.steps else None
+            yield SearchStage(cost, some.pivot, stage.steps, stage.keep, damping=1e-4, score=score)

@@ -1,0 +1,97 @@
+"""Successive halving: from many poses to one, by ever finer costs of ever fewer poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.localization.normal_equations import Cost
+from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class SearchStage:
+    """Some steps of all poses that are left, of which the best are kept."""
+
+    cost: Cost
+    pivot: Pivot
+    steps: int
+    keep: int
+    damping: float  # at first
+    # What poses are compared by after the steps; None: the cost.
+    score: Callable[[SE3], Float[Tensor, "h"]] | None = None
+
+
+@dataclass(frozen=True)
+class Distinct:
+    """When two poses are different answers, rather than two stages of one descent."""
+
+    middle: Float[Tensor, "3"]  # what is seen, metres, last camera's frame
+    distance: float  # metres between where the poses put it, from which on they are different
+    angle: float  # radians between them, likewise
+
+    def __call__(self, T: SE3) -> Bool[Tensor, "h"]:
+        """Return which of the poses are different from the first."""
+        middles = T.apply(self.middle.double())
+        away = torch.linalg.vector_norm(middles - middles[0], dim=-1) > self.distance
+        trace = (T.rotation[0].mT @ T.rotation).diagonal(dim1=-2, dim2=-1).sum(-1)
+        return away | (trace < 1 + 2 * math.cos(self.angle))
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """The poses that were left, and how much better the best is than any different one."""
+
+    T: SE3  # (h), best first
+    scores: Float[Tensor, "h"]
+    margin: float  # score of the best different pose less that of the best; infinite where there was none
+    path: SE3  # (s + 1): from the winning hypothesis to the best pose
+    losses: Float[Tensor, "s"]  # of the path before each step; costs of different stages do not compare
+
+
+def search(
+    start: SE3, stages: Iterable[SearchStage], distinct: Distinct, keep_runner_up: bool
+) -> SearchResult:
+    """Thin out the hypotheses ``start`` (h).
+
+    ``keep_runner_up``: if the best poses of a stage are all one answer, the last of them makes room for a different one,
+    and the last stage tells the margin; otherwise the last stage tells it that had different poses.
+    """
+    T, paths, margin = start, [start[None]], math.inf
+    losses = [torch.zeros((0, len(start.translation)), dtype=torch.float64)]
+    scores = losses[0]
+    for stage in stages:
+        done = descend(stage.cost, T, stage.steps, stage.pivot.moved, stage.damping)
+        scores = done.equations.cost if stage.score is None else stage.score(done.T)
+        best = _best(done.T, scores, stage.keep, distinct if keep_runner_up else None)
+        paths = [path[:, best] for path in (*paths, done.poses[1:])]
+        losses = [values[:, best] for values in (*losses, done.costs[:-1])]
+        T, compared = done.T[best], best if keep_runner_up else scores.argsort()
+        if stage.steps:
+            now = _margin(done.T[compared], scores[compared], distinct)
+            margin = now if keep_runner_up or math.isfinite(now) else margin
+        scores = scores[best]
+    path = SE3.cat([path[:, 0] for path in paths])
+    return SearchResult(T, scores, margin, path, torch.cat([values[:, 0] for values in losses]))
+
+
+def _best(T: SE3, scores: Float[Tensor, "h"], count: int, distinct: Distinct | None) -> Int[Tensor, "k"]:
+    order = scores.argsort()
+    best = order[:count]
+    if distinct is None or count == 1 or bool(distinct(T[best]).any()):
+        return best
+    others = order[distinct(T[order])]
+    return torch.cat([best[:-1], others[:1]]) if len(others) else best
+
+
+def _margin(T: SE3, scores: Float[Tensor, "h"], distinct: Distinct) -> float:
+    """Return by how much the best different pose is worse than the first; poses come best first."""
+    others = scores[distinct(T)]
+    return float(others.min() - scores[0]) if len(others) else math.inf

@@ -1,0 +1,148 @@
+"""Settings as frozen dataclasses, with the range of each beside its field, and the flat names by which users set them.
+
+A method's settings are composed of small groups that several methods share (`Annotated` fields of nested dataclasses). On
+the command line and in JSON all of them have flat names, ``{"rays": 512, "depth_weight": 3}``: a name occurs once in a
+method, whatever group it stands in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+import math
+import typing
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeVar
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.serialization import from_plain, to_plain
+
+S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Range:
+    """The values that a setting may take: ``least`` to ``most``, both included."""
+
+    least: float
+    most: float = math.inf
+
+    def __contains__(self, value: float) -> bool:
+        return math.isfinite(value) and self.least <= value <= self.most
+
+    def __str__(self) -> str:
+        return (
+            f"a number from {self.least:,} up"
+            if self.most == math.inf
+            else f"{self.least:,} to {self.most:,}"
+        )
+
+
+@dataclass(frozen=True)
+class Above(Range):
+    """The values that a setting may take: more than ``least``, and ``most`` at most."""
+
+    def __contains__(self, value: float) -> bool:
+        return super().__contains__(value) and value != self.least
+
+    def __str__(self) -> str:
+        return f"more than {self.least:,}" + ("" if self.most == math.inf else f", at most {self.most:,}")
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """The names that a setting may take, where they are those of a table that users may extend."""
+
+    table: typing.Mapping[str, Any]
+
+    def __contains__(self, value: str) -> bool:
+        return value in self.table
+
+    def __str__(self) -> str:
+        return f"one of {', '.join(self.table)}"
+
+
+@dataclass(frozen=True)
+class Expert:
+    """Marks a setting that ``--help`` leaves out and ``--help-all`` shows."""
+
+
+EXPERT = Expert()
+
+Count = Annotated[int, Range(1, 10**7)]
+NotNegative = Annotated[float, Range(0.0)]
+Positive = Annotated[float, Above(0.0, 1e6)]
+
+
+class Settings:
+    """A base of frozen dataclasses that checks each field against the range or the names beside it.
+
+    Raises ``InputError``, with the setting's name, its value and what was expected, as soon as an instance is made.
+    """
+
+    def __post_init__(self) -> None:
+        for name, allowed in _allowed(type(self)).items():  # type: ignore[arg-type]
+            value = getattr(self, name)
+            if value is not None and value not in allowed:
+                raise InputError(f"{name} is {value}, expected {allowed}")
+
+
+@functools.cache
+def _allowed(kind: Any) -> dict[str, Any]:
+    """Return what is allowed for each field of ``kind`` that limits its values."""
+    found: dict[str, Any] = {}
+    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
+        for part in (hint, *typing.get_args(hint)):
+            if typing.get_origin(part) is typing.Literal:
+                found[name] = OneOf(dict.fromkeys(typing.get_args(part)))
+            for note in getattr(part, "__metadata__", ()):
+                if isinstance(note, Range | OneOf):
+                    found[name] = note
+    return found
+
+
+def is_expert(kind: type, name: str) -> bool:
+    """Return whether a field of ``kind`` is marked as one for experts."""
+    hint = typing.get_type_hints(kind, include_extras=True)[name]
+    return any(isinstance(note, Expert) for note in getattr(hint, "__metadata__", ()))
+
+
+def to_flat(settings: Any) -> dict[str, Any]:
+    """Return all settings by their flat names, as values that JSON can hold."""
+    flat: dict[str, Any] = {}
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        flat |= (
+            to_flat(value) if dataclasses.is_dataclass(value) else {field.name: to_plain(value, field.name)}
+        )
+    return flat
+
+
+def from_flat(kind: type[S], values: dict[str, Any], where: str, renamed: dict[str, str] | None = None) -> S:
+    """Return an instance of the settings ``kind`` with ``values`` by flat name in place of its defaults.
+
+    ``renamed`` maps names of earlier versions to today's. Raises ``InputError``, which begins with ``where``, for an
+    unknown name, a value of another type than declared, and a value out of range.
+    """
+    default = kind()
+    known = to_flat(default)
+    given = {(renamed or {}).get(name, name): value for name, value in values.items()}
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f", did you mean {near[0]!r}?" if near else f", expected some of {', '.join(known)}"
+            raise InputError(f"{where}: {kind.__name__} has no setting {name!r}{hint}")
+    return from_plain(kind, _nested(default, given), where)
+
+
+def _nested(default: Any, flat: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of ``flat``, else those of ``default``, in the groups in which the settings are declared."""
+    nested: dict[str, Any] = {}
+    for field in dataclasses.fields(default):
+        value = getattr(default, field.name)
+        if dataclasses.is_dataclass(value):
+            nested[field.name] = _nested(value, flat)
+        else:
+            nested[field.name] = flat.get(field.name, to_plain(value, field.name))
+    return nested
