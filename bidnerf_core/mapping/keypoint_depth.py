@@ -57,38 +57,45 @@ def depth_noise(
 
 def placed(
     observations: Observations, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
-) -> tuple[Observations, Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Mean of the back-projected points of each track, without those that disagree, and its deviation (metres).
+) -> tuple[Observations, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """Weighted mean of the back-projected points of each track without those that disagree, and its covariance.
 
     ``depth`` is what was measured at each observation, 0 where nothing was; ``relative`` its noise as a share.
     Tracks most of whose depths disagree are dropped.
     """
-    observations, depth = observations[depth > 0], depth[depth > 0]
-    observations, _ = observations.compacted()
-    sightings = observations.sightings
+    observations, _ = observations[depth > 0].compacted()
+    sightings, depth = observations.sightings, depth[depth > 0]
     ray = torch.cat([sightings.image, torch.ones_like(sightings.image[:, :1])], dim=-1) * depth[:, None]
     world = (sightings.rotation.mT @ ray[..., None])[..., 0] + sightings.centre
-    deviation = depth * (relative**2 + (pixel_noise / sightings.focal) ** 2) ** 0.5
-    mean = _weighted(world, deviation**-2, observations.point)
-    off = torch.linalg.vector_norm(world - mean[observations.point], dim=-1)
-    agree = off <= APART * deviation
+    information = _information(sightings, depth, relative, pixel_noise)
+    mean, _ = _weighted(world, information, observations.point)
+    off = (world - mean[observations.point])[..., None]
+    agree = (off.mT @ information @ off)[:, 0, 0] <= APART**2
     tracks = torch.bincount(observations.point)
     majority = 2 * torch.bincount(observations.point[agree], minlength=len(tracks)) > tracks
     kept = agree & majority[observations.point]
     observations, _ = observations[kept].compacted()
-    positions = _weighted(world[kept], deviation[kept] ** -2, observations.point)
-    weight = _weight(deviation[kept] ** -2, observations.point)
-    return observations, positions, weight**-0.5
+    return observations, *_weighted(world[kept], information[kept], observations.point)
 
 
-def _weight(weight: Float[Tensor, "m"], point: Int[Tensor, "m"]) -> Float[Tensor, "n"]:
-    count = int(point.max()) + 1 if len(point) else 0
-    return torch.zeros(count, dtype=weight.dtype).index_add_(0, point, weight)
+def _information(
+    sightings: Sightings, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
+) -> Float[Tensor, "m 3 3"]:
+    """Inverse covariance of back-projected points: of the depth along the ray, of the keypoint across it."""
+    d = sightings.directions()
+    along = d[:, :, None] * d[:, None]
+    across = torch.eye(3, dtype=d.dtype) - along
+    sideways = (pixel_noise * depth / sightings.focal) ** -2
+    return along * ((relative * depth) ** -2)[:, None, None] + across * sideways[:, None, None]
 
 
 def _weighted(
-    values: Float[Tensor, "m 3"], weight: Float[Tensor, "m"], point: Int[Tensor, "m"]
-) -> Float[Tensor, "n 3"]:
-    total = _weight(weight, point)
-    summed = torch.zeros((len(total), 3), dtype=values.dtype).index_add_(0, point, values * weight[:, None])
-    return summed / total[:, None]
+    values: Float[Tensor, "m 3"], information: Float[Tensor, "m 3 3"], point: Int[Tensor, "m"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """Weighted mean by point, and its covariance."""
+    count = int(point.max()) + 1 if len(point) else 0
+    total = torch.zeros((count, 3, 3), dtype=values.dtype).index_add_(0, point, information)
+    weighted = (information @ values[..., None])[..., 0]
+    summed = torch.zeros((count, 3), dtype=values.dtype).index_add_(0, point, weighted)
+    covariance = torch.linalg.inv(total)
+    return (covariance @ summed[..., None])[..., 0], covariance

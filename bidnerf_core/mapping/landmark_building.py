@@ -99,13 +99,12 @@ def _located(observations: Observations, depth: Float[Tensor, "m"], config: Land
     kept, positions, covariance = _triangulated(observations[tracked], radians(config.parallax))
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
-    deviations = pixel_noise * torch.linalg.eigvalsh(covariance)[:, -1].clamp(min=0).sqrt()
-    triangulated = fused(kept, positions, deviations, pixel_noise)
+    triangulated = fused(kept, positions, pixel_noise**2 * covariance, pixel_noise)
     relative = depth_noise(sightings, positions, depth[kept.number])
     left = torch.ones_like(tracked).index_fill_(0, kept.number, False)
     left &= tracked | config.singles
-    rest, positions, deviations = placed(observations[left], depth[left], relative, pixel_noise)
-    return concatenated([triangulated, fused(rest, positions, deviations, pixel_noise)])
+    rest, positions, covariance = placed(observations[left], depth[left], relative, pixel_noise)
+    return concatenated([triangulated, fused(rest, positions, covariance, pixel_noise)])
 
 
 def _triangulated(

@@ -62,10 +62,10 @@ class Observations:
 def fused(
     observations: Observations,
     positions: Float[Tensor, "n 3"],
-    deviations: Float[Tensor, "n"],
+    covariance: Float[Tensor, "n 3 3"],
     noise: float,
 ) -> LandmarkMap:
-    """Landmarks at ``positions`` (metres, world); every one of them has an observation."""
+    """Landmarks at ``positions`` (metres, world) with their covariance; every one of them has an observation."""
     count, sightings = len(positions), observations.sightings
     away = sightings.centre - positions[sightings.point]
     towards = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
@@ -76,7 +76,7 @@ def fused(
     metres = observations.sizes * sightings.in_camera(positions)[:, 2].clamp(min=0) / sightings.focal
     return LandmarkMap(
         positions.float(),
-        deviations.float(),
+        _across_and_along(covariance, directions).float(),
         _mean_descriptors(observations.descriptors, sightings.point, count),
         directions.float(),
         least.acos().float(),
@@ -84,6 +84,15 @@ def fused(
         torch.bincount(sightings.point, minlength=count).int(),
         noise,
     )
+
+
+def _across_and_along(
+    covariance: Float[Tensor, "n 3 3"], directions: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 2"]:
+    """Standard deviations: the mean one across a direction, and the one along it."""
+    along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
+    across = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along) / 2
+    return torch.stack([across, along], dim=-1).clamp(min=0).sqrt()
 
 
 def _mean_descriptors(

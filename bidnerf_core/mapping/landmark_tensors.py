@@ -11,7 +11,7 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 
 KINDS = {
     "positions": ((-1, 3), torch.float32),
-    "deviations": ((-1,), torch.float32),
+    "deviations": ((-1, 2), torch.float32),
     "descriptors": ((-1, -1), torch.uint8),
     "directions": ((-1, 3), torch.float32),
     "cones": ((-1,), torch.float32),

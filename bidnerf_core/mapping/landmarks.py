@@ -14,7 +14,7 @@ class LandmarkMap:
     """Points of the world frame (metres) with descriptors, on the CPU."""
 
     positions: Float[Tensor, "n 3"]
-    deviations: Float[Tensor, "n"]  # metres: standard deviation of a position along its least certain axis
+    deviations: Float[Tensor, "n 2"]  # metres: standard deviation of a position across and along ``directions``
     descriptors: UInt8[Tensor, "n d"]  # mean over the views; see ``mapping.features``
     directions: Float[Tensor, "n 3"]  # unit, from the landmark towards the middle of the cameras that saw it
     cones: Float[Tensor, "n"]  # radians: greatest angle between ``directions`` and such a camera
