@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from bidnerf_core.datasets.dataset import Background, Dataset, ReadingProgress
+from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.transforms import TransformsReader
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError
+from bidnerf_core.images import Background
 
 __all__ = [
     "READERS",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,13 +11,8 @@ from typing import Protocol, TypeAlias, runtime_checkable
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 
-Background: TypeAlias = str | Sequence[float]
-"""What a user may write: "white", "black" or an rgb triple in [0, 1]."""
-
 ReadingProgress: TypeAlias = Callable[[int, int], None]
 """Told (frames read, frames asked for) after each frame."""
-
-NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 @runtime_checkable
@@ -54,19 +48,6 @@ class Dataset(Protocol):
         Raises ``InputError`` for an unknown split or frame, and for a file that is missing or not usable.
         """
         ...
-
-
-def background_colour(background: Background) -> tuple[float, float, float]:
-    """The rgb triple that ``background`` stands for."""
-    expected = 'expected "white", "black" or three numbers in [0, 1]'
-    if isinstance(background, str):
-        if background not in NAMED_BACKGROUNDS:
-            raise InputError(f"background is {background!r}, {expected}")
-        return NAMED_BACKGROUNDS[background]
-    values = tuple(float(value) for value in background)
-    if len(values) != 3 or not all(math.isfinite(value) and 0 <= value <= 1 for value in values):
-        raise InputError(f"background is {values}, {expected}")
-    return values[0], values[1], values[2]
 
 
 def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], where: str) -> list[int]:

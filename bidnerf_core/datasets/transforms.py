@@ -18,18 +18,12 @@ from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
-from bidnerf_core.datasets.dataset import (
-    Background,
-    Dataset,
-    ReadingProgress,
-    background_colour,
-    positions,
-    unique_names,
-)
-from bidnerf_core.datasets.images import over, read_depth, read_image
+from bidnerf_core.datasets.dataset import Dataset, ReadingProgress, positions, unique_names
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
+from bidnerf_core.depth_images import read_depth
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.images import Background, background_colour, over, read_header, read_image
 
 TRIED_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 
@@ -102,9 +96,10 @@ class TransformsDataset:
 
     def _view(self, frame: FrameRecord, name: str) -> View:
         path = self._image_file(frame)
+        header = read_header(path)
+        width, height = header.width, header.height
+        self._check_size(frame, path, width, height)  # before the pixels take memory
         colour, alpha = read_image(path)
-        height, width = colour.shape[:2]
-        self._check_size(frame, path, width, height)
         depth = None
         if frame.depth_path is not None:
             depth = read_depth(self._depth_file(frame), frame.depth_unit)
@@ -148,6 +143,6 @@ class TransformsDataset:
 
     def _has_alpha(self, split: str) -> bool:
         try:
-            return read_image(self._image_file(self._frames[split][0]))[1] is not None
+            return read_header(self._image_file(self._frames[split][0])).has_alpha
         except InputError:  # whoever asks for that frame will hear of it; others may do without
             return False

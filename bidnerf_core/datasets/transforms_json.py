@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.datasets.cameras import CameraRecord, camera_record, pose
-from bidnerf_core.datasets.records import Record, read_record
+from bidnerf_core.camera_records import CameraRecord, camera_record
+from bidnerf_core.datasets.poses import pose
 from bidnerf_core.errors import InputError
+from bidnerf_core.images import IMAGE_SUFFIXES
+from bidnerf_core.records import Record, read_record
 from bidnerf_core.se3 import SE3
 
 SPLITS = ("train", "val", "test")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 HOLD_OUT_EVERY = 8
 METRES_PER_DEPTH_UNIT = 0.001
 

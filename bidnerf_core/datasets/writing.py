@@ -18,7 +18,7 @@ from bidnerf_core.frames import Frame, View
 
 OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # of camera axes: y and z turn round
 LENS = ("k1", "k2", "p1", "p2", "k3")
-LARGEST = 65535
+LARGEST = 65534  # readers take the largest number of 16 bits for "not measured"
 
 
 def write_transforms(
