@@ -103,7 +103,7 @@ def find_camera(
 
 
 def _described(camera: Intrinsics, origin: str) -> CameraSource:
-    return CameraSource(camera, f"{origin}: fx {camera.fx:.0f} px ({MIDDLE})")
+    return CameraSource(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
 
 
 def _fitted(where: str, raster: Raster, given: Intrinsics, origin: str) -> CameraSource:
@@ -113,7 +113,11 @@ def _fitted(where: str, raster: Raster, given: Intrinsics, origin: str) -> Camer
         raise InputError(
             f"{where}: image is {size}, its camera is for {given.width}x{given.height}; expected one of the same aspect ratio"
         )
-    return CameraSource(fitted, f"{origin}: fx {fitted.fx:.0f} px")
+    return CameraSource(fitted, f"{origin}: {_focal(fitted)}")
+
+
+def _focal(camera: Intrinsics) -> str:
+    return f"fx {camera.fx:.0f} px at {camera.width}x{camera.height}"
 
 
 def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
