@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Shaped
 from PIL import Image
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
@@ -147,12 +148,18 @@ def background_colour(background: Background) -> tuple[float, float, float]:
 
 def reduced(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "nh nw *c"]:
     """Reduce an image to a smaller size; each new pixel is the mean over the area that it covers."""
-    flat = image.reshape(*image.shape[:2], -1)
-    bands = [
-        np.asarray(Image.fromarray(flat[..., i].numpy()).resize((width, height), Image.Resampling.BOX))
-        for i in range(flat.shape[-1])
-    ]
-    return torch.from_numpy(np.stack(bands, axis=-1)).reshape(height, width, *image.shape[2:])
+    rows = _area_weights(image.shape[0], height) @ image.reshape(image.shape[0], -1).numpy()
+    columns = rows.reshape(height, image.shape[1], -1).swapaxes(0, 1).reshape(image.shape[1], -1)
+    small = (_area_weights(image.shape[1], width) @ columns).reshape(width, height, *image.shape[2:])
+    return torch.from_numpy(small.swapaxes(0, 1).copy())
+
+
+def _area_weights(old: int, new: int) -> csr_array:
+    """Return (new, old): which part of each new pixel along an axis lies in each old one."""
+    edges = np.union1d(np.arange(old + 1), np.linspace(0, old, new + 1))
+    middles, lengths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+    places = ((middles * new / old).astype(int), middles.astype(int))
+    return csr_array(((lengths * new / old).astype(np.float32), places), shape=(new, old))
 
 
 def resampled(image: Shaped[Tensor, "h w"], width: int, height: int) -> Shaped[Tensor, "nh nw"]:

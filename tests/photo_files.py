@@ -10,11 +10,10 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 
-def write_photo(path: Path, pixels: np.ndarray, orientation: int | None = None, **tags: Any) -> Path:
+def write_photo(path: Path, pixels: np.ndarray, orientation: int = 1, **tags: Any) -> Path:
     """Write an image with EXIF tags by their names in ``PIL.ExifTags.Base``."""
     exif = Image.Exif()
-    if orientation is not None:
-        exif[Base.Orientation] = orientation
+    exif[Base.Orientation] = orientation  # without a tag of its own, Pillow writes no EXIF at all
     inner = exif.get_ifd(IFD.Exif)
     for name, value in tags.items():
         inner[Base[name]] = value

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import open_binary
 from bidnerf_core.se3 import SE3
 
 Item = TypeVar("Item")
@@ -221,7 +222,5 @@ def _lines(path: Path) -> list[str]:
 
 
 def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    with open_binary(path, "a file of a COLMAP sparse model") as file:
+        return file.read()

@@ -1,4 +1,4 @@
-"""Files of points that a sensor measured."""
+"""Files of points that a depth sensor measured."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import open_binary
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
@@ -16,12 +17,12 @@ EXPECTED = "expected n rows of x, y, z in metres"
 
 
 def read_depth_points(path: Path) -> Observations:
-    """Points (metres, OpenCV axes) as depth rays of the camera's frame.
+    """Read points (metres, OpenCV axes) as depth rays in the camera's frame.
 
-    Text (.txt, .csv, .xyz: rows of x, y, z, separated by commas or blanks; what follows on a row is not read, and ``#``
-    begins a comment) or .npy holds points of the camera's frame, seen from the camera. A .npz holds ``points`` and, for a
-    sensor of its own such as a lidar, ``T_camera_sensor`` (4x4): the points are then in the sensor's frame. Raises
-    ``InputError`` for anything else.
+    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by commas or blanks; further columns are ignored, and
+    ``#`` begins a comment. Text and .npy files hold points in the camera's frame, measured from the camera. A .npz file
+    holds ``points`` and, for a separate sensor such as a lidar, ``T_camera_sensor`` (4x4); the points are then in the
+    sensor's frame. Raises ``InputError`` for anything else.
     """
     points, T_camera_sensor = _read(path)
     if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
@@ -34,20 +35,21 @@ def read_depth_points(path: Path) -> Observations:
 
 
 def _read(path: Path) -> tuple[np.ndarray, SE3]:
-    try:
-        if path.suffix in (".npz", ".npy"):
-            found = np.load(path, allow_pickle=False)
+    """Return the array in a file, and the pose of the sensor that it belongs to."""
+    with open_binary(path, "a file of points") as file:
+        try:
+            if path.suffix not in (".npz", ".npy"):
+                return _from_text(file.read().decode()), SE3.identity()
+            found = np.load(file, allow_pickle=False)
             return (found, SE3.identity()) if isinstance(found, np.ndarray) else _from_archive(path, found)
-        return _from_text(path.read_text()), SE3.identity()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}), {EXPECTED}") from error
-    except (ValueError, EOFError, BadZipFile) as error:
-        if isinstance(error, InputError):
+        except InputError:
             raise
-        raise InputError(f"{path}: not a file of points ({error}), {EXPECTED}") from error
+        except (OSError, ValueError, EOFError, BadZipFile) as error:
+            raise InputError(f"{path}: not a file of points ({error}), {EXPECTED}") from error
 
 
 def _from_text(text: str) -> np.ndarray:
+    """Parse rows of numbers, of which the first three count."""
     rows = [line.partition("#")[0].replace(",", " ").split()[:3] for line in text.splitlines()]
     return np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
 
