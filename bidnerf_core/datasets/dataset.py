@@ -1,4 +1,4 @@
-"""What every reader of a dataset offers, and the rules that all of them share: names, splits, backgrounds."""
+"""The interface of a dataset, and how all readers name its frames."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 
 ReadingProgress: TypeAlias = Callable[[int, int], None]
-"""Told (frames read, frames asked for) after each frame."""
+"""Called with (frames read, frames requested) after each frame."""
 
 
 @runtime_checkable
 class Dataset(Protocol):
     """Posed images in splits. Poses are ``T_world_camera`` with OpenCV axes, float64; depth is planar z in metres.
 
-    A frame's name is the stem of its image file. Where several files of a split share a stem, folders are put in front,
-    as few as tell them apart ("left_0001", "right_0001"); the bare stem is then refused as ambiguous.
+    A frame's name is the stem of its image file. Where several files of a split share a stem, the names begin with as few
+    folders as it takes to make them different ("left_0001", "right_0001"); the bare stem is then refused as ambiguous.
     """
 
     @property
@@ -28,22 +28,22 @@ class Dataset(Protocol):
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """At least one, "train" first where there is one."""
+        """The names of the splits, at least one; "train" comes first where there is one."""
         ...
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """The colour (rgb in [0, 1]) that images with an alpha channel are laid over."""
+        """The colour (rgb in [0, 1]) behind images with an alpha channel."""
         ...
 
     def frame_names(self, split: str) -> list[str]:
-        """Names in the order of the file. Raises ``InputError`` for an unknown split."""
+        """Return the names in the order of the file. Raises ``InputError`` for an unknown split."""
         ...
 
     def views(
         self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
     ) -> list[View]:
-        """Read the frames ``names``, in that order, or all of the split; no other image is touched.
+        """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
         Raises ``InputError`` for an unknown split or frame, and for a file that is missing or not usable.
         """
@@ -51,7 +51,10 @@ class Dataset(Protocol):
 
 
 def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], where: str) -> list[int]:
-    """Where the ``asked`` frames are among ``names``; ``where`` opens the message of an ``InputError``."""
+    """Return the places of the requested frames among ``names``.
+
+    Raises ``InputError``, whose message begins with ``where``, for a name that is unknown or ambiguous.
+    """
     index = {name: place for place, name in enumerate(names)}
     for name in asked:
         if name not in index:
@@ -60,7 +63,7 @@ def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], 
 
 
 def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """A name for each path (folders, then stem): its stem, behind as many folders as it takes to be the only one."""
+    """Name each path (folders, then stem) by its stem, after as many folders as it takes to make the name unique."""
     names = [path[-1] for path in paths]
     for depth in range(2, max(map(len, paths), default=0) + 1):
         count = Counter(names)

@@ -19,7 +19,7 @@ EXPECTED = "expected n rows of x, y, z in metres"
 def read_depth_points(path: Path) -> Observations:
     """Read points (metres, OpenCV axes) as depth rays in the camera's frame.
 
-    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by commas or blanks; further columns are ignored, and
+    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by either commas or blanks; further columns are ignored, and
     ``#`` begins a comment. Text and .npy files hold points in the camera's frame, measured from the camera. A .npz file
     holds ``points`` and, for a separate sensor such as a lidar, ``T_camera_sensor`` (4x4); the points are then in the
     sensor's frame. Raises ``InputError`` for anything else.
@@ -50,18 +50,23 @@ def _read(path: Path) -> tuple[np.ndarray, SE3]:
 
 def _from_text(text: str) -> np.ndarray:
     """Parse rows of numbers, of which the first three count."""
-    rows = [line.partition("#")[0].replace(",", " ").split()[:3] for line in text.splitlines()]
-    return np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
+    lines = [line.partition("#")[0].strip() for line in text.splitlines()]
+    # A row with commas has no other separator: "1,5 2,5" has decimal commas and is refused.
+    rows = [line.split("," if "," in line else None)[:3] for line in lines if line]
+    return np.array([[float(word) for word in row] for row in rows], dtype=np.float64)
 
 
 def _from_archive(path: Path, archive: np.lib.npyio.NpzFile) -> tuple[np.ndarray, SE3]:
     with archive:
         if "points" not in archive:
             raise InputError(f"{path}: holds {', '.join(archive) or 'nothing'}, expected an array 'points'")
-        if "T_camera_sensor" not in archive:
-            return archive["points"], SE3.identity()
-        matrix = torch.from_numpy(archive["T_camera_sensor"].astype(np.float64))
+        arrays = [archive[name] for name in ("points", "T_camera_sensor") if name in archive]
+        if not all(isinstance(array, np.ndarray) for array in arrays):  # others come as bytes
+            raise InputError(f"{path}: holds something that is not an array, {EXPECTED} in 'points'")
+        if len(arrays) == 1:
+            return arrays[0], SE3.identity()
+        matrix = torch.from_numpy(arrays[1].astype(np.float64))
         pose = SE3.from_matrix(matrix) if matrix.shape == (4, 4) else None
         if pose is None or not bool(pose.is_rigid()):
             raise InputError(f"{path}: T_camera_sensor is not a rigid transform, expected 4x4")
-        return archive["points"], pose.normalized()
+        return arrays[0], pose.normalized()

@@ -17,9 +17,9 @@ RIGID_TO = 5e-3
 
 
 def pose(record: Record) -> SE3:
-    """``T_world_camera`` (OpenCV axes, float64) from ``transform_matrix`` (3x4 or 4x4, OpenGL axes).
+    """Return ``T_world_camera`` (OpenCV axes, float64) from ``transform_matrix`` (3x4 or 4x4, OpenGL axes).
 
-    A rotation that is orthonormal but for rounding is made so. Raises ``InputError`` for one that is not.
+    A rotation that is orthonormal up to rounding is made so. Raises ``InputError`` for any other matrix.
     """
     matrix = _matrix(record)
     flip = matrix.new_tensor(
@@ -34,7 +34,7 @@ def pose(record: Record) -> SE3:
 
 
 def _matrix(record: Record) -> Tensor:
-    """Three or four rows of four finite numbers, the fourth row being 0 0 0 1."""
+    """Return the first three of three or four rows of finite numbers; a fourth row must be 0 0 0 1."""
     rows = record.items("transform_matrix")
     if rows is None:
         raise record.error("no transform_matrix, expected a 4x4 camera-to-world matrix")
