@@ -18,7 +18,7 @@ except Exception:
     os.environ.setdefault("TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds, levels
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import Localization, Localizer, Outcome
@@ -33,6 +33,7 @@ __all__ = [
     "FieldValues",
     "Frame",
     "InputError",
+    "InputWarning",
     "Intrinsics",
     "Localization",
     "Localizer",

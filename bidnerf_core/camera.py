@@ -15,6 +15,16 @@ from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.orientation import Orientation
+
+LARGEST_SIZE = 1_000_000
+"""Columns or rows of an image."""
+SMALLEST_FOCAL, LARGEST_PIXELS = 1e-6, 1e9
+"""Limits of focal lengths and of the distance of the principal point, in pixels. Beyond them, float32 overflows."""
+LARGEST_COEFFICIENT = 1e6
+"""Limit of a distortion coefficient; those of rational models reach some hundreds."""
+ASPECT_TOLERANCE = 0.005
+"""Relative difference of two aspect ratios that passes for the rounding of a resized image."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +42,35 @@ class Intrinsics:
     def __post_init__(self) -> None:
         for name in ("fx", "fy"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
+            if not SMALLEST_FOCAL <= value <= LARGEST_PIXELS:
                 raise InputError(f"focal length {name} is {value}, expected a positive number of pixels")
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"image size is {self.width}x{self.height}, expected at least 1x1")
-        if not all(math.isfinite(x) for x in (self.cx, self.cy, *self.distortion)):
-            raise InputError("principal point or distortion is not finite")
+        if not (1 <= self.width <= LARGEST_SIZE and 1 <= self.height <= LARGEST_SIZE):
+            expected = f"1x1 to {LARGEST_SIZE}x{LARGEST_SIZE}"
+            raise InputError(f"image size is {self.width}x{self.height}, expected {expected}")
+        for name in ("cx", "cy"):
+            value = getattr(self, name)
+            if not abs(value) <= LARGEST_PIXELS:
+                raise InputError(f"principal point {name} is {value}, expected pixels near the image")
+        if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.distortion):
+            raise InputError(f"distortion is {self.distortion}, expected coefficients of a real lens")
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
             raise InputError(
                 f"distortion has {len(self.distortion)} coefficients, expected 0, 4, 5, 8, 12 or 14"
             )
+
+    @staticmethod
+    def from_focal(focal: float, width: int, height: int) -> Intrinsics:
+        """Return a camera without distortion; ``focal`` is in pixels, the principal point in the middle of the image."""
+        return Intrinsics(focal, focal, width / 2, height / 2, width, height)
+
+    @staticmethod
+    def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
+        """Return a camera without distortion that sees ``degrees`` from the left edge of the image to the right one."""
+        if not 0 < degrees < 180:
+            raise InputError(
+                f"horizontal field of view is {degrees}, expected degrees between 0 and 180 (both excluded)"
+            )
+        return Intrinsics.from_focal(focal_length(width, math.radians(degrees)), width, height)
 
     def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
         return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=dtype)
@@ -77,12 +106,56 @@ class Intrinsics:
         return torch.stack([u, v], dim=-1)
 
     def scaled(self, factor: float) -> Intrinsics:
-        """The same camera with an image ``factor`` times as large."""
-        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        """Return the camera of an image that is ``factor`` times as large."""
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """Return the camera of the same image resampled to another size."""
         x, y = width / self.width, height / self.height
         return replace(
             self, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y, width=width, height=height
         )
 
+    def upright(self, orientation: Orientation) -> Intrinsics:
+        """Return the camera of the upright image; this one is of the image as it is stored.
+
+        Raises ``InputError`` where an image with a tilted sensor (14 distortion coefficients) is transposed.
+        """
+        camera = self
+        if orientation.mirrors_columns:
+            distortion = _negated(camera.distortion, P2, S1, S2, TAU_Y)
+            camera = replace(camera, cx=camera.width - camera.cx, distortion=distortion)
+        if orientation.mirrors_rows:
+            distortion = _negated(camera.distortion, P1, S3, S4, TAU_X)
+            camera = replace(camera, cy=camera.height - camera.cy, distortion=distortion)
+        return camera._transposed() if orientation.transposes else camera
+
+    def _transposed(self) -> Intrinsics:
+        if any(self.distortion[TAU_X:]):
+            raise InputError("a camera with a tilted sensor cannot be rotated, expected an upright image")
+        order = [TRANSPOSED.get(place, place) for place in range(len(self.distortion))]
+        distortion = tuple(self.distortion[place] for place in order)
+        return Intrinsics(self.fy, self.fx, self.cy, self.cx, self.height, self.width, distortion)
+
     def _coefficients(self) -> Tensor:
         return torch.tensor(self.distortion, dtype=torch.float64)
+
+
+P1, P2, S1, S2, S3, S4, TAU_X, TAU_Y = 2, 3, 8, 9, 10, 11, 12, 13
+"""Places of those distortion coefficients that depend on the directions of the axes."""
+TRANSPOSED = {P1: P2, P2: P1, S1: S3, S2: S4, S3: S1, S4: S2}
+
+
+def _negated(distortion: tuple[float, ...], *places: int) -> tuple[float, ...]:
+    return tuple(-value if place in places else value for place, value in enumerate(distortion))
+
+
+def focal_length(pixels: int, angle: float) -> float:
+    """Return the focal length (pixels) with which ``pixels`` columns or rows span ``angle`` (radians)."""
+    return pixels / 2 / math.tan(angle / 2)
+
+
+def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) may be of one image at two resolutions."""
+    ratio = size[0] * other[1] / (size[1] * other[0])
+    return abs(ratio - 1) <= ASPECT_TOLERANCE

@@ -1,7 +1,11 @@
-"""What a user's mistake is told as: one line that names the file, the finding and the expectation."""
+"""What a user's mistake raises, and what is said of an assumption: one line that names the file and the finding."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Something that was given is not usable; the message is fit to be shown as it is."""
+    """An input is not usable; the message is a line that can be shown to the user as it is."""
+
+
+class InputWarning(UserWarning):
+    """An input was ambiguous and a convention was assumed; the message is a line that says which."""

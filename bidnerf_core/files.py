@@ -1,11 +1,44 @@
-"""Files that are written whole or not at all."""
+"""Opening files that a user names, and writing files whole or not at all."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import secrets
+import stat
 from pathlib import Path
+from typing import BinaryIO
+
+from bidnerf_core.errors import InputError
+
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+def open_binary(path: Path, expected: str) -> BinaryIO:
+    """Open a regular file for reading. ``expected`` says in a few words what it should be ("an image file").
+
+    Raises ``InputError`` where there is no such file, where reading is not permitted, and for folders, pipes and devices:
+    reading from a pipe would wait for ever.
+    """
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISREG(mode):
+            return path.open("rb")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file, expected {expected}") from error
+    except PermissionError as error:
+        raise InputError(f"{path}: permission denied, expected {expected} that may be read") from error
+    except (OSError, ValueError) as error:  # a ValueError is a NUL in the name
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be opened ({reason}), expected {expected}") from error
+    kind = KINDS.get(stat.S_IFMT(mode), "no regular file")
+    raise InputError(f"{path}: is {kind}, expected {expected}")
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -1,18 +1,27 @@
-"""Images with their camera, and images with their place."""
+"""Images with their camera, and images with their camera's pose."""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError
+from bidnerf_core.camera_sources import Raster
+from bidnerf_core.depth_images import depth_image
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.images import Background, background_colour, over, pixel_array, split_alpha
+from bidnerf_core.orientation import UPRIGHT
+from bidnerf_core.photos import fit_depth, read_photo
 from bidnerf_core.se3 import SE3
 
 SPARSE = 0.05
-"""Share of an image's pixels under which measured depth is that of a few points: it tells of them, not of what is between."""
+"""Share of an image's pixels below which measured depth is sparse: it says nothing about the pixels in between."""
+BLACK = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +36,14 @@ class Frame:
     intrinsics: Intrinsics
     depth: Float[Tensor, "dh dw"] | None = None
     alpha: Float[Tensor, "ah aw"] | None = None
+    camera_source: str | None = None
+    """A line that says where the intrinsics come from, of frames that ``open`` made."""
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[-1] != 3:
             raise InputError(
-                f"frame {self.name}: rgb has shape {tuple(self.rgb.shape)}, expected (height, width, 3); put alpha"
-                " apart and repeat grey three times"
+                f"frame {self.name}: rgb has shape {tuple(self.rgb.shape)}, expected (height, width, 3); "
+                "Frame.from_numpy takes grey and RGBA"
             )
         expected = (self.intrinsics.height, self.intrinsics.width)
         for what, image in (("rgb", self.rgb), ("depth", self.depth), ("alpha", self.alpha)):
@@ -42,14 +53,111 @@ class Frame:
                     f"frame {self.name}: {what} is {found}, its camera expects {expected[1]}x{expected[0]}"
                 )
 
+    @staticmethod
+    def open(
+        path: str | Path,
+        *,
+        depth: str | Path | None = None,
+        camera: Intrinsics | str | Path | None = None,
+        focal: float | None = None,
+        hfov: float | None = None,
+        depth_unit: float | None = None,
+        background: Background = BLACK,
+        largest: int | None = None,
+    ) -> Frame:
+        """Read a photo, turn it upright as its EXIF orientation says, and find its camera.
+
+        The camera is ``camera`` (intrinsics, or a file: ``transforms.json``, ``cameras.json``, COLMAP's ``cameras.txt``),
+        or has the focal length ``focal`` (pixels of the image file), or the horizontal field of view ``hfov`` (degrees, of
+        the upright image); at most one of them. Without them it comes from the focal length in EXIF. A camera of another
+        resolution is scaled, and one of the image as it is stored is turned with it. ``camera_source`` of the result says
+        in a line where the camera comes from.
+
+        ``depth`` is an image or a ``.npy`` file of planar z, ``depth_unit`` metres a step. Without a unit, 0.001 m is
+        assumed for integers and 1 m for floats, and an ``InputWarning`` says so. It also names values that stand for
+        "nothing measured" (NaN, infinite, negative, 65535, 1e10 and the like), which become 0. Depth of another resolution
+        is resampled to the nearest measurement. ``background`` (rgb in [0, 1], "white" or "black") lies behind transparent
+        pixels. Where the longer side has more than ``largest`` pixels, the image is reduced to that size.
+
+        Raises ``InputError`` where a file is not readable or has more than 100 megapixels, where the camera is not known or
+        given twice, and where camera or depth belong to an image of another aspect ratio.
+        """
+        path = Path(path)
+        photo = read_photo(
+            path,
+            depth=None if depth is None else Path(depth),
+            camera=camera,
+            focal=focal,
+            hfov=hfov,
+            depth_unit=depth_unit,
+            background=background,
+            largest=largest,
+        )
+        if photo.remark is not None:
+            warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=2)
+        source = photo.camera
+        return Frame(path.stem, photo.rgb, source.intrinsics, photo.depth, photo.alpha, source.description)
+
+    @staticmethod
+    def from_numpy(
+        rgb: np.ndarray | Tensor,
+        camera: Intrinsics,
+        *,
+        depth: np.ndarray | Tensor | None = None,
+        depth_unit: float | None = None,
+        alpha: np.ndarray | Tensor | None = None,
+        name: str = "image",
+        background: Background = BLACK,
+    ) -> Frame:
+        """Make a frame of arrays of numpy or torch.
+
+        ``rgb`` is (h, w) or (h, w, 1 to 4): uint8 in [0, 255], uint16 in [0, 65535], or floats in [0, 1]; a second or
+        fourth channel is alpha, which may be given as ``alpha`` (h, w) instead. Colours are straight (not premultiplied) and
+        laid over ``background``. ``depth`` (planar z) and ``depth_unit`` are as in ``open``, as is scaling of ``camera``.
+
+        Raises ``InputError`` for other types and shapes, NaN, floats outside [0, 1], and where camera or depth belong to
+        an image of another aspect ratio.
+        """
+        where = f"frame {name}"
+        colour, cover = split_alpha(pixel_array(rgb, f"{where}: rgb"))
+        if alpha is not None:
+            if cover is not None:
+                raise InputError(
+                    f"{where}: rgb has an alpha channel, and alpha is given; expected one of them"
+                )
+            cover = _mask(alpha, (colour.shape[1], colour.shape[0]), where)
+        raster = Raster(colour.shape[1], colour.shape[0], UPRIGHT)
+        intrinsics = raster.upright(camera)
+        if intrinsics is None:
+            found, expected = f"{raster.width}x{raster.height}", f"{camera.width}x{camera.height}"
+            raise InputError(
+                f"{where}: rgb is {found}, its camera expects {expected} or a size of the same aspect ratio"
+            )
+        metres = None
+        if depth is not None:
+            measured = depth_image(depth, depth_unit, f"{where}: depth")
+            metres = fit_depth(measured, raster, raster.size, f"{where}: depth")
+            if remark := measured.remark(depth_unit is None):
+                warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
+        return Frame(name, over(colour, cover, background_colour(background)), intrinsics, metres, cover)
+
     @property
     def has_depth(self) -> bool:
+        """Whether anything was measured."""
         return self.depth is not None and bool((self.depth > 0).any())
 
     @property
     def has_dense_depth(self) -> bool:
         """Whether more than a few points were measured."""
         return self.depth is not None and float((self.depth > 0).float().mean()) >= SPARSE
+
+
+def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Float[Tensor, "h w"]:
+    values = pixel_array(alpha, f"{where}: alpha")
+    if values.shape[2] != 1 or (values.shape[1], values.shape[0]) != size:
+        found = "x".join(map(str, values.shape))
+        raise InputError(f"{where}: alpha is {found}, expected {size[1]}x{size[0]} as rgb (rows x columns)")
+    return values[..., 0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -241,6 +242,28 @@ def test_depth_from_an_array(nerfstudio: Callable[..., Path]) -> None:
     depth = open_dataset(folder).views("test", ["r_0"])[0].frame.depth
     array[0, :3] = 0
     torch.testing.assert_close(depth, torch.from_numpy(array).float())
+
+
+@pytest.mark.parametrize("nothing", [1e10, float(np.finfo(np.float32).max), 65.535])
+def test_values_that_stand_for_no_depth_are_holes(nerfstudio: Callable[..., Path], nothing: float) -> None:
+    folder = nerfstudio(edit_frame(0, depth_file_path="depth/r_0.npy", depth_unit_scale_factor=1))
+    array = np.full((H, W), 2, dtype=np.float32)
+    array[0, :3] = nothing
+    np.save(folder / "depth/r_0.npy", array)
+    depth = open_dataset(folder).views("test", ["r_0"])[0].frame.depth
+    assert depth is not None
+    assert depth.unique().tolist() == [0, 2]
+    assert not depth[0, :3].any()
+
+
+def test_the_largest_number_of_sixteen_bits_is_a_hole(nerfstudio: Callable[..., Path]) -> None:
+    folder = nerfstudio()
+    steps = np.full((H, W), 2000, dtype=np.uint16)
+    steps[0, :3] = 65535
+    iio.imwrite(folder / "depth/r_0.png", steps)
+    depth = open_dataset(folder).views("test", ["r_0"])[0].frame.depth
+    assert depth is not None
+    assert depth.unique().tolist() == [0, 2]
 
 
 def test_depth_without_any_measurement_is_no_error(nerfstudio: Callable[..., Path]) -> None:
@@ -517,6 +540,13 @@ BAD_DESCRIPTIONS: dict[str, tuple[Callable[[Json], Any], str]] = {
         "camera_model is OPENCV_FISHEYE, expected one of PINHOLE, SIMPLE_PINHOLE, OPENCV",
     ),
     "fisheye flag": (edit_file(is_fisheye=True), "camera_model is fisheye (is_fisheye), expected one of"),
+    "fisheye flag as a number": (edit_file(is_fisheye=1), "camera_model is fisheye (is_fisheye), expected"),
+    "far principal point": (
+        edit_frame(cx=1e308),
+        "frame 1 (images/r_1.png): principal point cx is 1e+308, expected pixels near the image",
+    ),
+    "focal length tiny": (edit_frame(fl_x=1e-308), "frame 1 (images/r_1.png): focal length fx is 1e-308"),
+    "huge lens": (edit_frame(k1=1e308), "expected coefficients of a real lens"),
     "model a number": (edit_frame(camera_model=4), "camera_model is 4, expected text"),
     "k4": (edit_file(k4=0.1), "k4 is not 0, expected no distortion beyond k1 k2 p1 p2 k3"),
     "k1 text": (edit_file(k1="a"), 'k1 is "a", expected a finite number'),
@@ -557,6 +587,22 @@ def test_depth_of_another_size(nerfstudio: Callable[..., Path]) -> None:
     folder = nerfstudio()
     write_depth(folder, ["depth/r_0.png"], (H, W // 2))
     assert "frame 0 (images/r_0.png): depth/r_0.png is 6x8, expected 12x8 as its image" in message(folder)
+
+
+def test_an_image_of_another_size_is_not_decoded(nerfstudio: Callable[..., Path]) -> None:
+    """Its size is in the header: the pixels of this one are damaged, and nobody notices."""
+    folder = nerfstudio()
+    iio.imwrite(folder / "images/r_2.png", np.zeros((500, 400, 3), dtype=np.uint8))
+    damaged(folder / "images/r_2.png", "cut")
+    assert "r_2.png is 400x500, expected 12x8 as w and h say" in message(folder)
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "images/r_2.png", "depth/r_2.png"])
+def test_pipes_are_refused_and_do_not_hang(nerfstudio: Callable[..., Path], name: str) -> None:
+    folder = nerfstudio()
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    message(folder)
 
 
 def damaged(path: Path, how: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -199,6 +200,7 @@ def test_files_that_are_none_are_told(tmp_path: Path) -> None:
     (tmp_path / "words.txt").write_text("no points here")
     (tmp_path / "two.txt").write_text("1 2\n3 4\n")
     (tmp_path / "ragged.txt").write_text("1 2 3\n3 4\n")
+    (tmp_path / "decimal_commas.txt").write_text("1,5 2,5\n3,5 4,5\n")
     (tmp_path / "empty.txt").write_text("")
     (tmp_path / "zeros.txt").write_text("0 0 0\n")
     (tmp_path / "binary.txt").write_bytes(bytes(range(256)))
@@ -207,6 +209,8 @@ def test_files_that_are_none_are_told(tmp_path: Path) -> None:
     np.save(tmp_path / "words.npy", np.array([["a", "b", "c"]]))
     np.save(tmp_path / "objects.npy", np.array([[{}, {}, {}]], dtype=object))
     np.savez(tmp_path / "other.npz", cloud=np.ones((2, 3)))
+    with zipfile.ZipFile(tmp_path / "no_array.npz", "w") as archive:
+        archive.writestr("points.npy", b"no array at all")
     np.savez(tmp_path / "scaled.npz", points=np.ones((2, 3)), T_camera_sensor=2 * np.eye(4))
     np.savez(tmp_path / "flat.npz", points=np.ones((2, 3)), T_camera_sensor=np.eye(3))
     np.savez(tmp_path / "text.npz", points=np.ones((2, 3)), T_camera_sensor=np.array("no"))

@@ -27,9 +27,9 @@ from bidnerf_core.cli.common import (
 from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.datasets.dataset import background_colour
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.images import background_colour
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import to_plain

@@ -1,4 +1,4 @@
-"""Readers of posed images from disk, and a writer. All conversions of convention happen in here, once."""
+"""Readers of posed images, and a writer. Conventions are converted here and nowhere else."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from bidnerf_core.datasets.dataset import Background, Dataset, ReadingProgress
+from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.transforms import TransformsReader
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError
+from bidnerf_core.images import Background
 
 __all__ = [
     "READERS",
@@ -24,7 +25,7 @@ __all__ = [
 
 @runtime_checkable
 class Reader(Protocol):
-    """One format. ``expected`` says in a few words what its folders hold."""
+    """A reader of one format. ``expected`` names the files that its folders hold, for messages."""
 
     @property
     def expected(self) -> str: ...
@@ -35,17 +36,17 @@ class Reader(Protocol):
 
 
 READERS: list[Reader] = [TransformsReader()]
-"""Asked in this order; append to it to have ``open_dataset`` know another format."""
+"""The formats that ``open_dataset`` tries, in this order; append a reader to add one."""
 
 
 def open_dataset(
     path: str | Path, background: Background | None = None, readers: Sequence[Reader] | None = None
 ) -> Dataset:
-    """Open the dataset in the folder ``path``: descriptions are read and judged now, images when they are asked for.
+    """Open the dataset in the folder ``path``. Descriptions are read and checked now, images when views are requested.
 
-    ``background`` is "white", "black" or an rgb triple in [0, 1] that images with an alpha channel are laid over. Default:
-    white where the images have one (the convention of NeRF-Synthetic), else black. Raises ``InputError`` where there is
-    no such folder, where no reader recognises it, and where a description is not usable.
+    ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. The default is
+    white where the images have one, as is the convention of NeRF-Synthetic, and black otherwise. Raises ``InputError``
+    where there is no such folder, where no reader recognises it, and where a description is not usable.
     """
     folder = Path(path)
     if not folder.exists():

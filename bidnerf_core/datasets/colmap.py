@@ -1,7 +1,7 @@
-"""What a COLMAP sparse model knows of a dataset's frames: for each, the points that it observes, in metres.
+"""Points of a COLMAP sparse model that the frames of a dataset observe, in metres.
 
-Images of the model and frames of the dataset are matched by name. The model has a world and a unit of its own; how long
-the unit is comes from the places of the training cameras, which both know. No other pose is looked at.
+Images of the model and frames of the dataset are matched by name. The model has its own world and unit of length. The
+length of that unit is estimated from the positions of the training cameras, which both contain. No other pose is used.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from bidnerf_core.se3 import SE3
 
 SPLITS = frozenset({"train", "val", "test"})
 LARGEST_MISFIT = 0.2
-"""Median distance of the training cameras from where the model has them, in parts of their spread: more is another scene.
-A hand-held camera that was moved by decimetres comes to 0.03."""
+"""Limit of the median distance between training cameras and the model's, relative to their spread. A larger one means
+another scene; a hand-held camera that moved by decimetres reaches 0.03."""
 OUTLIER = 3.0
-"""Cameras that are off by more than so many medians are left out, and never those that are off by less than ..."""
-ALWAYS_FITS = 0.01  # ... of the spread
+"""Cameras that are off by more than this many medians are left out ..."""
+ALWAYS_FITS = 0.01  # ... but never those that are off by less than this part of the spread
 
 
 @dataclass(frozen=True)
 class SparseChoice:
-    """Which points of a COLMAP model are taken."""
+    """Which points of a COLMAP model are used."""
 
     points_error: float = 2.0  # pixels: those with a larger mean reprojection error are left out
     points_views: int = 2  # those that fewer images observe are left out
@@ -47,17 +47,17 @@ class SparseChoice:
 
 @dataclass(frozen=True)
 class Unit:
-    """How long the model's unit is, and how sure that is."""
+    """The length of the model's unit, and how well it is determined."""
 
     metres: float
-    cameras: int  # training cameras that told
-    misfit: float  # their median distance from where the model has them, in parts of their spread
+    cameras: int  # training cameras that it was estimated from
+    misfit: float  # their median distance from the model's cameras, relative to their spread
 
 
 class SparsePoints:
-    """A model in ``folder``, and the training cameras ``places`` (frame name, T_world_camera) of what it shows.
+    """The points of the model in ``folder``, scaled by the training cameras ``places`` (frame name, T_world_camera).
 
-    Raises ``InputError`` where the folder holds no sound model, and where its cameras are not those of the training.
+    Raises ``InputError`` where the folder holds no sound model, and where its cameras are not the training cameras.
     """
 
     def __init__(
@@ -76,6 +76,7 @@ class SparsePoints:
 
     @property
     def summary(self) -> str:
+        """A line about the unit of the model."""
         unit = self.unit
         checked = (
             f", places agree to {unit.misfit:.2%} of their spread" if unit.cameras > 2 else ", unchecked"
@@ -83,7 +84,7 @@ class SparsePoints:
         return f"{self.folder}: its unit is {unit.metres:.4g} m by {unit.cameras} training cameras{checked}"
 
     def seen(self, name: str, split: str) -> Float[Tensor, "n 3"]:
-        """The points that a frame observes: metres, camera frame; none where the model does not have the frame."""
+        """Return the points that a frame observes (metres, camera frame); none where the model lacks the frame."""
         image = self._images.find(name, split)
         if image is None:
             return torch.zeros((0, 3), dtype=torch.float64)
@@ -93,9 +94,9 @@ class SparsePoints:
         return points[points[:, 2] > 0]
 
     def rays(self, views: Sequence[View], split: str) -> Observations:
-        """What all ``views`` observe, in the frame of the last one's camera, by their relative poses.
+        """Return the points that all ``views`` observe as rays in the last camera's frame, by their relative poses.
 
-        Raises ``InputError`` where that is nothing.
+        Raises ``InputError`` where they observe none.
         """
         T_last_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
         found = [(view, self.seen(view.frame.name, split)) for view in views]
@@ -110,9 +111,9 @@ class SparsePoints:
         return Observations.joined(parts)
 
     def onto(self, view: View, split: str) -> View:
-        """The view with the depth (planar z) of the nearest observed point at each pixel, 0 elsewhere.
+        """Return the view with the depth (planar z) of the nearest observed point at each pixel, 0 elsewhere.
 
-        A view that has measured depth is left as it is, and so is one that observes nothing.
+        A view that has measured depth, or that observes no points, is returned unchanged.
         """
         points = self.seen(view.frame.name, split)
         if view.frame.has_depth or len(points) == 0:
@@ -126,7 +127,7 @@ class SparsePoints:
         return View(replace(view.frame, depth=depth), view.T_ref_camera)
 
     def _measured(self, places: Sequence[tuple[str, SE3]], split: str) -> Unit:
-        """By the training cameras that the model has; once more without those that it misplaced."""
+        """Estimate the unit from the training cameras, and again without the outliers among them."""
         pairs = [(self._images.find(name, split), T.translation) for name, T in places]
         known = [(image.T_camera_model.inverse().translation, place) for image, place in pairs if image]
         if len(known) < 2:
@@ -141,7 +142,9 @@ class SparsePoints:
             unit = fit_similarity(there[fits], here[fits]).scale
             misfit = float(_off(there[fits], here[fits]).median()) / spread(here[fits])
         except InputError as error:
-            raise InputError(f"{self.folder}: training cameras tell no unit: {error}") from error
+            raise InputError(
+                f"{self.folder}: the unit cannot be estimated from the training cameras: {error}"
+            ) from error
         if misfit > LARGEST_MISFIT:
             raise InputError(
                 f"{self.folder}: its cameras are {misfit:.0%} of their spread away from the training's, expected "
@@ -151,7 +154,7 @@ class SparsePoints:
 
 
 class _Names:
-    """Images of a model by the name of a frame: its stem, or folders and stem as datasets join them ("left_0001")."""
+    """The images of a model by frame names: the stem, or folders and stem as datasets join them ("left_0001")."""
 
     def __init__(self, folder: Path, images: Sequence[ModelImage]) -> None:
         self._folder, self._images = folder, images
@@ -162,9 +165,9 @@ class _Names:
                 self._by_name[name].append((parts[:-1], image))
 
     def find(self, name: str, split: str) -> ModelImage | None:
-        """None where there is none. Folders called train, val or test tell the frames of splits apart.
+        """Return the image of a frame, or None. Folders called train, val or test separate the frames of splits.
 
-        Raises ``InputError`` where several may be meant.
+        Raises ``InputError`` where the name is ambiguous.
         """
         others = SPLITS - {split}
         fits = [
@@ -181,7 +184,7 @@ class _Names:
 
     @property
     def some(self) -> str:
-        """A few names, for messages."""
+        """The number of images and a few of their names, for messages."""
         names = ", ".join(image.name for image in self._images[:3])
         return f"{len(self._images)} images" + (
             f" ({names}{', ...' if len(self._images) > 3 else ''})" if names else ""
@@ -189,11 +192,11 @@ class _Names:
 
 
 def _kept(points: ModelPoints, choice: SparseChoice) -> Tensor:
-    """Which points are good enough; an error that was never computed (negative) speaks against none."""
+    """Return which points are good enough. A negative error was never computed and excludes no point."""
     sound = points.positions.isfinite().all(-1) & ~points.errors.isnan()
     return sound & (points.errors <= choice.points_error) & (points.tracks >= choice.points_views)
 
 
 def _off(there: Float[Tensor, "n 3"], here: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """How far each camera is from where the model has it, once the two are laid over each other (metres)."""
+    """Return the distances (metres) between corresponding cameras after a similarity alignment."""
     return torch.linalg.vector_norm(fit_similarity(there, here).apply(there) - here, dim=-1)

@@ -1,8 +1,8 @@
 """The files of a COLMAP sparse model: ``images`` and ``points3D``, as .bin or .txt.
 
 Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. ``cameras`` is not
-needed, as points are given in space; nor are ``rigs`` and ``frames`` of newer versions, which write each image's pose to
-``images`` as before. Read here rather than by pycolmap, which waits for ever at a truncated ``points3D.bin``.
+needed, as points are given in space. Nor are ``rigs`` and ``frames`` of newer versions, which still write each image's pose
+to ``images``. pycolmap is not used, because it hangs on a truncated ``points3D.bin``.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import open_binary
 from bidnerf_core.se3 import SE3
 
 Item = TypeVar("Item")
@@ -33,24 +34,26 @@ TRACK_BYTES = 8  # an image and one of its key points, 4 bytes each
 
 @dataclass(frozen=True, eq=False)
 class ModelImage:
-    """A registered image."""
+    """A registered image of the model."""
 
     name: str  # path below the folder of images
     T_camera_model: SE3  # in units of the model
-    points: Int[Tensor, "n"]  # ids of the points that it observes
+    points: Int[Tensor, "n"]  # ids of the observed points
 
 
 @dataclass(frozen=True)
 class ModelPoint:
+    """A triangulated point of the model."""
+
     id: int
     position: tuple[float, float, float]  # model frame, in units of the model
     error: float  # mean reprojection error, pixels; negative where it was never computed
-    track: int  # how often it was observed
+    track: int  # number of observations
 
 
 @dataclass(frozen=True, eq=False)
 class ModelPoints:
-    """All of them, by rising id."""
+    """All points of a model, in the order of their ids."""
 
     ids: Int[Tensor, "p"]
     positions: Float[Tensor, "p 3"]  # model frame, in units of the model
@@ -59,7 +62,7 @@ class ModelPoints:
 
 
 def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
-    """What the model in ``folder`` holds. Raises ``InputError`` where it is none, or damaged."""
+    """Read the model in ``folder``. Raises ``InputError`` where there is none, or where a file is damaged."""
     suffix = next((s for s in (".bin", ".txt") if _is_model(folder, s)), None)
     if suffix is None:
         inside = [
@@ -83,7 +86,7 @@ def _any_model(folder: Path) -> bool:
 
 
 class _Bytes:
-    """A file that is read from its beginning."""
+    """A binary file that is parsed from its beginning."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._content, self._place = path, _content(path), 0
@@ -119,10 +122,10 @@ class _Bytes:
 
 
 def _binary(path: Path, one: Callable[[_Bytes], Item]) -> list[Item]:
-    """A count, then so many of what ``one`` reads."""
+    """Read a count, then that many items with ``one``."""
     file = _Bytes(path)
     (count,) = file.take(COUNT)
-    if count > file.left:  # before anything is made for as many
+    if count > file.left:  # a false count must not take memory
         raise InputError(
             f"{path}: says that it holds {count} entries in {file.left} bytes, expected a sound file"
         )
@@ -147,7 +150,7 @@ def _binary_point(file: _Bytes) -> ModelPoint:
 
 
 def _text_images(path: Path) -> list[ModelImage]:
-    """Two lines an image; the second is empty where nothing was observed."""
+    """Read two lines per image; the second is empty where nothing was observed."""
     found, lines = [], iter(enumerate(_lines(path), start=1))
     for number, line in lines:
         if not line or line.startswith("#"):
@@ -183,9 +186,9 @@ def _text_points(path: Path) -> list[ModelPoint]:
 
 
 def _image(where: str, name: str, pose: Sequence[float], points: np.ndarray) -> ModelImage:
-    """``pose``: the quaternion w x y z, then the translation."""
+    """Make an image of a ``pose`` that is a quaternion w x y z, then a translation."""
     if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(pose[:4]) < 2):
-        raise InputError(f"{where}: image {name!r} has a pose that is none, expected a unit quaternion")
+        raise InputError(f"{where}: image {name!r} has an invalid pose, expected a unit quaternion")
     rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
     T = SE3(torch.from_numpy(rotation), torch.tensor(pose[4:], dtype=torch.float64))
     return ModelImage(name, T, torch.from_numpy(np.unique(points)))
@@ -221,7 +224,5 @@ def _lines(path: Path) -> list[str]:
 
 
 def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    with open_binary(path, "a file of a COLMAP sparse model") as file:
+        return file.read()

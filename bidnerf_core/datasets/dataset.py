@@ -1,9 +1,8 @@
-"""What every reader of a dataset offers, and the rules that all of them share: names, splits, backgrounds."""
+"""The interface of a dataset, and how all readers name its frames."""
 
 from __future__ import annotations
 
 import difflib
-import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,21 +11,16 @@ from typing import Protocol, TypeAlias, runtime_checkable
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 
-Background: TypeAlias = str | Sequence[float]
-"""What a user may write: "white", "black" or an rgb triple in [0, 1]."""
-
 ReadingProgress: TypeAlias = Callable[[int, int], None]
-"""Told (frames read, frames asked for) after each frame."""
-
-NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+"""Called with (frames read, frames requested) after each frame."""
 
 
 @runtime_checkable
 class Dataset(Protocol):
     """Posed images in splits. Poses are ``T_world_camera`` with OpenCV axes, float64; depth is planar z in metres.
 
-    A frame's name is the stem of its image file. Where several files of a split share a stem, folders are put in front,
-    as few as tell them apart ("left_0001", "right_0001"); the bare stem is then refused as ambiguous.
+    A frame's name is the stem of its image file. Where several files of a split share a stem, the names begin with as few
+    folders as it takes to make them different ("left_0001", "right_0001"); the bare stem is then refused as ambiguous.
     """
 
     @property
@@ -34,43 +28,33 @@ class Dataset(Protocol):
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """At least one, "train" first where there is one."""
+        """The names of the splits, at least one; "train" comes first where there is one."""
         ...
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """The colour (rgb in [0, 1]) that images with an alpha channel are laid over."""
+        """The colour (rgb in [0, 1]) behind images with an alpha channel."""
         ...
 
     def frame_names(self, split: str) -> list[str]:
-        """Names in the order of the file. Raises ``InputError`` for an unknown split."""
+        """Return the names in the order of the file. Raises ``InputError`` for an unknown split."""
         ...
 
     def views(
         self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
     ) -> list[View]:
-        """Read the frames ``names``, in that order, or all of the split; no other image is touched.
+        """Read the frames ``names``, in that order, or the whole split; no other image is opened.
 
         Raises ``InputError`` for an unknown split or frame, and for a file that is missing or not usable.
         """
         ...
 
 
-def background_colour(background: Background) -> tuple[float, float, float]:
-    """The rgb triple that ``background`` stands for."""
-    expected = 'expected "white", "black" or three numbers in [0, 1]'
-    if isinstance(background, str):
-        if background not in NAMED_BACKGROUNDS:
-            raise InputError(f"background is {background!r}, {expected}")
-        return NAMED_BACKGROUNDS[background]
-    values = tuple(float(value) for value in background)
-    if len(values) != 3 or not all(math.isfinite(value) and 0 <= value <= 1 for value in values):
-        raise InputError(f"background is {values}, {expected}")
-    return values[0], values[1], values[2]
-
-
 def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], where: str) -> list[int]:
-    """Where the ``asked`` frames are among ``names``; ``where`` opens the message of an ``InputError``."""
+    """Return the places of the requested frames among ``names``.
+
+    Raises ``InputError``, whose message begins with ``where``, for a name that is unknown or ambiguous.
+    """
     index = {name: place for place, name in enumerate(names)}
     for name in asked:
         if name not in index:
@@ -79,7 +63,7 @@ def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], 
 
 
 def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """A name for each path (folders, then stem): its stem, behind as many folders as it takes to be the only one."""
+    """Name each path (folders, then stem) by its stem, after as many folders as it takes to make the name unique."""
     names = [path[-1] for path in paths]
     for depth in range(2, max(map(len, paths), default=0) + 1):
         count = Counter(names)

@@ -1,4 +1,4 @@
-"""Rotation, translation and scale between two sets of corresponding points."""
+"""Similarity transforms (rotation, translation and scale) between corresponding points."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from bidnerf_core.se3 import SE3
 class Similarity:
     """``x -> T.apply(scale * x)``."""
 
-    scale: float  # lengths of the target's unit in one of the source's
-    T_target_source: SE3  # of points that are scaled already
+    scale: float  # target units per source unit
+    T_target_source: SE3  # applied after scaling
 
     def apply(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
         return self.T_target_source.apply(self.scale * points)
 
 
 FARTHEST = 1e12
-"""Of a coordinate: the squares of more are no numbers."""
+"""Largest coordinate; the squares of larger ones lose all precision."""
 
 
 def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Similarity:
-    """The one that brings ``source`` nearest to ``target`` in least squares (Umeyama 1991, eqs. 34 to 43).
+    """Fit the similarity that maps ``source`` to ``target`` in least squares (Umeyama 1991, eqs. 34 to 43).
 
-    Where the points lie on a line, the turn about it is anyone's guess; the scale is not. Raises ``InputError`` where
-    fewer than two points of either set differ.
+    Where the points lie on a line, the rotation about it is arbitrary; the scale is still determined. Raises ``InputError``
+    where all points of either set coincide.
     """
     source, target = source.double(), target.double()
     largest = max((float(x.abs().max()) for x in (source, target) if x.numel()), default=0.0)
@@ -52,6 +52,6 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
 
 
 def spread(points: Float[Tensor, "n 3"]) -> float:
-    """Root of the mean squared distance from the mean; 0 where all are in one place, to the precision of numbers."""
+    """Return the root mean square distance from the mean, or 0 where all points coincide up to rounding."""
     found = float((points - points.mean(0)).square().sum(-1).mean().sqrt())
     return found if found > 1e-12 * float(points.abs().amax()) else 0.0

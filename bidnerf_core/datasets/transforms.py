@@ -1,15 +1,18 @@
 """Folders with ``transforms.json``: the dialects of NeRF's Blender scenes and of nerfstudio (and instant-ngp).
 
-Either ``transforms_train.json``, ``transforms_val.json``, ``transforms_test.json`` (those that are there), or one
-``transforms.json`` whose lists ``train_filenames``, ``val_filenames``, ``test_filenames`` tell the splits apart. Without
+A folder holds some of ``transforms_train.json``, ``transforms_val.json`` and ``transforms_test.json``, or one
+``transforms.json`` whose lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` define the splits. Without
 such lists every eighth frame (the first, the ninth ...) is held out as "test" and the others are "train", as is usual for
 captures; a single frame is both.
 
-Read of a file or, with precedence, of a frame: ``camera_angle_x [camera_angle_y]`` or ``fl_x [fl_y]``, ``cx cy w h``,
-``k1 k2 p1 p2 k3``, ``camera_model``, ``depth_unit_scale_factor`` (metres a unit, default 0.001; as in nerfstudio it holds
-for ``.npy`` depth as well); of a frame only: ``file_path`` (its extension may be missing), ``transform_matrix``,
-``depth_file_path`` (planar z). ``applied_transform`` and ``applied_scale`` tell what was already done to the poses: they are
-not undone, so the world is the one of the file. Other keys are not read.
+These keys are read from a frame or, where it lacks them, from the file: ``camera_angle_x [camera_angle_y]`` or
+``fl_x [fl_y]``, ``cx cy w h``, ``k1 k2 p1 p2 k3``, ``camera_model``, ``depth_unit_scale_factor`` (metres a unit, default
+0.001; as in nerfstudio it holds for ``.npy`` depth as well). These are read from a frame only: ``file_path`` (its extension
+may be missing), ``transform_matrix``, ``depth_file_path`` (planar z; see ``depth_images`` for values that count as not
+measured). ``applied_transform`` and ``applied_scale`` record what was already done to the poses. They are not undone, so
+the world is that of the file. Other keys are ignored.
+
+Images are used as they are stored: poses and intrinsics describe that raster, so an EXIF orientation is not applied.
 """
 
 from __future__ import annotations
@@ -18,24 +21,18 @@ from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
-from bidnerf_core.datasets.dataset import (
-    Background,
-    Dataset,
-    ReadingProgress,
-    background_colour,
-    positions,
-    unique_names,
-)
-from bidnerf_core.datasets.images import over, read_depth, read_image
+from bidnerf_core.datasets.dataset import Dataset, ReadingProgress, positions, unique_names
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
+from bidnerf_core.depth_images import read_depth
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.images import Background, background_colour, over, read_header, read_image
 
 TRIED_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 
 
 class TransformsReader:
-    """Recognises the folder by its files."""
+    """The reader of folders with ``transforms*.json``."""
 
     expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"
 
@@ -72,7 +69,7 @@ class TransformsDataset:
 
     @cached_property
     def background(self) -> tuple[float, float, float]:
-        """The one that was asked for, else white where the first image of a split has an alpha channel, else black."""
+        """The requested colour, or white where the first image of a split has an alpha channel, or black."""
         if self._background is not None:
             return self._background
         return background_colour("white" if any(map(self._has_alpha, self.splits)) else "black")
@@ -102,9 +99,10 @@ class TransformsDataset:
 
     def _view(self, frame: FrameRecord, name: str) -> View:
         path = self._image_file(frame)
+        header = read_header(path)
+        width, height = header.width, header.height
+        self._check_size(frame, path, width, height)  # before the pixels take memory
         colour, alpha = read_image(path)
-        height, width = colour.shape[:2]
-        self._check_size(frame, path, width, height)
         depth = None
         if frame.depth_path is not None:
             depth = read_depth(self._depth_file(frame), frame.depth_unit)
@@ -135,7 +133,7 @@ class TransformsDataset:
         return path
 
     def _check_size(self, frame: FrameRecord, path: Path, width: int, height: int) -> None:
-        """Against the camera's size or, where it has none, against the first such image: one lens, one size."""
+        """Compare with the camera's size or, where it has none, with the first such image, which the same lens took."""
         camera = frame.camera
         expected, whose = (camera.width or width, camera.height or height), "w and h say"
         if camera.width is None and camera.height is None:
@@ -148,6 +146,6 @@ class TransformsDataset:
 
     def _has_alpha(self, split: str) -> bool:
         try:
-            return read_image(self._image_file(self._frames[split][0]))[1] is not None
-        except InputError:  # whoever asks for that frame will hear of it; others may do without
+            return read_header(self._image_file(self._frames[split][0])).has_alpha
+        except InputError:  # the error is raised again when that frame is read
             return False

@@ -1,24 +1,25 @@
-"""What ``transforms*.json`` says of each frame and of the splits; no image is read here."""
+"""The frames and splits that ``transforms*.json`` describes; no image is read here."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.datasets.cameras import CameraRecord, camera_record, pose
-from bidnerf_core.datasets.records import Record, read_record
+from bidnerf_core.camera_records import CameraRecord, camera_record
+from bidnerf_core.datasets.poses import pose
 from bidnerf_core.errors import InputError
+from bidnerf_core.images import IMAGE_SUFFIXES
+from bidnerf_core.records import Record, read_record
 from bidnerf_core.se3 import SE3
 
 SPLITS = ("train", "val", "test")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 HOLD_OUT_EVERY = 8
 METRES_PER_DEPTH_UNIT = 0.001
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """One entry of ``frames``: all that the JSON says of it."""
+    """One entry of ``frames`` with the defaults of its file applied."""
 
     record: Record
     file_path: PurePosixPath  # as in the file, without a leading "./"
@@ -34,12 +35,12 @@ class FrameRecord:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Folders, then the stem."""
+        """The folders of the image, then its stem."""
         return (*self.file_path.parts[:-1], self.stem)
 
 
 def read_splits(path: Path) -> dict[str, list[FrameRecord]]:
-    """The frames of each split of the folder ``path``. Raises ``InputError`` for a description that is not usable."""
+    """Read the frames of each split of the folder ``path``. Raises ``InputError`` for a description that is not usable."""
     files = {split: path / file_of(split) for split in SPLITS if (path / file_of(split)).is_file()}
     if files:
         return {split: read_frames(read_record(file)) for split, file in files.items()}
@@ -48,7 +49,7 @@ def read_splits(path: Path) -> dict[str, list[FrameRecord]]:
 
 
 def read_frames(file: Record) -> list[FrameRecord]:
-    """Every entry of ``frames``, each named once."""
+    """Read every entry of ``frames``. Raises ``InputError`` where two have the same image."""
     entries = file.items("frames")
     if not entries:
         found = "no frames" if entries is None else "frames is empty"
@@ -63,7 +64,7 @@ def read_frames(file: Record) -> list[FrameRecord]:
 
 
 def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[FrameRecord]]:
-    """The splits of one ``transforms.json``: by its lists of file names, else by holding out every eighth frame."""
+    """Split one ``transforms.json`` by its lists of file names, or hold out every eighth frame where it has none."""
     lists = {split: file.items(f"{split}_filenames") for split in SPLITS}
     if not any(lists.values()):
         others = [frame for number, frame in enumerate(frames) if number % HOLD_OUT_EVERY]
@@ -106,4 +107,5 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
 
 
 def file_of(split: str) -> str:
+    """Return the name of the file that describes a split."""
     return f"transforms_{split}.json"

@@ -1,4 +1,4 @@
-"""Views as a folder that the readers read: ``transforms_train.json`` and its like, images, depth."""
+"""Writing views to a folder of ``transforms_SPLIT.json``, images and depth, which the readers understand."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from bidnerf_core.datasets.transforms_json import METRES_PER_DEPTH_UNIT, SPLITS,
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 
-OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # of camera axes: y and z turn round
+OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
 LENS = ("k1", "k2", "p1", "p2", "k3")
-LARGEST = 65535
+LARGEST = 65534  # readers take the largest number of 16 bits for "not measured"
 
 
 def write_transforms(
@@ -26,9 +26,9 @@ def write_transforms(
 ) -> None:  # fmt: skip
     """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bit) and ``depth/SPLIT/NAME.png`` (16 bit).
 
-    ``background`` is what lies behind a frame that has an alpha channel, to be taken out of its colour. Depth is kept to
-    the millimetre where that reaches far enough. Raises ``InputError`` for an unknown split, a name that comes twice, and
-    for a lens of more than five coefficients.
+    ``background`` is the colour behind frames that have an alpha channel; it is removed from their colours. Depth is stored
+    in millimetres, or in larger steps where 16 bits would not reach far enough. Raises ``InputError`` for an unknown split,
+    a name that occurs twice, and a lens of more than five coefficients.
     """
     for split, views in splits.items():
         if split not in SPLITS:
@@ -43,7 +43,7 @@ def write_transforms(
 
 
 def _written(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
-    """The entry of one frame, whose images are written."""
+    """Write the images of a frame and return its entry."""
     frame = view.frame
     T_world_camera = view.T_ref_camera.to(torch.float64).matrix()
     entry: dict[str, Any] = {
@@ -75,7 +75,7 @@ def _camera(frame: Frame) -> dict[str, float]:
 
 
 def _colours(frame: Frame, background: tuple[float, float, float]) -> np.ndarray:
-    """RGB, or straight (not premultiplied) RGBA where the frame has alpha."""
+    """Return RGB, or straight (not premultiplied) RGBA where the frame has alpha."""
     colours = frame.rgb.detach().cpu()
     if frame.alpha is not None:
         cover = frame.alpha.detach().cpu()[..., None]

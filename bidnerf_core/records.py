@@ -1,4 +1,4 @@
-"""JSON objects from files that people wrote: every value is asked for by type, every error names the place."""
+"""JSON objects in files that people wrote. Values are read by type, and every error names the place."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import open_binary
 
 LARGEST = sys.float_info.max  # JSON knows NaN, 1e999 and integers that no float holds
 
 
 @dataclass(frozen=True)
 class Record:
-    """A JSON object; what it lacks is sought in ``defaults``. A value of ``null`` counts as lacking."""
+    """A JSON object. A key that is missing or ``null`` is looked up in ``defaults``."""
 
-    where: str  # opens every message: the file and, for a part of it, which
+    where: str  # the beginning of every message: the file, and which part of it
     values: Mapping[str, Any]
     defaults: Record | None = None
 
@@ -26,7 +27,7 @@ class Record:
         return InputError(f"{self.where}: {finding}")
 
     def scopes(self) -> Iterator[Record]:
-        """This object by itself, then its defaults by themselves."""
+        """Yield this object without its defaults, then the defaults without theirs, and so on."""
         yield Record(self.where, self.values)
         if self.defaults is not None:
             yield from self.defaults.scopes()
@@ -36,12 +37,12 @@ class Record:
         return self.defaults.value(key) if found is None and self.defaults is not None else found
 
     def number(self, key: str) -> float | None:
-        """A finite number, or None where there is none."""
+        """Return a finite number, or None where the key is missing."""
         found = self.value(key)
         return None if found is None else self.checked_number(found, key)
 
     def size(self, key: str) -> int | None:
-        """A number of pixels: whole and positive, though some programs write it as 800.0."""
+        """Return a positive whole number of pixels, which some programs write as 800.0, or None."""
         found = self.number(key)
         if found is not None and (found < 1 or found != int(found)):
             raise self.error(f"{key} is {found:g}, expected a positive whole number of pixels")
@@ -67,21 +68,27 @@ class Record:
 
 
 def read_record(path: Path) -> Record:
-    """The JSON object in the file ``path``. Raises ``InputError`` with line and column where it is not one."""
+    """Read the JSON object in the file ``path``. Raises ``InputError`` with line and column where it is broken."""
+    with open_binary(path, "a JSON file") as file:
+        return parse_record(str(path), file.read())
+
+
+def parse_record(where: str, content: bytes) -> Record:
+    """Read a JSON object; ``where`` opens the message of the ``InputError`` that a broken one raises."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8-sig"))
+        values = json.loads(content.decode("utf-8-sig"))
     except json.JSONDecodeError as error:
         raise InputError(
-            f"{path}: broken JSON at line {error.lineno}, column {error.colno}: {error.msg}"
+            f"{where}: broken JSON at line {error.lineno}, column {error.colno}: {error.msg}"
         ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({type(error).__name__}: {error})") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: not readable as JSON ({type(error).__name__}: {error})") from error
     if not isinstance(values, dict):
-        raise InputError(f"{path}: holds {_short(values)}, expected a JSON object with frames")
-    return Record(str(path), values)
+        raise InputError(f"{where}: holds {_short(values)}, expected a JSON object")
+    return Record(where, values)
 
 
 def _short(value: Any) -> str:
-    """A found value for a message: as JSON, on one line, cut where it is long."""
+    """Return a value as JSON on one line, cut where it is long."""
     text = json.dumps(value)
     return text if len(text) <= 40 else text[:37] + "..."

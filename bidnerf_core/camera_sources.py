@@ -1,0 +1,200 @@
+"""Where the intrinsics of a photo come from: the user, a file, or the photo's own EXIF."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bidnerf_core.camera import Intrinsics, same_aspect
+from bidnerf_core.camera_records import camera_record
+from bidnerf_core.errors import InputError
+from bidnerf_core.exif import Exif
+from bidnerf_core.files import open_binary
+from bidnerf_core.orientation import Orientation
+from bidnerf_core.records import parse_record
+
+FILM_DIAGONAL = math.hypot(36.0, 24.0)
+"""Millimetres; 35 mm-equivalent focal lengths refer to it (CIPA DCG-001)."""
+MIDDLE = "the principal point is assumed in the middle"
+WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
+COLMAP_MODELS: dict[str, tuple[int, ...]] = {
+    # Places of fx, fy, cx, cy and of the distortion in OpenCV's order among the parameters; -1 is a coefficient of 0.
+    "SIMPLE_PINHOLE": (0, 0, 1, 2),
+    "PINHOLE": (0, 1, 2, 3),
+    "SIMPLE_RADIAL": (0, 0, 1, 2, 3, -1, -1, -1),
+    "RADIAL": (0, 0, 1, 2, 3, 4, -1, -1),
+    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
+}
+"""Parameters of COLMAP's perspective models (https://colmap.github.io/cameras.html), which also has pixel centres at +0.5."""
+
+
+@dataclass(frozen=True)
+class CameraSource:
+    """The camera of an upright image, and a line that says where it comes from."""
+
+    intrinsics: Intrinsics
+    description: str
+
+
+@dataclass(frozen=True)
+class Raster:
+    """The size of an image as its file stores it, and how it is turned upright."""
+
+    width: int
+    height: int
+    orientation: Orientation
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height as stored."""
+        return self.width, self.height
+
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """Width and height of the upright image."""
+        return self.orientation.upright_size(self.width, self.height)
+
+    def upright(self, camera: Intrinsics) -> Intrinsics | None:
+        """Return a given camera for the upright image, or None where its aspect ratio is that of another image.
+
+        A camera whose shape fits the stored image is taken for the camera of that (COLMAP ignores EXIF's orientation, too).
+        """
+        given = (camera.width, camera.height)
+        if same_aspect(given, self.size):
+            return camera.resized(*self.size).upright(self.orientation)
+        return camera.resized(*self.upright_size) if same_aspect(given, self.upright_size) else None
+
+
+def find_camera(
+    where: str,
+    raster: Raster,
+    exif: Exif,
+    camera: Intrinsics | str | Path | None = None,
+    focal: float | None = None,
+    hfov: float | None = None,
+) -> CameraSource:
+    """Return the camera of an upright photo: ``camera``, ``focal`` or ``hfov`` where one is given, else what EXIF says.
+
+    ``focal`` is in pixels of the stored image and ``hfov`` in degrees across the upright one. ``where`` opens the message
+    of the ``InputError`` that is raised where several are given, where none is and EXIF has no focal length, and where the
+    camera belongs to an image of another shape.
+    """
+    if sum(given is not None for given in (camera, focal, hfov)) > 1:
+        raise InputError(f"{where}: several cameras are given, expected one of {WAYS}")
+    size = raster.upright_size
+    try:
+        if focal is not None:
+            return _described(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px as given")
+        if hfov is not None:
+            return _described(Intrinsics.from_hfov(hfov, *size), f"horizontal field of view {hfov:g} deg")
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    if camera is None:
+        return camera_from_exif(where, raster, exif)
+    given, origin = (
+        (camera, "camera as given")
+        if isinstance(camera, Intrinsics)
+        else (read_camera(Path(camera), size), f"camera of {camera}")
+    )
+    return _fitted(where, raster, given, origin)
+
+
+def _described(camera: Intrinsics, origin: str) -> CameraSource:
+    return CameraSource(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
+
+
+def _fitted(where: str, raster: Raster, given: Intrinsics, origin: str) -> CameraSource:
+    fitted = raster.upright(given)
+    if fitted is None:
+        size = "x".join(map(str, raster.upright_size))
+        raise InputError(
+            f"{where}: image is {size}, its camera is for {given.width}x{given.height}; expected one of the same aspect ratio"
+        )
+    return CameraSource(fitted, f"{origin}: {_focal(fitted)}")
+
+
+def _focal(camera: Intrinsics) -> str:
+    return f"fx {camera.fx:.0f} px at {camera.width}x{camera.height}"
+
+
+def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
+    """Return the camera that EXIF describes; it is good to some percent, and the lens is taken as free of distortion.
+
+    Raises ``InputError`` where there is no focal length, and where the image was cropped after it was taken.
+    """
+    taken = exif.size
+    if taken and not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size)):
+        size = f"{raster.width}x{raster.height}"
+        raise InputError(
+            f"{where}: image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS}"
+        )
+    if exif.equivalent_mm is not None:
+        focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*raster.size)
+        return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF")
+    if exif.focal_mm is not None and exif.pixels_per_mm is not None:
+        # The resolution is that of the image when it was taken.
+        scale = max(raster.size) / max(taken) if taken else 1.0
+        focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
+        zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
+        return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
+    raise InputError(f"{where}: no focal length in EXIF, expected a camera: {WAYS}")
+
+
+def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> CameraSource:
+    try:
+        return _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
+    except InputError as error:
+        raise InputError(f"{where}: EXIF: {error}; give its camera: {WAYS}") from error
+
+
+def read_camera(path: Path, size: tuple[int, int]) -> Intrinsics:
+    """Read the camera in the header of a ``transforms.json`` or ``cameras.json``, or in COLMAP's ``cameras.txt``.
+
+    JSON without ``w`` and ``h`` describes an image of ``size`` (width, height). Raises ``InputError`` for other files, for
+    lenses that are not perspective, and where ``cameras.txt`` holds several different cameras.
+    """
+    with open_binary(path, "a JSON file or COLMAP's cameras.txt") as file:
+        content = file.read()
+    if content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"["):
+        record = camera_record(parse_record(str(path), content))
+        return record.intrinsics(record.width or size[0], record.height or size[1])
+    cameras = _colmap_cameras(path, content)
+    if len(set(cameras)) != 1:
+        raise InputError(f"{path}: holds {len(cameras)} cameras, expected one; keep the line of this photo's")
+    return cameras[0]
+
+
+def _colmap_cameras(path: Path, content: bytes) -> list[Intrinsics]:
+    try:
+        lines = [line.partition("#")[0].split() for line in content.decode("utf-8-sig").splitlines()]
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: neither JSON nor text, expected transforms.json or cameras.txt "
+            "(COLMAP's model_converter makes it of cameras.bin)"
+        ) from error
+    return [_colmap_camera(f"{path}: line {i}", words) for i, words in enumerate(lines, start=1) if words]
+
+
+def _colmap_camera(where: str, words: Sequence[str]) -> Intrinsics:
+    """Read ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``."""
+    expected = "expected CAMERA_ID MODEL WIDTH HEIGHT and parameters"
+    if len(words) < 5:
+        raise InputError(f"{where} has {len(words)} entries, {expected}")
+    places = COLMAP_MODELS.get(words[1])
+    if places is None:
+        raise InputError(f"{where}: camera model {words[1]}, expected one of {', '.join(COLMAP_MODELS)}")
+    try:
+        width, height = int(words[2]), int(words[3])
+        parameters = [float(word) for word in words[4:]]
+    except ValueError as error:
+        raise InputError(f"{where}: {error}, {expected}") from error
+    if len(parameters) != max(places) + 1:
+        raise InputError(f"{where}: {words[1]} has {len(parameters)} parameters, expected {max(places) + 1}")
+    fx, fy, cx, cy, *lens = (0.0 if place < 0 else parameters[place] for place in places)
+    try:
+        return Intrinsics(fx, fy, cx, cy, width, height, tuple(lens) if any(lens) else ())
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error

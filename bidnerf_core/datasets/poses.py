@@ -1,0 +1,46 @@
+"""Camera poses as NeRF's and nerfstudio's JSON describe them, in our conventions.
+
+They come as camera-to-world matrices with OpenGL axes (x right, y up, z backward) and leave as ``T_world_camera`` with
+OpenCV axes.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.records import Record
+from bidnerf_core.se3 import SE3
+
+RIGID_TO = 5e-3
+"""Largest entry of R^T R - 1 that passes for rounding (matrices printed with three decimals reach 2e-3)."""
+
+
+def pose(record: Record) -> SE3:
+    """Return ``T_world_camera`` (OpenCV axes, float64) from ``transform_matrix`` (3x4 or 4x4, OpenGL axes).
+
+    A rotation that is orthonormal up to rounding is made so. Raises ``InputError`` for any other matrix.
+    """
+    matrix = _matrix(record)
+    flip = matrix.new_tensor(
+        [1.0, -1.0, -1.0]
+    )  # of columns: y up becomes y down, z backward becomes z forward
+    given = SE3(matrix[:3, :3] * flip, matrix[:3, 3])
+    if not given.is_rigid(RIGID_TO):
+        off = (given.rotation.mT @ given.rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
+        finding = f"off orthonormal by {off:.2g}" if off > RIGID_TO else "a mirror image"
+        raise record.error(f"the rotation of transform_matrix is {finding}, expected a rigid transform")
+    return given.normalized()
+
+
+def _matrix(record: Record) -> Tensor:
+    """Return the first three of three or four rows of finite numbers; a fourth row must be 0 0 0 1."""
+    rows = record.items("transform_matrix")
+    if rows is None:
+        raise record.error("no transform_matrix, expected a 4x4 camera-to-world matrix")
+    if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+        raise record.error("transform_matrix is not 3x4 or 4x4, expected a 4x4 camera-to-world matrix")
+    numbers = [[record.checked_number(x, "a number of transform_matrix") for x in row] for row in rows]
+    if len(numbers) == 4 and max(abs(x - y) for x, y in zip(numbers[3], (0, 0, 0, 1), strict=True)) > 1e-6:
+        raise record.error(f"the last row of transform_matrix is {numbers[3]}, expected [0, 0, 0, 1]")
+    return torch.tensor(numbers[:3], dtype=torch.float64)

@@ -1,0 +1,119 @@
+"""Depth images: planar z in metres, and 0 where nothing was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.files import open_binary
+from bidnerf_core.images import decode, reason, to_numpy
+
+FARTHEST = 1e9
+"""Metres. No sensor measures more, and float32 has no use for it."""
+NOTHING = 1e10
+"""Floating-point values from here on stand for "nothing", whatever the unit: Blender's 1e10, the largest float."""
+INTEGER_UNIT, FLOAT_UNIT = 0.001, 1.0
+"""Metres a step where the user gives none."""
+SATURATED = np.iinfo(np.uint16).max
+"""A 16-bit sensor writes this for "too far" or "nothing"; 65.535 once it is converted to metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """A depth image, and what stood in the place of measurements."""
+
+    metres: Float[Tensor, "h w"]  # planar z, 0 where nothing was measured
+    unit: float  # metres a step
+    replaced: dict[str, int]  # how often each kind of value that is not a depth occurred, zeros not counted
+
+    @property
+    def median(self) -> float | None:
+        """The median of the measured distances (metres), or None where nothing was measured."""
+        measured = self.metres[self.metres > 0]
+        return float(measured.median()) if measured.numel() else None
+
+    def remark(self, unit_assumed: bool) -> str | None:
+        """Return a line that says which unit was assumed and which values were dropped, or None."""
+        parts = []
+        if unit_assumed:
+            middle = "nothing was measured" if self.median is None else f"median depth {self.median:.4g} m"
+            parts.append(f"depth_unit is not given, {self.unit:g} m a step is assumed: {middle}")
+        if self.replaced:
+            found = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
+            parts.append(f"counted as not measured: {found}")
+        return "; ".join(parts) or None
+
+
+def read_depth(path: Path, unit: float) -> Float[Tensor, "h w"]:
+    """Read planar z in metres, ``unit`` metres a step; 0 where nothing was measured (see ``depth_image``)."""
+    return read_depth_image(path, unit).metres
+
+
+def read_depth_image(path: Path, unit: float | None) -> DepthImage:
+    """Read a grey image of whole or floating-point numbers, or the ``.npy`` of an array; see ``depth_image``.
+
+    Raises ``InputError`` for anything else.
+    """
+    raw = _load(path) if path.suffix.lower() == ".npy" else decode(path)
+    return depth_image(raw, unit, f"{path}: depth")
+
+
+def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> DepthImage:
+    """Convert an array (h, w) or (h, w, 1) of ``unit`` metres a step; None is 0.001 for integers and 1 for floats.
+
+    Values that no sensor measures become 0: NaN, infinite, negative, the largest of an integer type, 65535 and 65.535 of a
+    floating-point one, and floats of more than 1e9 m (1e10, the largest float). Raises ``InputError``, which begins with
+    ``what``, for arrays of another shape or type and a unit that is not positive.
+    """
+    values = to_numpy(raw)
+    values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
+    if values.ndim != 2 or values.dtype.kind not in "uif":
+        found = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
+        raise InputError(f"{what} is {found}, expected one channel of whole or floating-point numbers")
+    if unit is None:
+        unit = FLOAT_UNIT if values.dtype.kind == "f" else INTEGER_UNIT
+    if not 0 < unit <= FARTHEST:
+        raise InputError(f"{what}: depth_unit is {unit}, expected a positive number of metres a step")
+    metres = values.astype(np.float64) * unit
+    absent = _absent(values, metres)
+    unmeasured = np.logical_or.reduce([metres == 0, *absent.values()])
+    counts = {name: int(mask.sum()) for name, mask in absent.items() if mask.any()}
+    return DepthImage(
+        torch.from_numpy(np.where(unmeasured, 0, metres).astype(np.float32)), float(unit), counts
+    )
+
+
+def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
+    """Masks of the values that stand for "not measured", by what a message calls them; no pixel is in two."""
+    if values.dtype.kind != "f":
+        largest = np.iinfo(values.dtype).max
+        saturated = values == largest
+        far = ~saturated & (metres > FARTHEST)
+        return {"negative": values < 0, str(largest): saturated, f"over {FARTHEST:g} m": far}
+    clipped = SATURATED * INTEGER_UNIT
+    absent = {
+        "NaN": np.isnan(values),
+        "infinite": np.isinf(values),
+        "negative": np.isfinite(values) & (values < 0),
+        str(SATURATED): values == SATURATED,
+        f"{clipped:g}": np.abs(values - clipped) < 1e-5,
+        f"{NOTHING:g} or more": np.isfinite(values) & (values >= NOTHING),
+    }
+    known = np.logical_or.reduce(list(absent.values()))
+    return absent | {f"over {FARTHEST:g} m": ~known & (metres > FARTHEST)}
+
+
+def _load(path: Path) -> np.ndarray:
+    with open_binary(path, "a .npy file") as file:
+        try:
+            return np.asarray(np.load(file, allow_pickle=False))
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(
+                f"{path}: not readable as an array ({reason(error)}), expected a .npy file"
+            ) from error

@@ -1,0 +1,46 @@
+"""How an image is stored and how it is meant to be seen: the eight orientations of EXIF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Shaped
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """The way from the stored raster to the upright image: mirror columns, mirror rows, then transpose."""
+
+    mirrors_columns: bool = False
+    mirrors_rows: bool = False
+    transposes: bool = False
+
+    @staticmethod
+    def from_exif(code: int) -> Orientation:
+        """Return what the EXIF tag 0x0112 stands for (CIPA DC-008, table 6); other codes mean an upright image."""
+        return Orientation(*CODES.get(code, (False, False, False)))
+
+    def upright(self, image: Shaped[Tensor, "sh sw *channels"]) -> Shaped[Tensor, "h w *channels"]:
+        """Turn a stored image."""
+        axes = [axis for axis, flips in ((0, self.mirrors_rows), (1, self.mirrors_columns)) if flips]
+        turned = image.flip(axes) if axes else image
+        return turned.transpose(0, 1).contiguous() if self.transposes else turned
+
+    def upright_size(self, width: int, height: int) -> tuple[int, int]:
+        """Return width and height of the upright image of a stored one of this size."""
+        return (height, width) if self.transposes else (width, height)
+
+
+UPRIGHT = Orientation()
+
+CODES = {
+    1: (False, False, False),
+    2: (True, False, False),
+    3: (True, True, False),
+    4: (False, True, False),
+    5: (False, False, True),
+    6: (False, True, True),  # the camera was turned by a quarter: most portrait photos
+    7: (True, True, True),
+    8: (True, False, True),
+}

@@ -1,0 +1,101 @@
+"""Depth images: units, and values that stand for "nothing measured"."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bidnerf_core.depth_images import depth_image, read_depth
+from bidnerf_core.errors import InputError
+
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
+
+
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        (np.nan, "NaN"),
+        (np.inf, "infinite"),
+        (-np.inf, "infinite"),
+        (-1.0, "negative"),
+        (LARGEST_FLOAT, "1e+10 or more"),
+        (1e10, "1e+10 or more"),
+        (2e9, "over 1e+09 m"),
+        (65535.0, "65535"),
+        (65.535, "65.535"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+def test_floats_that_stand_for_nothing(value: float, name: str, kind: str) -> None:
+    raw = np.array([[1.5, 2.5], [value, 0.0]], dtype=kind)
+    found = depth_image(raw, 1.0, "depth")
+    assert found.metres.tolist() == [[1.5, 2.5], [0, 0]]
+    assert found.replaced == {name: 1}
+    assert found.remark(unit_assumed=False) == f"counted as not measured: 1 x {name}"
+
+
+def test_blenders_background_is_recognised_in_any_unit() -> None:
+    raw = np.array([[1500, 1e10]], dtype=np.float32)
+    assert depth_image(raw, 0.001, "depth").metres.tolist() == [[1.5, 0]]
+
+
+@pytest.mark.parametrize("kind", ["uint16", "int32", "int64", "uint8"])
+def test_the_largest_integer_stands_for_nothing(kind: str) -> None:
+    largest = np.iinfo(kind).max
+    found = depth_image(np.array([[0, 1, 100, largest]], dtype=kind), 0.01, "depth")
+    torch.testing.assert_close(found.metres, torch.tensor([[0, 0.01, 1.0, 0]]))
+    assert found.replaced == {str(largest): 1}
+
+
+def test_no_value_is_counted_twice() -> None:
+    raw = np.array([[np.nan, np.inf, -np.inf, -1, -1e12, 1e30, 65535, 65.535, 0, 1]])
+    found = depth_image(raw, 1.0, "depth")
+    assert sum(found.replaced.values()) == 8
+    assert int((found.metres > 0).sum()) == 1
+
+
+@pytest.mark.parametrize(("kind", "unit"), [("uint16", 0.001), ("int32", 0.001), ("float32", 1.0)])
+def test_a_unit_that_is_missing_is_assumed_and_said(kind: str, unit: float) -> None:
+    found = depth_image(np.array([[0, 1000, 2000, 3000]], dtype=kind), None, "depth")
+    assert found.unit == unit
+    assert found.median == pytest.approx(2000 * unit)
+    expected = f"depth_unit is not given, {unit:g} m a step is assumed: median depth {2000 * unit:g} m"
+    assert found.remark(unit_assumed=True) == expected
+    assert found.remark(unit_assumed=False) is None
+
+
+def test_depth_without_any_measurement_has_no_median() -> None:
+    found = depth_image(np.zeros((2, 3), dtype=np.uint16), None, "depth")
+    assert found.median is None
+    assert "nothing was measured" in str(found.remark(unit_assumed=True))
+
+
+@pytest.mark.parametrize("unit", [0.0, -1.0, np.nan, np.inf])
+def test_units_that_are_none(unit: float) -> None:
+    with pytest.raises(InputError, match=r"depth: depth_unit is .*, expected a positive number of metres"):
+        depth_image(np.ones((2, 2)), unit, "depth")
+
+
+@pytest.mark.parametrize(
+    "raw", [np.ones((2, 2, 3)), np.ones(3), np.ones((2, 2), bool), np.ones((2, 2), "U1")]
+)
+def test_arrays_that_are_no_depth(raw: np.ndarray) -> None:
+    with pytest.raises(InputError, match="expected one channel of whole or floating-point numbers"):
+        depth_image(raw, 1.0, "depth")
+
+
+def test_files_of_every_kind_agree(tmp_path: Path) -> None:
+    steps = np.random.default_rng(0).integers(0, 5000, (6, 8)).astype(np.uint16)
+    Image.fromarray(steps).save(tmp_path / "a.png")
+    Image.fromarray(steps.astype(np.float32)).save(tmp_path / "a.tif")
+    np.save(tmp_path / "a.npy", steps)
+    expected = torch.from_numpy(steps.astype(np.float32) * 0.001)
+    for name in ("a.png", "a.tif", "a.npy"):
+        torch.testing.assert_close(read_depth(tmp_path / name, 0.001), expected)
+    torch.testing.assert_close(
+        depth_image(torch.from_numpy(steps), 0.001, "depth").metres, expected
+    )  # also as torch's uint16

@@ -1,0 +1,223 @@
+"""Decoding image files and arrays: what they become, and what is said of those that are not usable."""
+
+from __future__ import annotations
+
+import os
+import struct
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bidnerf_core import files
+from bidnerf_core.errors import InputError
+from bidnerf_core.images import (
+    LARGEST_IMAGE,
+    ImageHeader,
+    open_image,
+    over,
+    pixel_array,
+    read_header,
+    read_image,
+    reduced,
+    resampled,
+)
+from photo_files import noise
+
+READERS = pytest.mark.parametrize("read", [read_image, read_header], ids=["image", "header"])
+
+
+def empty_png(path: Path, width: int, height: int) -> Path:
+    """Write the PNG of a black image without making the image: a few kilobytes, whatever the size."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    packer = zlib.compressobj()
+    rows = b"".join(packer.compress(bytes(width + 1)) for _ in range(height)) + packer.flush()
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    )
+    return path
+
+
+@READERS
+@pytest.mark.parametrize("size", [(12000, 12000), (60000, 60000)])
+def test_images_of_too_many_pixels_take_no_memory(
+    tmp_path: Path, read: Callable[[Path], object], size: tuple[int, int]
+) -> None:
+    path = empty_png(tmp_path / "bomb.png", size[0], 1)
+    content = bytearray(path.read_bytes())
+    content[16:24] = struct.pack(">II", *size)
+    content[29:33] = struct.pack(">I", zlib.crc32(bytes(content[12:29])))
+    path.write_bytes(content)
+    tracemalloc.start()
+    with pytest.raises(
+        InputError, match=r"bomb\.png: image is .*megapixels, expected at most 100 megapixels"
+    ):
+        read(path)
+    assert tracemalloc.get_traced_memory()[1] < 5e6
+    tracemalloc.stop()
+
+
+def test_the_limit_lets_large_photos_pass(tmp_path: Path) -> None:
+    side = int(LARGEST_IMAGE**0.5)
+    assert read_header(empty_png(tmp_path / "large.png", side, side)) == ImageHeader(side, side, False)
+
+
+@pytest.mark.parametrize(
+    ("mode", "has_alpha"), [("L", False), ("LA", True), ("RGB", False), ("RGBA", True), ("1", False)]
+)
+def test_the_header_says_what_decoding_gives(tmp_path: Path, mode: str, has_alpha: bool) -> None:
+    path = tmp_path / "a.png"
+    Image.fromarray(noise(6, 9, 4)).convert(mode).save(path)
+    colour, alpha = read_image(path)
+    assert read_header(path) == ImageHeader(9, 6, has_alpha)
+    assert colour.shape == (6, 9, 3)
+    assert (alpha is not None) == has_alpha
+
+
+def test_palettes_become_colours(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    image = Image.fromarray(noise(6, 9)).quantize(16)
+    image.save(path)
+    expected = torch.from_numpy(np.array(image.convert("RGB"))).float() / 255
+    torch.testing.assert_close(read_image(path)[0], expected)
+    image.save(path, transparency=0)
+    alpha = read_image(path)[1]
+    assert alpha is not None
+    assert alpha.equal((torch.from_numpy(np.array(image)) != 0).float())
+    assert read_header(path).has_alpha
+
+
+# Files.
+
+
+@READERS
+def test_pipes_and_devices_are_refused_at_once(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    pipe = tmp_path / "pipe.png"
+    os.mkfifo(pipe)
+    for path, kind in ((pipe, "a named pipe"), (tmp_path, "a folder"), (Path("/dev/null"), "a device")):
+        with pytest.raises(InputError, match=f"^{path}: is {kind}, expected an image file$"):
+            read(path)
+
+
+@READERS
+def test_missing_files_and_odd_names(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    with pytest.raises(InputError, match=r"none\.png: no such file, expected an image file"):
+        read(tmp_path / "none.png")
+    with pytest.raises(InputError, match="cannot be opened"):
+        read(tmp_path / "a\0b.png")
+    with pytest.raises(InputError, match="cannot be opened"):
+        read(tmp_path / ("a" * 300))
+
+
+def test_permission_that_is_denied_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.png"
+    Image.fromarray(noise(3, 4)).save(path)
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    path.chmod(0)
+    if os.access(path, os.R_OK):  # nothing is denied to root
+        monkeypatch.setattr(files.Path, "open", refuse)
+    with pytest.raises(InputError, match=r"a\.png: permission denied, expected an image file that may be"):
+        read_image(path)
+
+
+def test_heic_without_its_package_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=r"IMG_1\.HEIC: reading HEIC needs the package pillow-heif \(pip"):
+        read_image(tmp_path / "IMG_1.HEIC")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
+def test_every_cut_of_a_file_is_one_line(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(noise(20, 30)).save(path)
+    whole = path.read_bytes()
+    for count in (0, 1, 10, len(whole) // 4, len(whole) // 2, len(whole) * 3 // 4):
+        path.write_bytes(whole[:count])
+        with pytest.raises(InputError) as caught:
+            read_image(path)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert "\n" not in str(caught.value)
+
+
+def test_an_error_within_the_context_keeps_its_words(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    Image.fromarray(noise(3, 4)).save(path)
+    with pytest.raises(InputError, match=r"^mine$"), open_image(path):
+        raise InputError("mine")
+
+
+# Arrays.
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "float16", "float32", "float64", "bool"])
+@pytest.mark.parametrize("torch_array", [False, True])
+def test_arrays_are_scaled_by_their_type(kind: str, torch_array: bool) -> None:
+    full = {"uint8": 255, "uint16": 65535}.get(kind, 1)
+    array = (np.array([[0.0, 1.0], [1.0, 0.0]]) * full).astype(kind)
+    found = pixel_array(torch.from_numpy(array) if torch_array else array, "rgb")
+    assert found.dtype == torch.float32
+    assert found[..., 0].tolist() == [[0, 1], [1, 0]]
+
+
+def test_what_leaves_the_range_by_rounding_is_clamped() -> None:
+    found = pixel_array(np.array([[-5e-4, 1.0005]]), "rgb")
+    assert found.flatten().tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("array", "said"),
+    [
+        (np.full((2, 2), np.nan), "rgb has 4 values that are NaN or infinite"),
+        (np.full((2, 2, 3), np.inf), "rgb has 12 values that are NaN or infinite"),
+        (np.linspace(0, 255, 12).reshape(2, 2, 3), r"floats from 0 to 255, expected \[0, 1\]; divide by 255"),
+        (np.linspace(-1, 1, 12).reshape(2, 2, 3), r"rgb has floats from -1 to 1, expected \[0, 1\]$"),
+        (np.zeros((2, 2, 3), dtype=np.int64), r"rgb is of int64, expected uint8 in \[0, 255\]"),
+        (np.zeros((2, 2, 3), dtype=complex), "rgb is of complex128"),
+        (np.zeros((2, 2), dtype=object), "rgb is of object"),
+        (np.zeros((3, 20, 30)), r"has shape \(3, 20, 30\).*move the channels last"),
+        (np.zeros((20, 30, 5)), r"rgb has shape \(20, 30, 5\), expected .*1 to 4\)$"),
+        (np.zeros((20, 0, 3)), "rgb has shape"),
+        (np.zeros(20), "rgb has shape"),
+    ],
+)
+def test_arrays_that_are_no_images(array: np.ndarray, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        pixel_array(array, "rgb")
+
+
+def test_reducing_keeps_means_and_commutes_with_compositing() -> None:
+    """An area filter: each new pixel is the mean of a block, and both steps are linear in premultiplied colour."""
+    image = torch.from_numpy(noise(12, 20, 4)).float() / 255
+    small = reduced(image, 5, 3)
+    torch.testing.assert_close(small, image.reshape(3, 4, 5, 4, 4).mean((1, 3)))
+    torch.testing.assert_close(reduced(image, 7, 5).mean((0, 1)), image.mean((0, 1)), atol=1e-5, rtol=0)
+    premultiplied = image[..., :3] * image[..., 3:]
+    expected = reduced(premultiplied, 5, 3) + 0.3 * (1 - small[..., 3:])
+    torch.testing.assert_close(reduced(over(image[..., :3], image[..., 3], (0.3,) * 3), 5, 3), expected)
+
+
+@pytest.mark.parametrize("size", [(29, 17), (40, 30), (41, 1), (8, 6)])
+def test_reducing_is_opencvs_area_filter(size: tuple[int, int]) -> None:
+    cv2 = pytest.importorskip("cv2")
+    image = noise(30, 41).astype(np.float32) / 255
+    expected = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    np.testing.assert_allclose(reduced(torch.from_numpy(image), *size).numpy(), expected, atol=1e-6)
+
+
+def test_resampling_takes_the_nearest_and_invents_nothing() -> None:
+    image = torch.arange(12.0).reshape(3, 4)
+    assert resampled(image, 8, 6).equal(image.repeat_interleave(2, 0).repeat_interleave(2, 1))
+    assert resampled(resampled(image, 12, 9), 4, 3).equal(image)
+    assert set(resampled(image, 7, 5).flatten().tolist()) <= set(image.flatten().tolist())
