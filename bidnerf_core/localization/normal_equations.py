@@ -64,3 +64,17 @@ class Sum:
     def __call__(self, T: SE3) -> NormalEquations:
         first, *others = (cost(T) for cost in self.costs)
         return sum(others, start=first)
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """A cost times a constant: its weight beside others."""
+
+    cost: Cost
+    factor: float
+
+    def __call__(self, T: SE3) -> NormalEquations:
+        found = self.cost(T)
+        return NormalEquations(
+            self.factor * found.cost, self.factor * found.gradient, self.factor * found.hessian
+        )
