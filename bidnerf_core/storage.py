@@ -10,11 +10,11 @@ import contextlib
 import json
 import re
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from safetensors import SafetensorError
@@ -29,15 +29,19 @@ from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.files import write_file as write_file
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
+from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
+from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.registry import load_backend
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.training import TrainingState
 
+Part = TypeVar("Part")
+
 FORMAT = "bidnerf map"
 VERSION = 1
 DESCRIPTION = "map.json"
-TENSORS = r"(weights|training|surface)-\d{8,}-[0-9a-f]{8}\.safetensors"
+TENSORS = r"(weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors"
 OURS = re.compile(rf"{TENSORS}|\.({TENSORS}|map\.json)\.[0-9a-f]{{8}}")
 """Names that a save may leave behind; whatever else is in the folder is not ours to remove."""
 
@@ -67,6 +71,7 @@ class MapInfo:
     weights: str = ""  # file names
     training: str | None = None  # what resuming needs; dropped when training is complete
     surface: str | None = None  # baked from these weights
+    landmarks: str | None = None  # of the training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
     version: int = VERSION
@@ -78,7 +83,8 @@ class Map:
 
     info: MapInfo
     field: RadianceField
-    surface: SurfaceMap | None = None  # none where it was not baked
+    surface: SurfaceMap | None = None  # None where it was not baked
+    landmarks: LandmarkMap | None = None  # None where none were built
 
     @property
     def bounds(self) -> SceneBounds:
@@ -111,7 +117,7 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     """Write one whole map; what an earlier save left is removed once the new one stands."""
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
     training = None if info.complete else f"training-{name}"
-    info = replace(info, weights=f"weights-{name}", training=training, surface=None)
+    info = replace(info, weights=f"weights-{name}", training=training, surface=None, landmarks=None)
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -129,12 +135,26 @@ def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
 
     Raises ``InputError`` where another training has replaced that map meanwhile.
     """
+    return _save_part(folder, of, "surface", surface_tensors(surface))
+
+
+def save_landmarks(folder: Path, of: MapInfo, landmarks: LandmarkMap) -> MapInfo:
+    """Add landmarks to map ``of``, in place of those that it had.
+
+    Raises ``InputError`` where another training has replaced that map meanwhile.
+    """
+    return _save_part(folder, of, "landmarks", landmark_tensors(landmarks))
+
+
+def _save_part(folder: Path, of: MapInfo, part: str, tensors: dict[str, Tensor]) -> MapInfo:
+    """Add a file of tensors to a map under the name of a part of its description."""
     if load_info(folder).weights != of.weights:
-        raise InputError(f"{folder}: was trained anew while its surface was baked; bake it again")
-    info = replace(load_info(folder), surface=f"surface-{of.step:08d}-{secrets.token_hex(4)}.safetensors")
+        raise InputError(f"{folder}: was trained anew while its {part} was made; bake it again")
+    name = f"{part}-{of.step:08d}-{secrets.token_hex(4)}.safetensors"
+    info = replace(load_info(folder), **{part: name})
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     try:
-        write_file(folder / str(info.surface), tensors_to_bytes(surface_tensors(surface)))
+        write_file(folder / name, tensors_to_bytes(tensors))
         write_file(folder / DESCRIPTION, description)
     finally:
         _sweep(folder)
@@ -168,34 +188,41 @@ def load_info(folder: Path) -> MapInfo:
         advice = "it was written by a newer bidnerf, update yours" if newer else "train the map anew"
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; {advice}")
     info = from_plain(MapInfo, found, str(path))
-    for name in (info.weights, info.training, info.surface):
+    for name in (info.weights, info.training, info.surface, info.landmarks):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
     return info
 
 
-def load_map(folder: Path, device: torch.device | str = "cpu", surface: bool = True) -> Map:
-    """The map in ``folder``, its field built by its backend and frozen, on ``device``; the surface stays on the CPU.
+def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
+    """Return the map in ``folder``, its field built by its backend and frozen, on ``device``; what was baked stays on the CPU.
 
-    ``surface``: whether to read that as well.
+    ``baked``: whether to read the surface and the landmarks as well. Raises ``InputError`` where the folder is no map, or a
+    damaged one.
     """
-    info, tensors, baked = _read(folder, surface)
+    folder = Path(folder)
+    info, tensors, surface, landmarks = _read(folder, baked)
     field, _ = build_field(load_backend(info.backend, str(folder)), info, str(folder / DESCRIPTION))
     _check_weights(field, tensors, folder / info.weights)
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
-    return Map(info, field, baked)
+    return Map(info, field, surface, landmarks)
+
+
+def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) -> Part:
+    """Return what ``make`` makes of the tensors in a file. Raises ``InputError`` where it refuses them."""
+    tensors = read_tensors(path)
+    try:
+        return make(tensors)
+    except (KeyError, ValueError) as error:
+        why = f"no tensor {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{path}: not {what} ({why}); bake it anew with 'bidnerf bake'") from error
 
 
 def load_surface(path: Path) -> SurfaceMap:
     """Raises ``InputError`` where the file does not hold what ``surface_tensors`` gives."""
-    tensors = read_tensors(path)
-    try:
-        return surface_from_tensors(tensors)
-    except (KeyError, ValueError) as error:
-        why = f"no tensor {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{path}: not a baked surface ({why}); bake it anew with 'bidnerf bake'") from error
+    return load_part(path, surface_from_tensors, "a baked surface")
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
@@ -207,17 +234,22 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
     return TrainingState(info.step, weights, read_tensors(folder / info.training))
 
 
-def _read(folder: Path, surface: bool) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None]:
-    """Description, weights and surface that belong together, even while a training replaces them."""
+def _read(
+    folder: Path, baked: bool
+) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None]:
+    """Return parts that belong together, even while a training replaces them."""
     info = load_info(folder)
     while True:
         try:
             weights = read_tensors(folder / info.weights)
-            baked = load_surface(folder / info.surface) if surface and info.surface is not None else None
-            return info, weights, baked
+            surface = load_surface(folder / info.surface) if baked and info.surface else None
+            landmarks = None
+            if baked and info.landmarks:
+                landmarks = load_part(folder / info.landmarks, landmarks_from_tensors, "landmarks")
+            return info, weights, surface, landmarks
         except InputError:
             before, info = info, load_info(folder)
-            if (info.weights, info.surface) == (before.weights, before.surface):
+            if replace(before, bidnerf="") == replace(info, bidnerf=""):
                 raise
 
 
@@ -261,7 +293,7 @@ def _sweep(folder: Path) -> None:
     """Remove what saves left that ``map.json`` does not name: earlier ones, and those that did not come to their end."""
     try:
         found = json.loads((folder / DESCRIPTION).read_bytes())
-        kept = {found.get("weights"), found.get("training"), found.get("surface")}
+        kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks")}
     except FileNotFoundError:
         kept = set()
     except (OSError, ValueError, AttributeError):  # damaged: nothing tells what is of use

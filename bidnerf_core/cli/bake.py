@@ -48,7 +48,7 @@ def _bake(
 def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
     """Bake the map in ``folder``; of ``views``, those with measured depth take the place of rendered ones."""
     began = time.monotonic()
-    stored = load_map(folder, surface=False)  # which may be damaged, and is to be replaced
+    stored = load_map(folder, baked=False)  # which may be damaged, and is to be replaced
     measured = [view for view in views if view.frame.has_depth]
     places = [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     if not any(view.frame.has_dense_depth for view in measured):
