@@ -97,6 +97,11 @@ class SceneBounds:
         a, b = self.lower, self.upper
         return (b[0] - a[0], b[1] - a[1], b[2] - a[2])
 
+    @property
+    def centre(self) -> tuple[float, float, float]:
+        a, b = self.lower, self.upper
+        return ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2, (a[2] + b[2]) / 2)
+
     def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
         """Rays limited to the box and to [near, far] (slab method). The limits carry no gradient: they only say where to look."""
         with torch.no_grad():

@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples
 from bidnerf_core.rendering import query_samples, rendering_weights
+from bidnerf_core.voxel_grid import OccupancyMask
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,21 @@ class AroundDepth:
 
 
 @dataclass(frozen=True)
+class OccupiedOnly:
+    """The samples of another sampler, valid only in cells that may hold matter."""
+
+    occupancy: OccupancyMask
+    sampler: RaySampler
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        samples = self.sampler(rays, jitter)
+        return replace(samples, valid=samples.valid & self.occupancy.holds(rays.at(samples.middles)))
+
+
+@dataclass(frozen=True)
 class Resampled:
-    """A field that is asked where ``sampler`` says, in place of its own."""
+    """A field with another sampler in place of its own."""
 
     field: RadianceField
     sampler: RaySampler

@@ -12,9 +12,9 @@ from torch import Generator, Tensor
 
 from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
 from bidnerf_adanerf.bins import Bins, chosen
-from bidnerf_adanerf.dense import Room, dense_samples, opacity, render_softly, soft_student
+from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_student
 from bidnerf_adanerf.oracle_loss import ENOUGH, by_depth, by_weight, oracle_loss
-from bidnerf_adanerf.recipe import Phase, phase_at, sparsity
+from bidnerf_adanerf.recipe import Phase, phase_at, room_for_matter, sparsity
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues, Rays, RaySamples
@@ -219,7 +219,7 @@ def test_bins_without_room_for_matter_are_shaded_now_and_then(
     field: AdaNerfField, generator: Generator
 ) -> None:
     views = list(rgbd_views())
-    room = Room.left_by(views, BOUNDS, 16)
+    room = room_for_matter(views, BOUNDS, 16)
     rays = RayBank(views, BOUNDS).draw(512, generator).rays
     samples, empty = dense_samples(field, rays, room, generator)
     every = field.bins(rays)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -11,21 +12,24 @@ import pytest
 import torch
 from torch import Tensor
 
+from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, RaySampler, RaySamples, SceneBounds, levels
+from bidnerf_core.frames import View
 from bidnerf_core.rendering import query_samples, render
-from bidnerf_core.sampling import Importance, Stratified
+from bidnerf_core.sampling import Importance, OccupiedOnly, Stratified
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.storage import MapInfo, load_map, save_map
 from bidnerf_core.testing import BackendContract
 from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, SIDE, points, rgb_views, rgbd_views
 from bidnerf_core.training import RayBank, TrainingState, depth_term, supervised_loss
+from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.encoding import encoded_width, positional_encoding
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 from bidnerf_vanilla.recipe import LEAST, step_outcome
-from bidnerf_vanilla.room import Room, Within
+from voxels import cell_centres
 
 SMALL = VanillaConfig(
     layers=3, width=32, skip=1, position_frequencies=4, direction_frequencies=1, coarse_samples=24, fine_samples=8,
@@ -142,7 +146,7 @@ def test_an_untrained_field_is_nearly_transparent() -> None:
 
 
 def inner(sampler: RaySampler) -> RaySampler:
-    assert isinstance(sampler, Within)
+    assert isinstance(sampler, OccupiedOnly)
     return sampler.sampler
 
 
@@ -203,18 +207,21 @@ def test_no_gradient_flows_through_the_choice_of_place() -> None:
 
 
 def test_room_is_everywhere_until_it_is_carved() -> None:
-    room = Room(BOUNDS, 8)
+    room = OccupancyMask(VoxelGrid.cube(BOUNDS, 8))
     positions = torch.randn(100, 3) * 3 * SIDE
     assert bool(room.holds(positions).all())
     room.cells[:] = False
     room.cells[2, 3, 5] = True
-    places = room.lower + (torch.cartesian_prod(*[torch.arange(8)] * 3) + 0.5) * (room.side / 8)
-    assert torch.equal(room.holds(places).reshape(8, 8, 8), room.cells)
+    assert torch.equal(room.holds(cell_centres(room.grid)), room.cells)
+
+
+def carve(field: VanillaField, views: Sequence[View]) -> None:
+    field.room.cells.copy_(occupied_voxels(views, field.room.grid))
 
 
 def test_nothing_is_asked_where_there_is_no_room() -> None:
     field = built()
-    field.room.carve(rgbd_views())
+    carve(field, rgbd_views())
     rays = rays_of_view()
     for level in levels(field):
         everywhere, found = inner(level.sampler)(rays), level.sampler(rays)
@@ -228,7 +235,7 @@ def test_nothing_is_asked_where_there_is_no_room() -> None:
 def test_carving_leaves_what_is_seen() -> None:
     """Each pixel that shows matter has room on its ray where its depth was measured."""
     field = built(room_resolution=32)
-    field.room.carve(rgbd_views())
+    carve(field, rgbd_views())
     batch = RayBank(rgbd_views(), BOUNDS).draw(2000, torch.Generator().manual_seed(1))
     hit = batch.distance > 0
     places = batch.rays.at(batch.distance[:, None])[:, 0]
@@ -237,7 +244,7 @@ def test_carving_leaves_what_is_seen() -> None:
 
 def test_views_without_silhouette_or_depth_carve_nothing() -> None:
     field = built()
-    field.room.carve(rgb_views())
+    carve(field, rgb_views())
     assert bool(field.room.cells.all())
 
 

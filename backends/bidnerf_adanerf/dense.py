@@ -2,50 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_adanerf.field import AdaNerfField
-from bidnerf_core.carving import occupied_cells
-from bidnerf_core.field import FieldValues, Rays, RaySamples, SceneBounds
-from bidnerf_core.frames import View
+from bidnerf_core.field import FieldValues, Rays, RaySamples
 from bidnerf_core.rendering import Rendering
+from bidnerf_core.voxel_grid import OccupancyMask
 
-TOLERANCE = 0.05
-"""Part by which the measured depth of a real sensor may be off."""
 PROBED = 1 / 16
 """Share of the bins without room for matter that are shaded all the same, to learn that they are empty."""
 
 
-@dataclass(frozen=True, eq=False)
-class Room:
-    """A cube of cells about the scene: where the training views leave room for matter. It serves training only."""
-
-    lower: Float[Tensor, "3"]
-    side: float  # metres
-    cells: Bool[Tensor, "n n n"]
-
-    @staticmethod
-    def left_by(views: Sequence[View], bounds: SceneBounds, resolution: int) -> Room:
-        side = max(bounds.size)
-        x, y, z = ((a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True))
-        half = side / 2
-        lower, upper = (x - half, y - half, z - half), (x + half, y + half, z + half)
-        cells = occupied_cells(views, lower, upper, (resolution,) * 3, TOLERANCE)
-        return Room(torch.tensor(lower), side, cells)
-
-    def holds(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
-        count = len(self.cells)
-        x, y, z = ((positions - self.lower) * (count / self.side)).long().clamp_(0, count - 1).unbind(-1)
-        return self.cells.view(-1)[(x * count + y) * count + z]
-
-
 def dense_samples(
-    field: AdaNerfField, rays: Rays, room: Room | None, generator: Generator
+    field: AdaNerfField, rays: Rays, room: OccupancyMask | None, generator: Generator
 ) -> tuple[RaySamples, Tensor]:
     """The bins that are shaded, jittered, and which of them are known to be empty."""
     samples = field.bins(rays, generator)

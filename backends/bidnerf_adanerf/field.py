@@ -27,15 +27,14 @@ class AdaNerfField(nn.Module):
     There are no coarser ``levels``: the shading network is trained where the oracle looks, at one level of detail.
     """
 
-    middle: Float[Tensor, "3"]
+    centre: Float[Tensor, "3"]
 
     def __init__(self, config: AdaNerfConfig, bounds: SceneBounds) -> None:
         super().__init__()
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
-        self.register_buffer("middle", torch.tensor(middle), persistent=False)
+        self.register_buffer("centre", torch.tensor(bounds.centre), persistent=False)
         self.shading = ShadingNetwork(
             config.width, config.layers, config.position_frequencies, config.direction_frequencies
         )
@@ -58,7 +57,7 @@ class AdaNerfField(nn.Module):
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Positions are brought into the cube [-1, 1], densities are per its side: no unit of length matters."""
         shape = positions.shape[:-1]
-        points = (positions.reshape(-1, 3) - self.middle) * (2 / self.side)
+        points = (positions.reshape(-1, 3) - self.centre) * (2 / self.side)
         raw, rgb = self.shading(points, directions.reshape(-1, 3))
         density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))

@@ -11,12 +11,15 @@ from torch import Generator
 
 from bidnerf_adanerf.bins import ray_logits
 from bidnerf_adanerf.config import AdaNerfConfig
-from bidnerf_adanerf.dense import Room, dense_samples, opacity, render_softly, soft_student
+from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_student
 from bidnerf_adanerf.field import AdaNerfField
 from bidnerf_adanerf.oracle_loss import oracle_loss
+from bidnerf_core.carving import occupied_voxels
+from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import query_samples, render, rendering_weights
 from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 
 PROBE = 4096
 """Rays from which is learnt how many samples a ray takes."""
@@ -44,7 +47,7 @@ def sparsity(step: int, config: AdaNerfConfig) -> float:
 
 def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
-    room = Room.left_by(views, field.bounds, config.room_resolution) if config.carve else None
+    room = room_for_matter(views, field.bounds, config.room_resolution) if config.carve else None
     bank = RayBank(views, field.bounds)
 
     @cache
@@ -66,8 +69,15 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
     fit(field, groups, outcome, config.steps, report, seed=config.seed)
 
 
+def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int) -> OccupancyMask:
+    """Return where the training views leave room for matter. It serves training only and is not saved."""
+    room = OccupancyMask(VoxelGrid.cube(bounds, resolution))
+    room.cells.copy_(occupied_voxels(views, room.grid))
+    return room
+
+
 def dense_step(
-    field: AdaNerfField, batch: RayBatch, room: Room | None, config: AdaNerfConfig, step: int, generator: Generator
+    field: AdaNerfField, batch: RayBatch, room: OccupancyMask | None, config: AdaNerfConfig, step: int, generator: Generator
 ) -> StepOutcome:  # fmt: skip
     """All bins are shaded, and count in full or, in the soft phase, as much as their scores say."""
     samples, empty = dense_samples(field, batch.rays, room, generator)

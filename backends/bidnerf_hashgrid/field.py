@@ -41,8 +41,8 @@ class HashGridField(nn.Module):
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
-        self.register_buffer("lower", torch.tensor([m - self.side / 2 for m in middle]), persistent=False)
+        lower = [middle - self.side / 2 for middle in bounds.centre]
+        self.register_buffer("lower", torch.tensor(lower), persistent=False)
         self.encoding = HashEncoding(config.encoding)
         self.geometry = nn.Sequential(
             nn.Linear(self.encoding.width, config.width),

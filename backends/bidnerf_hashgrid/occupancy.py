@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Generator, Tensor, nn
 
 from bidnerf_core.field import Rays, RaySamples, SceneBounds
+from bidnerf_core.voxel_grid import VoxelGrid
 
 BLOCK = 8
 """Steps along a ray that are skipped together where nothing is near."""
@@ -21,7 +22,6 @@ class OccupancyGrid(nn.Module):
     move, their neighbours.
     """
 
-    lower: Float[Tensor, "3"]
     peak: Float[Tensor, "n n n"]
     samples_per_ray: Float[Tensor, ""]  # running mean over training rays
     occupied: Bool[Tensor, "n n n"]
@@ -29,13 +29,10 @@ class OccupancyGrid(nn.Module):
 
     def __init__(self, bounds: SceneBounds, resolution: int, steps_per_cell: int = 2) -> None:
         super().__init__()
-        self.resolution = resolution
-        self.side = max(bounds.size)
-        self.step = self.side / (resolution * steps_per_cell)
+        self.grid = VoxelGrid.cube(bounds, resolution)
+        self.step = max(bounds.size) / (resolution * steps_per_cell)  # metres
         self._reach = -(-BLOCK // (2 * steps_per_cell))  # cells from the middle of a block to its ends
-        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
-        self.register_buffer("lower", torch.tensor([m - self.side / 2 for m in middle]), persistent=False)
-        shape = (resolution,) * 3
+        shape = self.grid.shape
         self.register_buffer("peak", torch.ones(shape))
         self.register_buffer("samples_per_ray", torch.full((), float(resolution)))
         self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool))
@@ -51,7 +48,7 @@ class OccupancyGrid(nn.Module):
     @torch.no_grad()
     def observe(self, positions: Float[Tensor, "p 3"], weights: Float[Tensor, "p"], fade: float) -> None:
         """Take note of the weights that one batch of rays gave to sampled positions."""
-        cells = self._cells(positions)
+        cells = self.grid.numbers(positions)
         seen = torch.zeros_like(self.peak).view(-1).scatter_reduce_(0, cells, weights.to(self.peak), "amax")
         flat = self.peak.view(-1)
         flat[cells] = torch.maximum(flat[cells] * fade, seen[cells])
@@ -74,10 +71,8 @@ class OccupancyGrid(nn.Module):
         steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
         distance = start[:, None] + steps + (offset[ray] * self.step)[:, None]
         positions = origins[ray][:, None] + distance[..., None] * directions[ray][:, None]
-        within = (
-            (positions >= self.lower.to(positions)) & (positions <= (self.lower + self.side).to(positions))
-        ).all(-1)
-        kept = self.occupied.view(-1)[self._cells(positions)] & (distance < far[ray][:, None]) & within
+        occupied = self.grid.at(self.occupied, positions) & self.grid.contains(positions)
+        kept = occupied & (distance < far[ray][:, None])
         return self._padded(distance[kept], ray[:, None].expand_as(kept)[kept], near, far, shape)
 
     def _busy_blocks(
@@ -91,7 +86,7 @@ class OccupancyGrid(nn.Module):
         ray, block = inside.nonzero(as_tuple=True)
         start = starts[ray, block]
         middle = origins[ray] + (start + length / 2)[:, None] * directions[ray]
-        busy = self.near_occupied.view(-1)[self._cells(middle)]
+        busy = self.grid.at(self.near_occupied, middle)
         return ray[busy], start[busy]
 
     def _padded(
@@ -110,15 +105,6 @@ class OccupancyGrid(nn.Module):
         return RaySamples(
             starts.reshape(*shape, width), ends.reshape(*shape, width), valid.reshape(*shape, width)
         )
-
-    def _cells(self, positions: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
-        scaled = (positions - self.lower.to(positions)) * (self.resolution / self.side)
-        x, y, z = scaled.long().clamp_(0, self.resolution - 1).unbind(-1)
-        return (x * self.resolution + y) * self.resolution + z
-
-    def centres(self) -> Float[Tensor, "n n n 3"]:
-        axis = (torch.arange(self.resolution, device=self.lower.device) + 0.5) * (self.side / self.resolution)
-        return self.lower + torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
 
     def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))

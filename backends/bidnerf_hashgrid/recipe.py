@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from torch import Generator, Tensor
+from torch import Generator
 
-from bidnerf_core.carving import occupied_cells
+from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
@@ -59,7 +59,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
     """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
     if config.carve and report.resume() is None:
         for grid in (field.sampler, field.coarse_sampler):
-            grid.restrict(_room_for_matter(grid, views))
+            grid.restrict(occupied_voxels(views, grid.grid))
     bank = RayBank(views, field.bounds)
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
@@ -82,13 +82,6 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
     fit(field, groups, outcome, config.steps, report, seed=config.seed)
-
-
-def _room_for_matter(grid: OccupancyGrid, views: Sequence[View]) -> Tensor:
-    upper = grid.lower + grid.side
-    shape = (grid.resolution,) * 3
-    # Measured depth of a real sensor is off by a few per cent, and a cell that is emptied by mistake is lost.
-    return occupied_cells(views, tuple(grid.lower.tolist()), tuple(upper.tolist()), shape, tolerance=0.05)
 
 
 def _tend(

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.sampling import Importance, Stratified
+from bidnerf_core.sampling import Importance, OccupiedOnly, Stratified
+from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
-from bidnerf_vanilla.room import Room, Within
 
 SHARPNESS = 30.0
 """Density per side of the scene at a raw density of about 1: networks whose outputs are small see surfaces."""
@@ -32,20 +32,19 @@ class FieldConfig(NetworkConfig):
 class Level(nn.Module):
     """One network, and where on a ray it is asked."""
 
-    middle: Float[Tensor, "3"]
+    centre: Float[Tensor, "3"]
 
     def __init__(self, config: NetworkConfig, bounds: SceneBounds, sampler: RaySampler) -> None:
         super().__init__()
         self.sampler = sampler
         self.side = max(bounds.size)
-        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
-        self.register_buffer("middle", torch.tensor(middle), persistent=False)
+        self.register_buffer("centre", torch.tensor(bounds.centre), persistent=False)
         self.network = NerfNetwork(config)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Positions are brought into the cube [-1, 1], densities are per its side: no unit of length matters."""
         shape = positions.shape[:-1]
-        points = (positions.reshape(-1, 3) - self.middle) * (2 / self.side)
+        points = (positions.reshape(-1, 3) - self.centre) * (2 / self.side)
         raw, rgb = self.network(points, directions.reshape(-1, 3))
         density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
@@ -59,9 +58,11 @@ class VanillaField(nn.Module):
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        self.room = Room(bounds, config.room_resolution)
-        self.coarse = Level(config, bounds, Within(self.room, Stratified(config.coarse_samples)))
-        self.fine = Level(config, bounds, Within(self.room, Importance(self.coarse, config.fine_samples)))
+        self.room = OccupancyMask(VoxelGrid.cube(bounds, config.room_resolution))
+        self.coarse = Level(config, bounds, OccupiedOnly(self.room, Stratified(config.coarse_samples)))
+        self.fine = Level(
+            config, bounds, OccupiedOnly(self.room, Importance(self.coarse, config.fine_samples))
+        )
 
     @property
     def sampler(self) -> RaySampler:

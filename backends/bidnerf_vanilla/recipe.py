@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator
 
+from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
@@ -60,7 +61,7 @@ class VanillaConfig(FieldConfig):
 def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
     if config.carve:
-        field.room.carve(views)
+        field.room.cells.copy_(occupied_voxels(views, field.room.grid))
     bank = RayBank(views, field.bounds)
     rays_per_step = _rays_per_step(field, bank, config)
 
