@@ -75,7 +75,11 @@ class WaveBackend:
 
         def outcome(step: int, generator: Generator) -> StepOutcome:
             batch = bank.draw(256, generator)
-            error = (render(field, batch.rays, batch.background, generator).rgb - batch.rgb).square().mean()
+            error = (
+                (render(field, batch.rays, batch.background, generator).rgb - batch.observed.rgb)
+                .square()
+                .mean()
+            )
             return StepOutcome(error, float(error.detach()))
 
         groups = [{"params": list(field.parameters()), "lr": 0.02}]

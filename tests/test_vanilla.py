@@ -237,8 +237,8 @@ def test_carving_leaves_what_is_seen() -> None:
     field = built(room_resolution=32)
     carve(field, rgbd_views())
     batch = RayBank(rgbd_views(), BOUNDS).draw(2000, torch.Generator().manual_seed(1))
-    hit = batch.distance > 0
-    places = batch.rays.at(batch.distance[:, None])[:, 0]
+    hit = batch.observed.distance > 0
+    places = batch.rays.at(batch.observed.distance[:, None])[:, 0]
     assert float(field.room.holds(places[hit]).float().mean()) > 0.99
 
 
@@ -257,14 +257,14 @@ def test_what_is_compared_with_measured_depth() -> None:
     batch = RayBank(rgbd_views(), BOUNDS).draw(300, torch.Generator().manual_seed(0))
     rendering = render(field, batch.rays, batch.background)
     total, count = 0.0, 0
-    for w, t, d in zip(rendering.weights, rendering.samples.middles, batch.distance, strict=True):
+    for w, t, d in zip(rendering.weights, rendering.samples.middles, batch.observed.distance, strict=True):
         if d > 0:
             total += float((w * (t - d).abs()).sum() + (1 - w.sum()) * d)
             count += 1
     assert count > 10
     assert float(depth_term(rendering, batch)) == pytest.approx(total / count, rel=1e-4)
     loss, mse = supervised_loss(rendering, batch, SIDE, 0.5)
-    assert mse == pytest.approx(float(((rendering.rgb - batch.rgb) ** 2).mean()))
+    assert mse == pytest.approx(float(((rendering.rgb - batch.observed.rgb) ** 2).mean()))
     assert float(loss) == pytest.approx(mse + 0.5 * total / count / SIDE, rel=1e-4)
 
 
@@ -290,7 +290,7 @@ def test_loss_falls_at_both_levels() -> None:
 
     def error(level: RadianceField) -> float:
         batch = RayBank(views, BOUNDS).draw(1000, torch.Generator().manual_seed(5))
-        return float(((render(level, batch.rays, batch.background).rgb - batch.rgb) ** 2).mean())
+        return float(((render(level, batch.rays, batch.background).rgb - batch.observed.rgb) ** 2).mean())
 
     before = [error(level) for level in levels(field)]
     backend.train(field, views, replace(SMALL, steps=150), Recorder())
@@ -311,7 +311,7 @@ def test_a_step_takes_more_rays_where_there_is_little_room() -> None:
 # Configuration and storage.
 
 
-@pytest.mark.parametrize("config", [VanillaConfig(), VanillaConfig.small(), VanillaConfig.paper(), SMALL])
+@pytest.mark.parametrize("config", [VanillaConfig(), VanillaConfig.paper(), SMALL])
 def test_configs_survive_json(config: VanillaConfig) -> None:
     assert from_plain(VanillaConfig, json.loads(json.dumps(to_plain(config))), "config") == config
 

@@ -58,13 +58,8 @@ class AdaNerfConfig:
             raise InputError(f"dense_part and soft_part make {parts:g}, expected 1 or less together")
 
     @classmethod
-    def small(cls) -> AdaNerfConfig:
-        """The defaults."""
-        return cls()
-
-    @classmethod
     def paper(cls) -> AdaNerfConfig:
-        """Sizes of the paper: two networks of 8 layers of 256, 128 bins."""
+        """Return the sizes of the paper: two networks of 8 layers of width 256, and 128 bins."""
         return cls(
             width=256, layers=8, position_frequencies=10, direction_frequencies=4, oracle_width=256, oracle_layers=8,
             bins=128, steps=300_000, samples_per_step=2048 * 128, rays_at_most=2048, learning_rate=5e-4, carve=False,

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bidnerf_core.field import RaySamples
-from bidnerf_core.training import RayBatch
+from bidnerf_core.training import TrainingBatch
 
 BLUR = 2.0
 """How many bins from the measured depth a bin may be and still matter somewhat."""
@@ -20,7 +20,7 @@ def oracle_loss(
     logits: Float[Tensor, "r n"],
     samples: RaySamples,
     weights: Float[Tensor, "r n"],
-    batch: RayBatch,
+    batch: TrainingBatch,
 ) -> Float[Tensor, ""]:
     """Cross entropy of the scores with soft targets in [0, 1], over the rays that meet the scene.
 
@@ -39,9 +39,9 @@ def by_weight(weights: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:
     return ((weights + beside) / 2 / ENOUGH).clamp(max=1)
 
 
-def by_depth(samples: RaySamples, batch: RayBatch) -> Float[Tensor, "r n"]:
+def by_depth(samples: RaySamples, batch: TrainingBatch) -> Float[Tensor, "r n"]:
     """A bin matters where depth was measured, and less the farther it is from there; not at all where none was."""
     width = (samples.ends - samples.starts).clamp(min=1e-9)
-    away = (samples.middles - batch.distance[:, None]).abs() / width  # in bins
+    away = (samples.middles - batch.observed.distance[:, None]).abs() / width  # in bins
     near = (1 - away / BLUR).clamp(min=0)
-    return torch.where((batch.distance > 0)[:, None], near, 0)
+    return torch.where(batch.observed.measured[:, None], near, 0)

@@ -18,7 +18,7 @@ from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import query_samples, render, rendering_weights
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
 from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 
 PROBE = 4096
@@ -77,7 +77,7 @@ def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int)
 
 
 def dense_step(
-    field: AdaNerfField, batch: RayBatch, room: OccupancyMask | None, config: AdaNerfConfig, step: int, generator: Generator
+    field: AdaNerfField, batch: TrainingBatch, room: OccupancyMask | None, config: AdaNerfConfig, step: int, generator: Generator
 ) -> StepOutcome:  # fmt: skip
     """All bins are shaded, and count in full or, in the soft phase, as much as their scores say."""
     samples, empty = dense_samples(field, batch.rays, room, generator)
@@ -97,9 +97,9 @@ def dense_step(
 
 
 def sparse_step(
-    field: AdaNerfField, batch: RayBatch, config: AdaNerfConfig, generator: Generator
+    field: AdaNerfField, batch: TrainingBatch, config: AdaNerfConfig, generator: Generator
 ) -> StepOutcome:
     """As in localization: the oracle, which learns no more, chooses, and the shading network makes the best of it."""
     rendering = render(field, batch.rays, batch.background, generator)
     loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
-    return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch.rgb)))
+    return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))

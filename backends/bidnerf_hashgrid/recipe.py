@@ -11,7 +11,7 @@ from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 
@@ -85,7 +85,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
 
 
 def _tend(
-    grid: OccupancyGrid, batch: RayBatch, rendering: Rendering, step: int, config: HashGridConfig
+    grid: OccupancyGrid, batch: TrainingBatch, rendering: Rendering, step: int, config: HashGridConfig
 ) -> None:
     """Keep the occupancy grid abreast of what the rays saw."""
     valid = rendering.samples.valid

@@ -12,7 +12,7 @@ from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
 LEAST = {
@@ -45,13 +45,8 @@ class VanillaConfig(FieldConfig):
             raise InputError("position_frequencies is 0 without include_input, expected one of them")
 
     @classmethod
-    def small(cls) -> VanillaConfig:
-        """The defaults."""
-        return cls()
-
-    @classmethod
     def paper(cls) -> VanillaConfig:
-        """Sizes and training of the paper (section 5.3, appendix A)."""
+        """Return the sizes and the training of the paper (section 5.3, appendix A)."""
         return cls(
             layers=8, width=256, skip=5, position_frequencies=10, direction_frequencies=4, coarse_samples=64,
             fine_samples=128, steps=200_000, samples_per_step=4096 * 192, learning_rate=5e-4, carve=False,
@@ -73,13 +68,13 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
 
 
 def step_outcome(
-    field: VanillaField, batch: RayBatch, depth_weight: float, generator: Generator
+    field: VanillaField, batch: TrainingBatch, depth_weight: float, generator: Generator
 ) -> StepOutcome:
     """Both levels must see what was seen (eq. 6); the samples that are counted are the fine level's."""
     coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
     rough, _ = supervised_loss(coarse, batch, field.side, depth_weight)
     loss, mse = supervised_loss(fine, batch, field.side, depth_weight)
-    return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch.rgb)))
+    return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch)))
 
 
 @torch.no_grad()

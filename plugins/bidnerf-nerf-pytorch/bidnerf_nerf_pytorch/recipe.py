@@ -57,7 +57,7 @@ def train(field: NerfPytorchField, views: Sequence[View], config: NerfPytorchCon
         coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
         rough, _ = supervised_loss(coarse, batch, side, config.depth_weight)
         loss, mse = supervised_loss(fine, batch, side, config.depth_weight)
-        return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch.rgb)))
+        return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch)))
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
     fit(field, groups, outcome, config.steps, report, seed=config.seed)
