@@ -68,12 +68,12 @@ class RecipeBackend(Generic[Config, Field]):
     """A ``Backend`` that is composed of a config, a field and a training recipe. A seed reproduces the initial weights."""
 
     summary: str
-    config_type: type[Config]
+    config_type: type
     field_type: Callable[[Config, SceneBounds], Field]
     recipe: Callable[[Field, Sequence[View], Config, Report], None]
     quick: Config | None = None  # for small and simple scenes
 
-    def quick_config(self) -> Config:
+    def quick_config(self) -> Any:
         return self.config_type() if self.quick is None else self.quick
 
     def build(self, config: Config, bounds: SceneBounds) -> Field:

@@ -342,6 +342,6 @@ def test_the_same_generator_draws_the_same_rays(generator: torch.Generator) -> N
     other = bank.draw(50, generator)
     generator.set_state(state)
     again = bank.draw(50, generator)
-    assert torch.equal(one.rgb, again.rgb)
+    assert torch.equal(one.observed.rgb, again.observed.rgb)
     assert torch.equal(one.background, again.background)
-    assert not torch.equal(one.rgb, other.rgb)
+    assert not torch.equal(one.observed.rgb, other.observed.rgb)

@@ -1,4 +1,4 @@
-"""Size of an AdaNeRF, how sparse it is, and how it is trained."""
+"""Settings of an AdaNeRF: its size, its sparsity and its training."""
 
 from __future__ import annotations
 
@@ -16,36 +16,40 @@ LEAST = {
 
 @dataclass(frozen=True)
 class AdaNerfConfig:
-    """The defaults suit some ten minutes on one core of a small CPU."""
+    """Settings of an AdaNeRF. With the defaults, training takes about ten minutes on one core of a small CPU."""
 
     # The shading network.
     width: int = 128  # of the hidden layers
     layers: int = 4
     position_frequencies: int = 8
     direction_frequencies: int = 2
-    # The sampling network, called oracle.
+    # The sampling network, here called the oracle.
     oracle_width: int = 256
     oracle_layers: int = 3
-    ray_points: int = 16  # points of a ray that describe it to the oracle
-    ray_frequencies: int = 3  # with which each of them is encoded
-    # How many samples a ray takes: the user's dial. It may be turned on a trained map. Fewer samples are faster, but holes
-    # in the picture, where bins are missed, lead a pose astray long before they are seen.
-    bins: int = 64  # equal parts of a ray's way through the scene's box, each with a score
-    threshold: float = 0.03  # a bin whose score is above it is shaded ...
-    max_samples: int = 16  # ... if it is among so many of its ray with the highest scores
+    ray_points: int = 16  # points that describe a ray to the oracle
+    ray_frequencies: int = 3  # of the encoding of each of them
+    # How many samples a ray takes. The last two may be changed in a trained map. Fewer samples are faster, but the holes
+    # where bins are missed lead a pose astray long before they are visible.
+    bins: int = 64  # equal parts of a ray's segment in the scene's box, each with a score
+    threshold: float = 0.03  # a bin is shaded if its score is above this ...
+    max_samples: int = 16  # ... and among so many highest scores of its ray
     # Training.
     steps: int = 4500
     dense_part: float = 0.4  # of the steps: all bins are shaded and count
-    soft_part: float = 0.2  # of the steps, then: bins count as their scores say; the rest shades sparsely
-    samples_per_step: int = 8192  # the number of rays follows from it
+    soft_part: float = 0.2  # of the steps, after those: bins are weighted by their scores; the remaining steps shade sparsely
+    samples_per_step: int = 8192  # it decides the number of rays
     rays_at_most: int = 4096  # per step
     learning_rate: float = 3e-3
     depth_weight: float = 0.1
     sparsity_weight: float = 0.01  # of the mean score, once the soft phase is half over
-    oracle_weight: float = 0.1  # of what measured depth and the shaded bins teach the oracle
+    oracle_weight: float = (
+        0.1  # of the oracle's own loss, which has measured depth and the shaded bins as targets
+    )
     empty_weight: float = 0.1  # of the opacity of bins that are known to be empty
-    carve: bool = True  # in training, take bins as empty where depth and silhouettes leave no matter
-    room_resolution: int = 64  # cells along the longest side of the scene, for that
+    carve: bool = (
+        True  # in training, treat bins as empty where the views' depth and silhouettes leave no matter
+    )
+    room_resolution: int = 64  # cells along the longest side of the scene, for ``carve``
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -52,7 +52,7 @@ class _Level:
 
 
 def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
-    """Resolutions by eqs. 2 and 3; a level whose vertices fit in the table is stored without a hash."""
+    """Return the levels, with resolutions by eqs. 2 and 3; one whose vertices fit in the table is stored without a hash."""
     if not 1 <= config.log2_table_size <= 30:
         raise ValueError(f"log2_table_size must be in 1..30, got {config.log2_table_size}")
     if config.levels < 1 or config.features < 1:
@@ -77,7 +77,7 @@ def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
 def _vertices(
     points: Float[Tensor, "3 n"], level: _Level, dtype: torch.dtype
 ) -> tuple[Int[Tensor, "3 2 n"], Float[Tensor, "3 n"]]:
-    """What the lower and the upper vertex of each axis add to a corner's index, and the position in the cell."""
+    """Return the terms of the lower and upper vertex of each axis in a corner's index, and the position in the cell."""
     scaled = points * level.resolution
     # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
     lower = scaled.to(dtype).clamp_(0, level.resolution - 1)
@@ -88,14 +88,14 @@ def _vertices(
 
 
 def _corner_indices(terms: Int[Tensor, "3 2 m"], level: _Level) -> Int[Tensor, " 8*m"]:
-    """Table index of the eight corners (eq. 4, or the dense index), ordered (z, y, x, point)."""
+    """Return the table indices of the eight corners (eq. 4, or the dense index), ordered (z, y, x, point)."""
     combine = torch.bitwise_xor if level.hashed else torch.add
     x, y, z = terms.unbind()
     return combine(combine(z[:, None], y)[:, :, None], x).view(-1)
 
 
 def _weights(fraction: Float[Tensor, "3 n"], level: _Level, unit: int) -> Float[Tensor, "3 w"]:
-    """Weight of the upper vertex by axis (the fraction, or its smoothstep), repeated within a unit."""
+    """Return the weight of the upper vertex by axis (the fraction, or its smoothstep), repeated within a unit."""
     return _repeat(fraction * fraction * (3 - 2 * fraction) if level.smooth else fraction, unit)
 
 
@@ -108,7 +108,7 @@ def _unit(features: int) -> int:
 
 
 def _as_units(values: Float[Tensor, "*shape w"], unit: int) -> Shaped[Tensor, "*shape n"]:
-    """View of adjacent pairs of floats as complex numbers, if the unit is a pair."""
+    """Return a view of adjacent pairs of floats as complex numbers, if the unit is a pair."""
     return torch.view_as_complex(values.unflatten(-1, (-1, 2))) if unit == 2 else values
 
 
@@ -126,7 +126,7 @@ def _interpolate(corners: Float[Tensor, "2 2 2 w"], weights: Float[Tensor, "3 w"
 def _interpolate_with_slopes(
     corners: Float[Tensor, "2 2 2 w"], weights: Float[Tensor, "3 w"]
 ) -> tuple[Float[Tensor, " w"], list[Float[Tensor, " w"]]]:
-    """Interpolated value and its derivatives by the weights of x, y and z."""
+    """Return the interpolated value and its derivatives by the weights of x, y and z."""
     x, y, z = weights.unbind()
     slopes: list[Tensor] = []
     for weight in (z, y, x):
@@ -137,7 +137,7 @@ def _interpolate_with_slopes(
 
 
 def _spread(gradient: Float[Tensor, " w"], weights: Float[Tensor, "3 w"]) -> Float[Tensor, "2 2 2 w"]:
-    """Transpose of ``_interpolate``: the gradient to each of the eight corners."""
+    """Return the gradient to each of the eight corners: the transpose of ``_interpolate``."""
     for weight in weights.unbind():
         corners = gradient.new_empty(2, *gradient.shape)
         torch.mul(gradient, weight, out=corners[1])

@@ -32,7 +32,7 @@ class FieldConfig:
 
 
 class HashGridField(nn.Module):
-    """Density and colour of points of a scene's box. ``levels`` are the field with its fine levels masked, and itself."""
+    """Density and colour in a scene's box. Its ``levels`` are the field with its fine encoding levels masked, and itself."""
 
     lower: Float[Tensor, "3"]
 
@@ -67,10 +67,10 @@ class HashGridField(nn.Module):
     def query_levels(
         self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], active: int | None
     ) -> FieldValues:
-        """As ``query``, with the first ``active`` levels of the encoding only."""
+        """Return the values with the first ``active`` levels of the encoding only (None: all)."""
         shape = positions.shape[:-1]
         features = self.geometry(self.encode(positions.reshape(-1, 3), active))
-        # Per side of the scene, so that an untrained field is equally thin whatever the unit of length.
+        # Per side of the scene, so that an untrained field is equally thin in any unit of length.
         density = features[:, 0].clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
         seen = torch.cat([features[:, 1:], spherical_harmonics(directions.reshape(-1, 3))], dim=-1)
         return FieldValues(density.reshape(shape), self.colour(seen).reshape(*shape, 3))
@@ -86,7 +86,7 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
 
 @dataclass(frozen=True)
 class CoarseField:
-    """A hash-grid field seen through its coarse levels only: blurred, cheaper, with wider gradients."""
+    """A hash-grid field with its coarse encoding levels only: blurred, cheaper, with gradients of wider range."""
 
     fine: HashGridField
 
@@ -99,7 +99,7 @@ class CoarseField:
 
 
 def spherical_harmonics(directions: Float[Tensor, "p 3"]) -> Float[Tensor, "p 9"]:
-    """Real spherical harmonics of degrees 0 to 2 at unit directions."""
+    """Return the real spherical harmonics of degrees 0 to 2 at unit directions."""
     x, y, z = directions.unbind(-1)
     return torch.stack(
         [

@@ -1,4 +1,4 @@
-"""How a hash-grid field is trained."""
+"""Training of a hash-grid field: its settings and its recipe."""
 
 from __future__ import annotations
 
@@ -24,21 +24,23 @@ LEAST = {
 
 @dataclass(frozen=True)
 class HashGridConfig(FieldConfig):
-    """Size of the field and its training. The defaults suit a few minutes on a small CPU."""
+    """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
     steps: int = 1600  # of the optimizer
-    samples_per_step: int = 65536  # the number of rays follows from it
-    learning_rate: float = 1e-2  # of the tables; the networks learn at a quarter of it
-    coarse_every: int = 4  # one step in so many trains the coarse field
+    samples_per_step: int = 65536  # it decides the number of rays
+    learning_rate: float = 1e-2  # of the tables; that of the networks is a quarter of it
+    coarse_every: int = 4  # every so many steps, the coarse field is trained; 0: never
     depth_weight: float = 0.1  # of the depth term beside the colour term; 0 leaves depth out
-    seed: int = 0  # of initial weights and of all that is drawn at random
-    rays_at_most: int = 16384  # a step, however few samples they take
-    prune_from: int = 200  # step from which empty cells are left out
-    prune_every: int = 16  # steps between two such rounds
-    prune_fade: float = 0.95  # a cell's largest weight fades by this each time that rays visit it
-    prune_threshold: float = 0.01  # rendering weight up to which a cell counts as empty
-    grow_until: float = 0.6  # share of the steps in which the neighbours of occupied cells are asked as well
-    carve: bool = True  # start from the cells that the views' depth and silhouettes leave
+    seed: int = 0  # of the initial weights and of all random draws
+    rays_at_most: int = 16384  # a step, even if they take few samples
+    prune_from: int = 200  # first step at which empty cells are left out
+    prune_every: int = 16  # steps from one update of the occupied cells to the next
+    prune_fade: float = 0.95  # factor on a cell's largest weight each time that rays visit it
+    prune_threshold: float = 0.01  # rendering weight up to which a cell is empty
+    grow_until: float = (
+        0.6  # fraction of the steps during which the neighbours of occupied cells are sampled as well
+    )
+    carve: bool = True  # begin with the cells that the views' depth and silhouettes leave
 
     def __post_init__(self) -> None:
         for name, least in LEAST.items():
@@ -56,7 +58,7 @@ class HashGridConfig(FieldConfig):
 
 
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve and report.resume() is None:
         for grid in (field.sampler, field.coarse_sampler):
             grid.restrict(occupied_voxels(views, grid.grid))
@@ -77,17 +79,17 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         count = max(1, min(config.rays_at_most, affordable))
         batch = bank.draw(count, generator)
         rendering = render(level, batch.rays, batch.background, generator)
-        _tend(grid, batch, rendering, step, config)
+        _update(grid, batch, rendering, step, config)
         loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
     fit(field, groups, outcome, config.steps, report, seed=config.seed)
 
 
-def _tend(
+def _update(
     grid: OccupancyGrid, batch: TrainingBatch, rendering: Rendering, step: int, config: HashGridConfig
 ) -> None:
-    """Keep the occupancy grid abreast of what the rays saw."""
+    """Update the occupancy grid by one step's rendering."""
     valid = rendering.samples.valid
     positions = batch.rays.at(rendering.samples.middles)[valid]
     grid.observe(positions.detach(), rendering.weights.detach()[valid], config.prune_fade)

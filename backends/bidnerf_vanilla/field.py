@@ -1,4 +1,4 @@
-"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, the second asked where the first found matter."""
+"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, the second sampled where the first has found matter."""
 
 from __future__ import annotations
 
@@ -15,22 +15,24 @@ from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 
 SHARPNESS = 30.0
-"""Density per side of the scene at a raw density of about 1: networks whose outputs are small see surfaces."""
+"""Density, per side of the scene, at a raw density of about 1: networks with small outputs can represent surfaces."""
 THINNESS = 1.0
-"""How far raw density is shifted down, so that an untrained field is nearly transparent (Barron et al. 2021, mip-NeRF)."""
+"""Shift of raw density that makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF)."""
 
 
 @dataclass(frozen=True)
 class FieldConfig(NetworkConfig):
     """Size of the field."""
 
-    coarse_samples: int = 64  # intervals of a ray at which the coarse network is asked
-    fine_samples: int = 32  # how many more the fine network is asked at, placed by the coarse one
-    room_resolution: int = 64  # cells along the longest side of the scene; those seen to be empty are skipped
+    coarse_samples: int = 64  # intervals of a ray at which the coarse network is evaluated
+    fine_samples: int = 32  # further intervals of the fine network, placed by the coarse one
+    room_resolution: int = (
+        64  # cells along the longest side of the scene; those that views show to be empty are skipped
+    )
 
 
 class Level(nn.Module):
-    """One network, and where on a ray it is asked."""
+    """A network and its sampler."""
 
     centre: Float[Tensor, "3"]
 
@@ -42,7 +44,7 @@ class Level(nn.Module):
         self.network = NerfNetwork(config)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Positions are brought into the cube [-1, 1], densities are per its side: no unit of length matters."""
+        """Return the values at positions that are scaled to the cube [-1, 1], so that the unit of length has no effect."""
         shape = positions.shape[:-1]
         points = (positions.reshape(-1, 3) - self.centre) * (2 / self.side)
         raw, rgb = self.network(points, directions.reshape(-1, 3))
@@ -51,7 +53,7 @@ class Level(nn.Module):
 
 
 class VanillaField(nn.Module):
-    """The fine level, and the coarse one in ``levels``. Hierarchical sampling (section 5.2) is what composes them."""
+    """The fine level, with the coarse one in ``levels``. The fine sampler is hierarchical (section 5.2): it uses the coarse level."""
 
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""How a NeRF is trained."""
+"""Training of a NeRF: its settings and its recipe."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ LEAST = {
     "depth_weight": 0, "seed": 0,
 }  # fmt: skip
 PROBE = 4096
-"""Rays from which is learnt how many samples a ray takes."""
+"""Number of rays from which the mean number of samples of a ray is estimated."""
 
 
 @dataclass(frozen=True)
 class VanillaConfig(FieldConfig):
-    """Size of the field and its training. The defaults suit some forty minutes on a small CPU."""
+    """Size and training of the field. With the defaults, training takes about forty minutes on a small CPU."""
 
     steps: int = 20000  # of the optimizer
-    samples_per_step: int = 4096  # of the fine network, about; the number of rays follows from it
-    rays_at_most: int = 4096  # a step, however few samples they take
+    samples_per_step: int = 4096  # of the fine network, approximately; it decides the number of rays
+    rays_at_most: int = 4096  # a step, even if they take few samples
     learning_rate: float = 3e-3
     depth_weight: float = 0.1  # of the depth term beside the colour term; 0 leaves depth out
-    seed: int = 0  # of initial weights and of all that is drawn at random
-    carve: bool = True  # ask no network where the views' depth and silhouettes leave no room for matter
+    seed: int = 0  # of the initial weights and of all random draws
+    carve: bool = True  # skip the cells that the views' depth and silhouettes show to be empty
 
     def __post_init__(self) -> None:
         for name, least in LEAST.items():
@@ -54,7 +54,7 @@ class VanillaConfig(FieldConfig):
 
 
 def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve:
         field.room.cells.copy_(occupied_voxels(views, field.room.grid))
     bank = RayBank(views, field.bounds)
@@ -70,7 +70,7 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
 def step_outcome(
     field: VanillaField, batch: TrainingBatch, depth_weight: float, generator: Generator
 ) -> StepOutcome:
-    """Both levels must see what was seen (eq. 6); the samples that are counted are the fine level's."""
+    """Return the loss of both levels (eq. 6), and the colour error and the samples of the fine one."""
     coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
     rough, _ = supervised_loss(coarse, batch, field.side, depth_weight)
     loss, mse = supervised_loss(fine, batch, field.side, depth_weight)
@@ -79,7 +79,7 @@ def step_outcome(
 
 @torch.no_grad()
 def _rays_per_step(field: VanillaField, bank: RayBank, config: VanillaConfig) -> int:
-    """Where there is little room for matter, a step affords more rays."""
+    """Return the number of rays of a step: the fewer samples a ray takes, the more rays."""
     rays = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
     asked = field.coarse.sampler(rays).valid
     samples = float(asked.sum() + config.fine_samples * asked.any(-1).sum()) / PROBE
