@@ -653,7 +653,7 @@ def stale_save(report: Report) -> Any:
 @pytest.mark.parametrize(
     ("backend", "said"),
     [
-        (reporting(step=every_other), "report.step was told of [(1, 60), (3, 60)"),
+        (reporting(step=every_other), "report.step was called with [(1, 60), (3, 60)"),
         (reporting(step=nan_loss), "loss or PSNR that is not finite"),
         (reporting(due=lambda report: lambda step: False), "saved after steps [], expected [1, 30, 60]"),
         (reporting(due=lambda report: lambda step: True), "and only then"),
@@ -690,7 +690,7 @@ class Forgetting(WaveBackend):
         (Deaf(), "TrainingStopped says step 31"),
         (
             reporting(resume=lambda report: lambda: None),
-            "resumed after step 30, it told of steps [1, 2, ... 60]",
+            "resumed after step 30, it reported steps [1, 2, ... 60]",
         ),
         (Forgetting(), "a resumed training arrives elsewhere"),
     ],

@@ -28,7 +28,7 @@ from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.encoding import encoded_width, positional_encoding
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
-from bidnerf_vanilla.recipe import LEAST, step_outcome
+from bidnerf_vanilla.recipe import step_outcome
 from voxels import cell_centres
 
 SMALL = VanillaConfig(
@@ -316,20 +316,18 @@ def test_configs_survive_json(config: VanillaConfig) -> None:
     assert from_plain(VanillaConfig, json.loads(json.dumps(to_plain(config))), "config") == config
 
 
-@pytest.mark.parametrize("name", LEAST)
+NUMBERS = [f.name for f in fields(VanillaConfig) if type(getattr(VanillaConfig(), f.name)) is not bool]
+
+
+@pytest.mark.parametrize("name", NUMBERS)
 def test_settings_that_make_no_sense_are_refused(name: str) -> None:
-    with pytest.raises(InputError, match=f"{name} is {LEAST[name] - 1}, expected {LEAST[name]} or more"):
-        VanillaConfig(**{name: LEAST[name] - 1})
+    with pytest.raises(InputError, match=f"{name} is -1, expected "):
+        VanillaConfig(**{name: -1})
 
 
 def test_an_encoding_of_nothing_is_refused() -> None:
     with pytest.raises(InputError, match="expected one of them"):
         VanillaConfig(position_frequencies=0, include_input=False)
-
-
-def test_every_number_of_the_config_has_a_least_value() -> None:
-    numbers = {f.name for f in fields(VanillaConfig) if type(getattr(VanillaConfig(), f.name)) is not bool}
-    assert numbers == set(LEAST)
 
 
 def test_a_stored_map_renders_the_same(tmp_path: Path) -> None:

@@ -14,12 +14,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.settings import Range, Settings
 
 # The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
@@ -27,19 +30,26 @@ CPU_CHUNK = 32768
 
 
 @dataclass(frozen=True)
-class HashEncodingConfig:
+class HashEncodingConfig(Settings):
     """Hyperparameters of table 1 of the paper: L, F, log2 T, N_min and N_max.
 
     The interpolation ``smooth`` passes the position in a cell through 3t^2 - 2t^3 (appendix A), so that the derivative
     of the encoding by position is continuous.
     """
 
-    levels: int = 16  # of resolution
-    features: int = 2  # of an entry; even numbers are faster
-    log2_table_size: int = 19  # entries of a level's table, as a power of two
-    base_resolution: float = 16  # cells along a side at the coarsest level
-    finest_resolution: float = 512  # and at the finest
+    levels: Annotated[int, Range(1, 64)] = 16  # of resolution
+    features: Annotated[int, Range(1, 64)] = 2  # of an entry; even numbers are faster
+    log2_table_size: Annotated[int, Range(1, 30)] = 19  # entries of a level's table, as a power of two
+    base_resolution: Annotated[float, Range(1, 2**20)] = 16  # cells along a side at the coarsest level
+    finest_resolution: Annotated[float, Range(1, 2**20)] = 512  # and at the finest
     interpolation: Literal["linear", "smooth"] = "linear"  # between the corners of a cell
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.base_resolution > self.finest_resolution:
+            raise InputError(
+                f"base_resolution is {self.base_resolution}, expected {self.finest_resolution} (finest_resolution) or less"
+            )
 
 
 @dataclass(frozen=True)
@@ -53,14 +63,6 @@ class _Level:
 
 def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
     """Return the levels, with resolutions by eqs. 2 and 3; one whose vertices fit in the table is stored without a hash."""
-    if not 1 <= config.log2_table_size <= 30:
-        raise ValueError(f"log2_table_size must be in 1..30, got {config.log2_table_size}")
-    if config.levels < 1 or config.features < 1:
-        raise ValueError("levels and features must be at least 1")
-    if not 1 <= config.base_resolution <= config.finest_resolution:
-        raise ValueError("resolutions must satisfy 1 <= base_resolution <= finest_resolution")
-    if config.interpolation not in ("linear", "smooth"):
-        raise ValueError(f"interpolation must be linear or smooth, got {config.interpolation!r}")
     growth = math.log(config.finest_resolution / config.base_resolution) / max(config.levels - 1, 1)
     levels = []
     for index in range(config.levels):

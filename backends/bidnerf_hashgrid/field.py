@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 
@@ -18,17 +20,19 @@ LARGEST_LOG_DENSITY = 12.0
 
 
 @dataclass(frozen=True)
-class FieldConfig:
+class FieldConfig(Settings):
     """Size of the field."""
 
     encoding: HashEncodingConfig = field(
         default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=19, finest_resolution=768)
     )
-    width: int = 64  # of the hidden layers
-    colour_layers: int = 2  # hidden layers of the colour network
-    geometry_features: int = 15  # that the density network passes on to the colour network
-    grid_resolution: int = 128  # cells of the occupancy grid along the longest side of the scene
-    coarse_levels: int = 4  # levels of the encoding that the coarse field keeps
+    width: Count = 64  # of the hidden layers
+    colour_layers: Count = 2  # hidden layers of the colour network
+    geometry_features: Count = 15  # that the density network passes on to the colour network
+    grid_resolution: Annotated[int, Range(2, 1024)] = (
+        128  # cells of the occupancy grid along the longest side of the scene
+    )
+    coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 
 
 class HashGridField(nn.Module):

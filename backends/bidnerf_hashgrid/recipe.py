@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 from torch import Generator
 
@@ -11,45 +12,37 @@ from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
+from bidnerf_core.settings import Count, NotNegative, Range
 from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
-
-LEAST = {
-    "width": 1, "colour_layers": 1, "geometry_features": 1, "grid_resolution": 2, "coarse_levels": 0, "steps": 1, "samples_per_step": 1,
-    "learning_rate": 0, "coarse_every": 0, "depth_weight": 0, "seed": 0, "rays_at_most": 1, "prune_from": 0,
-    "prune_every": 1, "prune_fade": 0, "prune_threshold": 0,
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class HashGridConfig(FieldConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
-    steps: int = 1600  # of the optimizer
-    samples_per_step: int = 65536  # it decides the number of rays
-    learning_rate: float = 1e-2  # of the tables; that of the networks is a quarter of it
-    coarse_every: int = 4  # every so many steps, the coarse field is trained; 0: never
-    depth_weight: float = 0.1  # of the depth term beside the colour term; 0 leaves depth out
-    seed: int = 0  # of the initial weights and of all random draws
-    rays_at_most: int = 16384  # a step, even if they take few samples
-    prune_from: int = 200  # first step at which empty cells are left out
-    prune_every: int = 16  # steps from one update of the occupied cells to the next
-    prune_fade: float = 0.95  # factor on a cell's largest weight each time that rays visit it
-    prune_threshold: float = 0.01  # rendering weight up to which a cell is empty
-    grow_until: float = (
-        0.6  # fraction of the steps during which the neighbours of occupied cells are sampled as well
+    steps: Count = 1600  # of the optimizer
+    samples_per_step: Count = 65536  # it decides the number of rays
+    learning_rate: NotNegative = 1e-2  # of the tables; that of the networks is a quarter of it
+    coarse_every: Annotated[int, Range(0)] = 4  # every so many steps, the coarse field is trained; 0: never
+    depth_weight: NotNegative = 0.1  # of the depth term beside the colour term; 0 leaves depth out
+    seed: Annotated[int, Range(0)] = 0  # of the initial weights and of all random draws
+    rays_at_most: Count = 16384  # a step, even if they take few samples
+    prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
+    prune_every: Count = 16  # steps from one update of the occupied cells to the next
+    prune_fade: Annotated[float, Range(0, 1)] = 0.95  # factor on a cell's weight when rays visit it
+    prune_threshold: NotNegative = 0.01  # rendering weight up to which a cell is empty
+    grow_until: NotNegative = (
+        0.6  # fraction of the steps in which neighbours of occupied cells are sampled too
     )
     carve: bool = True  # begin with the cells that the views' depth and silhouettes leave
 
     def __post_init__(self) -> None:
-        for name, least in LEAST.items():
-            value = getattr(self, name)
-            if not value >= least:
-                raise InputError(f"{name} is {value}, expected {least} or more")
-        if self.coarse_every == 1 or self.prune_fade > 1:
+        super().__post_init__()
+        if self.coarse_every == 1:
             raise InputError(
-                "coarse_every is 1 or prune_fade above 1: the field itself would never be trained or pruned"
+                "coarse_every is 1, expected 0 or 2 and more: the field itself would not be trained"
             )
         if self.coarse_every > self.prune_every:
             raise InputError(

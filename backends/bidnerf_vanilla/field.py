@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -11,6 +12,7 @@ from torch.nn import functional
 
 from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
 from bidnerf_core.sampling import Importance, OccupiedOnly, Stratified
+from bidnerf_core.settings import Count, Range
 from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 
@@ -24,9 +26,9 @@ THINNESS = 1.0
 class FieldConfig(NetworkConfig):
     """Size of the field."""
 
-    coarse_samples: int = 64  # intervals of a ray at which the coarse network is evaluated
-    fine_samples: int = 32  # further intervals of the fine network, placed by the coarse one
-    room_resolution: int = (
+    coarse_samples: Count = 64  # intervals of a ray at which the coarse network is evaluated
+    fine_samples: Count = 32  # further intervals of the fine network, placed by the coarse one
+    room_resolution: Annotated[int, Range(2, 1024)] = (
         64  # cells along the longest side of the scene; those that views show to be empty are skipped
     )
 

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_vanilla.encoding import encoded_width, positional_encoding
 
 
 @dataclass(frozen=True)
-class NetworkConfig:
+class NetworkConfig(Settings):
     """Size of one MLP."""
 
-    layers: int = 4  # hidden layers before the density
-    width: int = 128  # of each; the layer that takes the direction has half of it
-    skip: int = 2  # number of layers before the position is fed in once more; 0: never
-    position_frequencies: int = (
+    layers: Count = 4  # hidden layers before the density
+    width: Count = 128  # of each; the layer that takes the direction has half of it
+    skip: Annotated[int, Range(0)] = 2  # number of layers before the position is fed in once more; 0: never
+    position_frequencies: Annotated[int, Range(0, 64)] = (
         8  # octaves of sines and cosines; the first has the scene's longest side as its period
     )
-    direction_frequencies: int = 2
+    direction_frequencies: Annotated[int, Range(0, 64)] = 2
     include_input: bool = True  # feed positions and directions themselves in, beside their sines
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Generator
@@ -12,14 +13,10 @@ from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
+from bidnerf_core.settings import Count, NotNegative, Range
 from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
-LEAST = {
-    "layers": 1, "width": 1, "skip": 0, "position_frequencies": 0, "direction_frequencies": 0, "coarse_samples": 1,
-    "fine_samples": 1, "room_resolution": 2, "steps": 1, "samples_per_step": 1, "rays_at_most": 1, "learning_rate": 0,
-    "depth_weight": 0, "seed": 0,
-}  # fmt: skip
 PROBE = 4096
 """Number of rays from which the mean number of samples of a ray is estimated."""
 
@@ -28,19 +25,16 @@ PROBE = 4096
 class VanillaConfig(FieldConfig):
     """Size and training of the field. With the defaults, training takes about forty minutes on a small CPU."""
 
-    steps: int = 20000  # of the optimizer
-    samples_per_step: int = 4096  # of the fine network, approximately; it decides the number of rays
-    rays_at_most: int = 4096  # a step, even if they take few samples
-    learning_rate: float = 3e-3
-    depth_weight: float = 0.1  # of the depth term beside the colour term; 0 leaves depth out
-    seed: int = 0  # of the initial weights and of all random draws
+    steps: Count = 20000  # of the optimizer
+    samples_per_step: Count = 4096  # of the fine network, approximately; it decides the number of rays
+    rays_at_most: Count = 4096  # a step, even if they take few samples
+    learning_rate: NotNegative = 3e-3
+    depth_weight: NotNegative = 0.1  # of the depth term beside the colour term; 0 leaves depth out
+    seed: Annotated[int, Range(0)] = 0  # of the initial weights and of all random draws
     carve: bool = True  # skip the cells that the views' depth and silhouettes show to be empty
 
     def __post_init__(self) -> None:
-        for name, least in LEAST.items():
-            value = getattr(self, name)
-            if not value >= least:
-                raise InputError(f"{name} is {value}, expected {least} or more")
+        super().__post_init__()
         if not (self.include_input or self.position_frequencies):
             raise InputError("position_frequencies is 0 without include_input, expected one of them")
 

@@ -16,6 +16,7 @@ from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.mapping.casting import trace
 from bidnerf_core.se3 import SE3
 
 WELL_BEFORE = 0.04
