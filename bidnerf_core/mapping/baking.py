@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,6 +19,7 @@ from bidnerf_core.mapping.surface_map import SurfaceMap, nearest_surfels
 from bidnerf_core.mapping.surfels import fused, merged
 from bidnerf_core.rendering import RenderedImage, render_image
 from bidnerf_core.se3 import SE3
+from bidnerf_core.settings import Above, Range, Settings
 from bidnerf_core.voxel_grid import VoxelGrid
 
 WITNESSES = 8
@@ -25,20 +27,13 @@ WITNESSES = 8
 
 
 @dataclass(frozen=True)
-class BakeConfig:
+class BakeConfig(Settings):
     """Settings of baking."""
 
-    rays: int = 300_000  # rendered in all, shared out equally among the views
-    cells: int = 4_000_000  # of the grid, at most
-    opacity: float = 0.9  # rays that are stopped to a lesser part meet no surface
-    agreement: int = 2  # other views in which a point must lie on the surface
-
-    def __post_init__(self) -> None:
-        for name, least, most in (("rays", 1000, 10**9), ("cells", 1000, 10**9), ("agreement", 0, WITNESSES)):
-            if not least <= getattr(self, name) <= most:
-                raise InputError(f"{name} is {getattr(self, name)}, expected {least} to {most}")
-        if not 0 < self.opacity < 1:
-            raise InputError(f"opacity is {self.opacity}, expected a number between 0 and 1")
+    rays: Annotated[int, Range(1000, 10**9)] = 300_000  # rendered in all, shared out equally among the views
+    cells: Annotated[int, Range(1000, 10**9)] = 4_000_000  # of the grid, at most
+    opacity: Annotated[float, Above(0, 0.999)] = 0.9  # a ray with a lower opacity meets no surface
+    agreement: Annotated[int, Range(0, WITNESSES)] = 2  # other views in which a point must lie on the surface
 
 
 @dataclass(frozen=True, eq=False)
