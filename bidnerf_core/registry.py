@@ -1,7 +1,7 @@
 """Discovery of backends by entry-point name.
 
 A distribution offers a backend by an entry point of the group ``bidnerf.backends``. Listing reads metadata and source
-text only, so that a broken backend cannot break the list: its fault surfaces when that backend is asked for, in an
+text only, so that a broken backend cannot break the list: its fault surfaces when that backend is loaded, in an
 error that names the entry point, its value, its distribution and the cause.
 """
 
@@ -49,7 +49,7 @@ class BackendInfo:
     distribution: str
     version: str
     summary: str = ""
-    fault: str | None = None  # why it cannot be loaded, as far as metadata tells
+    fault: str | None = None  # why it cannot be loaded, as far as metadata shows
     hidden: tuple[str, ...] = ()  # other versions of the same distribution, farther down sys.path
 
     def __str__(self) -> str:

@@ -265,7 +265,7 @@ def _sweep(folder: Path) -> None:
         kept = {found.get("weights"), found.get("training"), found.get("surface")}
     except FileNotFoundError:
         kept = set()
-    except (OSError, ValueError, AttributeError):  # damaged: nothing tells what is of use
+    except (OSError, ValueError, AttributeError):  # damaged: which files are in use is unknown
         return
     for file in list(folder.iterdir()):
         if OURS.fullmatch(file.name) and file.name not in kept:

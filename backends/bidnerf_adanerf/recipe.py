@@ -56,8 +56,8 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
         probe = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
         generator = Generator().manual_seed(config.seed)
         samples = field.sampler(probe) if sparse else dense_samples(field, probe, room, generator)[0]
-        asked = 1 + float(samples.valid.sum()) / PROBE  # the oracle costs about as much as a sample
-        return max(1, min(config.rays_at_most, int(config.samples_per_step / asked)))
+        evaluations = 1 + float(samples.valid.sum()) / PROBE  # the oracle costs about as much as a sample
+        return max(1, min(config.rays_at_most, int(config.samples_per_step / evaluations)))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
         phase = phase_at(step, config)

@@ -75,6 +75,6 @@ def step_outcome(
 def _rays_per_step(field: VanillaField, bank: RayBank, config: VanillaConfig) -> int:
     """Return the number of rays of a step: the fewer samples a ray takes, the more rays."""
     rays = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
-    asked = field.coarse.sampler(rays).valid
-    samples = float(asked.sum() + config.fine_samples * asked.any(-1).sum()) / PROBE
+    coarse = field.coarse.sampler(rays).valid
+    samples = float(coarse.sum() + config.fine_samples * coarse.any(-1).sum()) / PROBE
     return max(1, min(config.rays_at_most, int(config.samples_per_step / max(samples, 1.0))))

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from bidnerf_core.backend import Backend
 from bidnerf_core.field import RadianceField, levels
 from bidnerf_core.testing import derivatives, recipes, samples, values
-from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.faults import calling, query, require
 from bidnerf_core.testing.scene import awkward_rays, joined, points, rgb_views, rgbd_views
 from bidnerf_core.testing.subject import Subject, called, frozen, precise
 
@@ -102,7 +102,7 @@ class BackendContract(Subject):
 
     def test_query_follows_the_dtype(self) -> None:
         for field in self._fields():
-            with telling(f"{type(field).__name__}.double()"):
+            with calling(f"{type(field).__name__}.double()"):
                 doubled = copy.deepcopy(field).double()
             for level, moved in zip(levels(field), levels(cast(RadianceField, doubled)), strict=True):
                 values.check_precision(level, moved)
@@ -112,7 +112,7 @@ class BackendContract(Subject):
             return
         rays = joined(list(awkward_rays().values()))
         field = self._trained()
-        with telling(f"{type(field).__name__} on CUDA"):
+        with calling(f"{type(field).__name__} on CUDA"):
             moved = copy.deepcopy(field).to("cuda")
             names = (f.name for f in dataclasses.fields(rays))
             elsewhere = dataclasses.replace(rays, **{name: getattr(rays, name).cuda() for name in names})
@@ -151,7 +151,7 @@ class BackendContract(Subject):
 
     def test_saved_field_renders_the_same(self) -> None:
         trained, fresh = self._trained(), self._build(self._reread(self._config()))
-        with telling(f"{type(fresh).__name__}.load_state_dict of a saved state_dict"):
+        with calling(f"{type(fresh).__name__}.load_state_dict of a saved state_dict"):
             fresh.load_state_dict(recipes.stored(dict(trained.state_dict())))
         loaded = frozen(fresh)
         rays = joined(list(awkward_rays().values()))

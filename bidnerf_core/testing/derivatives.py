@@ -11,7 +11,7 @@ from torch import Tensor
 from bidnerf_core.field import RadianceField
 from bidnerf_core.rendering import render
 from bidnerf_core.se3 import SE3
-from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.faults import calling, query, require
 from bidnerf_core.testing.scene import SIDE, camera_rays, points, rgbd_views
 
 COUNT = 64
@@ -63,7 +63,7 @@ def check_pose_gradient(field: RadianceField, dtype: torch.dtype) -> None:
     nudge = torch.tensor([0.02, -0.03, 0.01, 0.02, 0.01, -0.02], dtype=dtype)
     T_world_camera: SE3 = start.retract(nudge).retract(delta)
     who = f"{type(field).__name__} rendered from a pose"
-    with telling(who):
+    with calling(who):
         rendering = render(field, camera_rays(T_world_camera))
         seen = {"rgb": rendering.rgb.square().mean(), "distance": rendering.distance.mean()}
     for what, value in seen.items():
@@ -103,7 +103,7 @@ def _slopes(ask: Asked, at: Float[Tensor, "n 3"], speed: Float[Tensor, "n 3"]) -
     if not values.requires_grad:
         return slopes
     for c in range(values.shape[1]):
-        with telling("backward through query"):
+        with calling("backward through query"):
             (gradient,) = torch.autograd.grad(values[:, c].sum(), leaf, retain_graph=True, allow_unused=True)
         if gradient is not None:
             slopes[:, c] = (gradient * speed).sum(-1)

@@ -18,7 +18,7 @@ def require(condition: bool, fault: str) -> None:
 
 
 @contextmanager
-def telling(doing: str) -> Iterator[None]:
+def calling(doing: str) -> Iterator[None]:
     """Turn an exception of the backend's code into a failure that names the call (``doing``)."""
     try:
         yield
@@ -31,7 +31,7 @@ def telling(doing: str) -> Iterator[None]:
 def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) -> FieldValues:
     """Return the field's values after a check of their shapes. ``of`` describes the points."""
     who = f"{type(field).__name__}.query of {of}"
-    with telling(who):
+    with calling(who):
         values = field.query(positions, directions)
     shape = tuple(positions.shape[:-1])
     for what, found, expected in (
@@ -49,7 +49,7 @@ def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) 
 def sample(field: RadianceField, rays: Rays, of: str, jitter: Generator | None = None) -> RaySamples:
     """Return the samples of the field's sampler after a check of their shapes. ``of`` describes the rays."""
     who = f"sampler {type(field.sampler).__name__} of {of}"
-    with telling(who):
+    with calling(who):
         samples = field.sampler(rays, jitter)
     shape, found = samples.starts.shape, tuple(rays.near.shape)
     require(

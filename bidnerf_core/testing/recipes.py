@@ -15,7 +15,7 @@ from bidnerf_core.backend import Backend
 from bidnerf_core.field import RadianceField
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
-from bidnerf_core.testing.faults import require, telling
+from bidnerf_core.testing.faults import calling, require
 from bidnerf_core.testing.scene import BOUNDS, camera_rays, rgbd_views
 from bidnerf_core.training import Progress, TrainingState, TrainingStopped
 
@@ -52,7 +52,7 @@ class Recorder:
 
 def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors as they are read back from a safetensors file."""
-    with telling("writing the tensors of a state to safetensors"):
+    with calling("writing the tensors of a state to safetensors"):
         packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
         return tensors_from_bytes(tensors_to_bytes(packed))
 
@@ -142,7 +142,7 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
 
 def colour_error(field: RadianceField) -> float:
     """Return the mean squared error of colour over all pixels of the training views."""
-    with torch.no_grad(), telling(f"render by {type(field).__name__}"):
+    with torch.no_grad(), calling(f"render by {type(field).__name__}"):
         found = [
             render(field, camera_rays(view.T_ref_camera.to(torch.float32)), BOUNDS.background).rgb
             for view in rgbd_views()
@@ -155,7 +155,7 @@ def _train(
     backend: Backend, field: RadianceField, views: Sequence[View], config: Any, report: Recorder, how: str
 ) -> None:
     try:
-        with telling(f"{_name(backend)}.train {how}".rstrip()):
+        with calling(f"{_name(backend)}.train {how}".rstrip()):
             backend.train(field, views, config, report)
     except AssertionError as error:
         if isinstance(error.__cause__, TrainingStopped):

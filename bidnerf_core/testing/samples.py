@@ -7,7 +7,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.field import RadianceField, Rays, RaySamples
 from bidnerf_core.rendering import Rendering, render
-from bidnerf_core.testing.faults import require, sample, telling
+from bidnerf_core.testing.faults import calling, require, sample
 from bidnerf_core.testing.scene import SIDE, awkward_rays, joined, picked
 from bidnerf_core.testing.values import close
 
@@ -113,7 +113,7 @@ def check_levels(field: RadianceField) -> None:
 
 def seen(field: RadianceField, rays: Rays, of: str) -> Tensor:
     """Return rendered colour, distance and opacity as five channels (*r 5)."""
-    with telling(f"render of {of} by {type(field).__name__}"), torch.no_grad():
+    with calling(f"render of {of} by {type(field).__name__}"), torch.no_grad():
         rendering: Rendering = render(field, rays, BACKGROUND)
     channels = [rendering.rgb, rendering.distance[..., None], rendering.opacity[..., None]]
     return torch.cat(channels, dim=-1)

@@ -15,7 +15,7 @@ from bidnerf_core.field import RadianceField, levels
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.testing import recipes
-from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.faults import calling, query, require
 from bidnerf_core.testing.scene import BOUNDS, points, rgbd_views
 
 STEPS = 40
@@ -45,12 +45,12 @@ class Subject:
 
     def _reread(self, config: Any) -> Any:
         """Return the config as it is read back from a map on disk."""
-        with telling(f"{type(config).__name__} to JSON and back"):
+        with calling(f"{type(config).__name__} to JSON and back"):
             text = json.dumps(to_plain(config, "config"), allow_nan=False)
             return from_plain(self._backend().config_type, json.loads(text), "config")
 
     def _build(self, config: Any = None) -> Any:
-        with telling(f"{called(self._backend())}.build"):
+        with calling(f"{called(self._backend())}.build"):
             return self._backend().build(self._config() if config is None else config, BOUNDS)
 
     def _trained(self) -> Any:
@@ -58,7 +58,7 @@ class Subject:
         kept = type(self).__dict__.get("_kept")
         if kept is None:
             kept = self._build()
-            with telling(f"{called(self._backend())}.train"):
+            with calling(f"{called(self._backend())}.train"):
                 self._backend().train(kept, rgbd_views(), self._config(), recipes.Recorder())
             type(self)._kept = frozen(kept)  # type: ignore[attr-defined]
         return type(self).__dict__["_kept"]

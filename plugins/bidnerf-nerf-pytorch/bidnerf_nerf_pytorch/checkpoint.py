@@ -52,9 +52,7 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
 def _loaded(path: Path) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file, expected a checkpoint of nerf-pytorch")
-    path.open(
-        "rb"
-    ).close()  # what keeps it from being read is told as it is; all later errors are the content's
+    path.open("rb").close()  # errors of reading the file pass as they are; all later ones are of its content
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # each kind of damage has an exception of its own
