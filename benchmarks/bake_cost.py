@@ -54,7 +54,7 @@ def baked(source: Path, data: Path | None, folder: Path) -> dict[str, Any]:
         "added_on_disk_MiB": (size(copy) - before) / 2**20,
         "surfels": len(surface.surfels),
         "cell_metres": surface.cell,
-        "cells": list(surface.nearest.shape),
+        "cells": list(surface.grid.shape),
         "keyframes": len(surface.keyframes),
     }
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.casting import trace
 from bidnerf_core.pixels import observe
 from bidnerf_core.se3 import SE3
 
@@ -49,7 +50,7 @@ def _outwards(surface: SurfaceMap) -> torch.Tensor:
         way = surface.surfels.positions - centre
         length = torch.linalg.vector_norm(way, dim=-1)
         directions = way / length[:, None]
-        met = surface.trace(centre.expand_as(directions), directions)
+        met = trace(surface, centre.expand_as(directions), directions)
         side = -(directions * surface.surfels.normals).sum(-1).sign()
         votes += torch.stack([side * (met > length - 2 * surface.cell), side])
     decided = torch.where(votes[0] != 0, votes[0], votes[1])

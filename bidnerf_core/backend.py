@@ -1,9 +1,13 @@
-"""What an entry point of the group ``bidnerf.backends`` points at."""
+"""What an entry point of the group ``bidnerf.backends`` names, and the usual way to make one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+import torch
+from torch import nn
 
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
@@ -21,13 +25,61 @@ class Backend(Protocol):
 
     @property
     def config_type(self) -> type:
-        """A frozen dataclass, every field defaulted, of what JSON can hold."""
+        """A frozen dataclass of values that JSON can hold, with a default for every field."""
         ...
 
     def build(self, config: Any, bounds: SceneBounds) -> RadianceField:
-        """An untrained field: an ``nn.Module`` with ``query`` and ``sampler``, whose ``state_dict`` is all that is saved."""
+        """Return an untrained field: an ``nn.Module`` with ``query`` and ``sampler``, of which the ``state_dict`` is saved."""
         ...
 
     def train(self, field: RadianceField, views: Sequence[View], config: Any, report: Report) -> None:
-        """Fit the field to views whose reference frame is the world, telling ``report`` of every step."""
+        """Fit the field to views whose reference frame is the world, and give ``report`` the progress of each step."""
         ...
+
+
+@runtime_checkable
+class QuickConfig(Protocol):
+    """An optional part of a backend: settings for small and simple scenes, which ``bidnerf demo`` trains with."""
+
+    def quick_config(self) -> Any:
+        """Return a config of the backend's ``config_type`` that trains such a scene in about a minute."""
+        ...
+
+
+def quick_config(backend: Backend) -> Any:
+    """Return the backend's config for small scenes, or its default config where it offers none."""
+    return backend.quick_config() if isinstance(backend, QuickConfig) else backend.config_type()
+
+
+@runtime_checkable
+class Seeded(Protocol):
+    """A config with a seed for the initial weights."""
+
+    @property
+    def seed(self) -> int: ...
+
+
+Config = TypeVar("Config", bound=Seeded)
+Field = TypeVar("Field", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class RecipeBackend(Generic[Config, Field]):
+    """A ``Backend`` that is composed of a config, a field and a training recipe. A seed reproduces the initial weights."""
+
+    summary: str
+    config_type: type
+    field_type: Callable[[Config, SceneBounds], Field]
+    recipe: Callable[[Field, Sequence[View], Config, Report], None]
+    quick: Config | None = None  # for small and simple scenes
+
+    def quick_config(self) -> Any:
+        return self.config_type() if self.quick is None else self.quick
+
+    def build(self, config: Config, bounds: SceneBounds) -> Field:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            return self.field_type(config, bounds)
+
+    def train(self, field: Field, views: Sequence[View], config: Config, report: Report) -> None:
+        self.recipe(field, views, config, report)

@@ -44,7 +44,7 @@ class RaySamples:
 
 @dataclass(frozen=True, eq=False)
 class FieldValues:
-    """What a field says of points seen from directions."""
+    """Density and colour at points, as seen along directions."""
 
     density: Float[Tensor, "*p"]  # >= 0, per metre
     rgb: Float[Tensor, "*p 3"]  # in [0, 1]
@@ -52,25 +52,25 @@ class FieldValues:
 
 @runtime_checkable
 class RaySampler(Protocol):
-    """Chooses where on each ray a field is asked. Deterministic without ``jitter``."""
+    """Chooses where on each ray a field is queried. Deterministic without ``jitter``."""
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples: ...
 
 
 @runtime_checkable
 class RadianceField(Protocol):
-    """A differentiable scene. Only reverse-mode derivatives are asked of it."""
+    """A differentiable scene. Only reverse-mode derivatives are required of it."""
 
     @property
     def sampler(self) -> RaySampler: ...
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Density and colour at ``positions`` (metres, world) seen along unit ``directions``; zero points are asked too."""
+        """Return density and colour at ``positions`` (metres, world) seen along unit ``directions``; there may be no points."""
         ...
 
 
 def levels(field: RadianceField) -> tuple[RadianceField, ...]:
-    """The field's levels of detail, coarsest first; a field that offers none is its own only level."""
+    """Return the field's levels of detail, coarsest first; a field that offers none is its own only level."""
     return tuple(getattr(field, "levels", None) or (field,))
 
 
@@ -97,8 +97,13 @@ class SceneBounds:
         a, b = self.lower, self.upper
         return (b[0] - a[0], b[1] - a[1], b[2] - a[2])
 
+    @property
+    def centre(self) -> tuple[float, float, float]:
+        a, b = self.lower, self.upper
+        return ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2, (a[2] + b[2]) / 2)
+
     def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
-        """Rays limited to the box and to [near, far] (slab method). The limits carry no gradient: they only say where to look."""
+        """Return the rays limited to the box and to [near, far] (slab method). The limits carry no gradient."""
         with torch.no_grad():
             lower, upper = (origins.new_tensor(corner) for corner in (self.lower, self.upper))
             tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
@@ -110,6 +115,6 @@ class SceneBounds:
 
 
 def widened(rays: Rays, factor: float) -> Rays:
-    """The sampled interval ``factor`` times as long about its middle, never behind the camera (the paper's "wide")."""
+    """Return the rays with an interval ``factor`` times as long about its middle, but not behind the camera (the paper's "wide")."""
     middle, half = (rays.near + rays.far) / 2, (rays.far - rays.near) / 2 * factor
     return replace(rays, near=(middle - half).clamp(min=0), far=middle + half)

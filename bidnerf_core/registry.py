@@ -1,7 +1,7 @@
-"""Finding backends by entry-point name.
+"""Discovery of backends by entry-point name.
 
 A distribution offers a backend by an entry point of the group ``bidnerf.backends``. Listing reads metadata and source
-text only, so that a broken backend cannot break the list: its fault surfaces when that backend is asked for, in an
+text only, so that a broken backend cannot break the list: its fault surfaces when that backend is loaded, in an
 error that names the entry point, its value, its distribution and the cause.
 """
 
@@ -37,7 +37,7 @@ METHODS = {"build": ("config", "bounds"), "train": ("field", "views", "config", 
 
 
 class BackendError(InputError):
-    """A backend cannot be had; the message says which, whose, and why."""
+    """A backend cannot be loaded; the message names it, its distribution and the cause."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class BackendInfo:
     distribution: str
     version: str
     summary: str = ""
-    fault: str | None = None  # why it cannot be loaded, as far as metadata tells
+    fault: str | None = None  # why it cannot be loaded, as far as metadata shows
     hidden: tuple[str, ...] = ()  # other versions of the same distribution, farther down sys.path
 
     def __str__(self) -> str:
@@ -57,15 +57,15 @@ class BackendInfo:
 
 
 def list_backends() -> list[BackendInfo]:
-    """Every declared backend, by name; imports none of them. A name that two distributions claim is listed twice."""
+    """Return every declared backend, by name, without importing any. A name that two distributions claim is listed twice."""
     infos = [info for dist, hidden in _installed() for info in _declared(dist, hidden)]
     return sorted(_with_rivals(infos), key=lambda info: (info.name, info.distribution, info.value))
 
 
 def load_backend(name: str, wanted_by: str = "") -> Backend:
-    """The backend of that name, imported and checked.
+    """Return the backend of that name, imported and checked.
 
-    Raises ``BackendError``, which names the culprit and, where it is given, the map that is of no use without it.
+    Raises ``BackendError``, which names the entry point and, where it is given, the map that needs it (``wanted_by``).
     """
     try:
         return _loaded(name)
@@ -84,11 +84,11 @@ def _loaded(name: str) -> Backend:
     return _checked(info, _imported(info))
 
 
-# Reading metadata: whatever is wrong with a stranger's files is the stranger's affair.
+# Reading metadata, of which any file of any distribution may be malformed.
 
 
 def _installed() -> Iterator[tuple[AnyDistribution, tuple[str, ...]]]:
-    """Distributions as ``import`` sees them, the first on sys.path, each with the versions that it hides."""
+    """Return distributions as ``import`` sees them, the first on sys.path, each with the versions that it hides."""
     copies: dict[str, list[AnyDistribution]] = {}
     for dist in distributions():
         copies.setdefault(_normalized(_label(dist)), []).append(dist)
@@ -127,7 +127,7 @@ def _read(info: BackendInfo, point: AnyEntryPoint, dist: AnyDistribution) -> Bac
 
 
 def _with_rivals(infos: list[BackendInfo]) -> Iterator[BackendInfo]:
-    """The same, where a name that is declared more than once is at fault: there is no telling which was meant."""
+    """Return the backends, with a fault for each name that is declared more than once: which one is meant is unknown."""
     for info in infos:
         rivals = [x for x in infos if x.name == info.name and x is not info]
         if rivals and info.name != UNREADABLE:
@@ -168,7 +168,7 @@ def _mentions_group(dist: AnyDistribution) -> bool:
 
 
 def _spec(module: str) -> ModuleSpec | None:
-    """Where a module would come from. ``find_spec`` alone would import the parents of a dotted name."""
+    """Return where a module would be imported from. ``find_spec`` alone would import the parents of a dotted name."""
     top, *rest = module.split(".")
     spec = importlib.util.find_spec(top)
     for part in rest:
@@ -183,7 +183,7 @@ def _first_line(spec: ModuleSpec) -> str:
     try:
         source = read(spec.name) if read else None
         text = ast.get_docstring(ast.parse(source)) if source else None
-    except Exception:  # not to be read as Python: asking for the backend will tell
+    except Exception:  # not Python: loading the backend will report it
         return ""
     return text.strip().splitlines()[0] if text and text.strip() else ""
 
@@ -214,7 +214,7 @@ def _checked(info: BackendInfo, backend: Any) -> Backend:
 
 
 def _defects(backend: Any) -> Iterator[str]:
-    """What keeps an object from being a ``Backend``, the most telling first."""
+    """Return what keeps an object from being a ``Backend``, the most telling defect first."""
     missing = [name for name in ("summary", "config_type", *METHODS) if not hasattr(backend, name)]
     if missing:
         who = f"class {backend.__name__}" if isinstance(backend, type) else type(backend).__name__
@@ -252,7 +252,7 @@ def _accepts(method: Any, count: int) -> bool:
         inspect.signature(method).bind(*[None] * count)
     except TypeError:
         return False
-    except ValueError:  # compiled code does not tell its signature
+    except ValueError:  # compiled code may have no signature
         return True
     return True
 

@@ -15,7 +15,7 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What a ray sees."""
+    """Colour, distance and opacity of each ray."""
 
     rgb: Float[Tensor, "*r 3"]
     distance: Float[Tensor, "*r"]  # sum of weight times distance, metres: not divided by the opacity
@@ -26,13 +26,15 @@ class Rendering:
 
 @dataclass(frozen=True, eq=False)
 class RenderedImage:
+    """Colour, depth and opacity of each pixel."""
+
     rgb: Float[Tensor, "h w 3"]
     depth: Float[Tensor, "h w"]  # planar z, metres; 0 where less than half of the ray was stopped
     opacity: Float[Tensor, "h w"]
 
 
 def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
-    """Field values of shape (*r, s): zero density where a sample is not valid, and the field is not asked there."""
+    """Return the field's values at the samples (*r s). Where a sample is not valid, the field is not queried and density is 0."""
     valid = samples.valid
     positions = rays.at(samples.middles)
     directions = rays.directions[..., None, :].expand_as(positions)
@@ -48,7 +50,7 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
 
 
 def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:
-    """``w_i = exp(-sum_{j<i} sigma_j dt_j) (1 - exp(-sigma_i dt_i))`` (eq. 3)."""
+    """Return ``w_i = exp(-sum_{j<i} sigma_j dt_j) (1 - exp(-sigma_i dt_i))`` (eq. 3)."""
     absorbed = torch.where(
         samples.valid, density * (samples.ends - samples.starts), torch.zeros_like(density)
     )
@@ -62,7 +64,7 @@ def render(
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
     jitter: Generator | None = None,
 ) -> Rendering:
-    """Colour, distance and opacity of each ray; differentiable in the field's parameters and in the rays."""
+    """Render rays; differentiable in the field's parameters and in the rays."""
     return render_samples(field, rays, field.sampler(rays, jitter), background)
 
 
@@ -72,7 +74,7 @@ def render_samples(
     samples: RaySamples,
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
 ) -> Rendering:
-    """The same from ``samples`` of the rays that were chosen already."""
+    """Render rays from given samples, see ``render``."""
     values = query_samples(field, rays, samples)
     weights = rendering_weights(values.density, samples)
     opacity = weights.sum(-1)
@@ -85,7 +87,7 @@ def render_samples(
 def render_image(
     field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, chunk: int = 8192
 ) -> RenderedImage:
-    """A whole image from a pose, ``chunk`` rays at a time."""
+    """Render a whole image from a pose, ``chunk`` rays at a time."""
     ray = intrinsics.unproject(intrinsics.pixel_centres()).reshape(-1, 3)
     length = torch.linalg.vector_norm(ray, dim=-1)
     device = next((p.device for p in getattr(field, "parameters", lambda: iter(()))()), torch.device("cpu"))

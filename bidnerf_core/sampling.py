@@ -1,4 +1,4 @@
-"""Where on each ray a field is asked."""
+"""Samplers: where on each ray a field is queried."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples
 from bidnerf_core.rendering import query_samples, rendering_weights
+from bidnerf_core.voxel_grid import OccupancyMask
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,11 @@ class Stratified:
 class AroundDepth:
     """``count`` equal intervals within ``reach`` metres of the distance that was measured along each ray.
 
-    For a pose that is nearly right, they are where all the matter is that the ray meets; of a pose that is not, they
-    say that there is none. Where nothing was measured (distance 0), ``otherwise`` decides.
+    With a nearly correct pose they hold all the matter that the ray meets, with a wrong one they are empty. Rays without a
+    measurement (distance 0) are sampled by ``otherwise``.
     """
 
-    distance: Float[Tensor, "*r"]  # metres along the rays that it is asked about
+    distance: Float[Tensor, "*r"]  # metres along the rays that are to be sampled
     reach: float
     count: int
     otherwise: RaySampler
@@ -52,13 +53,28 @@ class AroundDepth:
         near = torch.maximum(rays.near, self.distance - self.reach)
         far = torch.minimum(rays.far, self.distance + self.reach)
         window = replace(rays, near=near, far=torch.maximum(near, far))
-        rest = replace(rays, far=torch.where(measured, rays.near, rays.far))  # none left of what was measured
+        rest = replace(
+            rays, far=torch.where(measured, rays.near, rays.far)
+        )  # empty where a distance was measured
         return _either(measured, Stratified(self.count)(window, jitter), self.otherwise(rest, jitter))
 
 
 @dataclass(frozen=True)
+class OccupiedOnly:
+    """The samples of another sampler, valid only in cells that may hold matter."""
+
+    occupancy: OccupancyMask
+    sampler: RaySampler
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        samples = self.sampler(rays, jitter)
+        return replace(samples, valid=samples.valid & self.occupancy.holds(rays.at(samples.middles)))
+
+
+@dataclass(frozen=True)
 class Resampled:
-    """A field that is asked where ``sampler`` says, in place of its own."""
+    """A field with another sampler in place of its own."""
 
     field: RadianceField
     sampler: RaySampler
@@ -68,7 +84,7 @@ class Resampled:
 
 
 def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:
-    """Rays of one and of the other, as wide as the wider of the two."""
+    """Return the samples ``yes`` for some rays and ``no`` for the others, padded to a common number a ray."""
     width = max(yes.starts.shape[-1], no.starts.shape[-1])
 
     def filled(part: Tensor) -> Tensor:
@@ -80,10 +96,10 @@ def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySa
 
 @dataclass(frozen=True)
 class Importance:
-    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` puts its weight.
+    """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` has its weight.
 
-    The field's own valid intervals are cut further, into ``count`` more of them; what its sampler leaves out, as an
-    occupancy grid does, stays out. No gradient flows through the choice of place.
+    The field's own valid intervals are cut at ``count`` more places; what its sampler leaves out, as an occupancy grid does,
+    stays out. No gradient flows through the choice of places.
     """
 
     field: RadianceField
@@ -102,9 +118,9 @@ class Importance:
 def inverse_transform(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> tuple[Float[Tensor, "*r n"], Int[Tensor, "*r n"]]:
-    """``count`` distances distributed as ``weights``, piecewise constant over the intervals, by inverting their CDF.
+    """Return ``count`` distances distributed as ``weights`` (piecewise constant over the intervals), by inverting their CDF.
 
-    In ascending order, and with the interval in which each lies. A ray without any weight has them in its first interval.
+    They come in ascending order, with the interval in which each lies. A ray without weight has them in its first interval.
     """
     cdf = torch.cumsum(weights, dim=-1)
     cdf = cdf / cdf[..., -1:].clamp(min=torch.finfo(cdf.dtype).tiny)
@@ -124,7 +140,7 @@ def inverse_transform(
 
 
 def _gathered(samples: RaySamples) -> RaySamples:
-    """The same with valid intervals first, and without the overlaps that rounding makes."""
+    """Return the samples with valid intervals first, and without the overlaps that rounding makes."""
     order = (~samples.valid).sort(dim=-1, stable=True).indices
     starts, ends, valid = (part.gather(-1, order) for part in (samples.starts, samples.ends, samples.valid))
     following = torch.where(valid, starts, torch.inf)[..., 1:]
@@ -133,19 +149,19 @@ def _gathered(samples: RaySamples) -> RaySamples:
 
 
 def _cut(rough: RaySamples, places: Float[Tensor, "*r n"], owner: Int[Tensor, "*r n"]) -> RaySamples:
-    """``rough``, gathered, with a border more at each of ``places``, which lie in the intervals ``owner``.
+    """Return the gathered intervals ``rough``, cut at ``places``, which lie in the intervals ``owner``.
 
-    A piece begins at the start of an interval or at a place in it, and reaches to the next such or to the interval's end.
+    A piece begins at the start of an interval or at a place in it, and ends at the next place or at the interval's end.
     """
     first = torch.arange(rough.starts.shape[-1], device=owner.device).expand(rough.starts.shape)
     owner = torch.cat([owner, first], dim=-1)
     valid = rough.valid.gather(-1, owner)
-    # Places go first: of a place and a start at the same distance, the piece from the start is the longer one.
+    # Places go first: where a place and a start coincide, the piece from the start is the longer one.
     starts, order = (
         torch.cat([places, rough.starts], dim=-1).where(valid, torch.inf).sort(dim=-1, stable=True)
     )
     owner, valid = owner.gather(-1, order), valid.gather(-1, order)
     following = torch.cat([starts[..., 1:], torch.full_like(starts[..., :1], torch.inf)], dim=-1)
     ends = torch.minimum(rough.ends.gather(-1, owner), following)
-    last = rough.ends.amax(-1, keepdim=True)  # somewhere finite, for what is not valid
+    last = rough.ends.amax(-1, keepdim=True)  # a finite number for invalid samples
     return RaySamples(starts.where(valid, last), ends.where(valid, last), valid)

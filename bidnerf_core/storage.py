@@ -1,4 +1,4 @@
-"""A map on disk: a folder of JSON and safetensors, nothing that can run when it is read.
+"""Storage of maps: a folder of JSON and safetensors, which cannot run code when it is read.
 
 ``map.json`` describes the map and names the files of its tensors. Files are written under new names first and
 ``map.json`` is replaced last, in one stroke: whenever the writing stops, the folder holds one whole map.
@@ -43,12 +43,12 @@ VERSION = 1
 DESCRIPTION = "map.json"
 TENSORS = r"(weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors"
 OURS = re.compile(rf"{TENSORS}|\.({TENSORS}|map\.json)\.[0-9a-f]{{8}}")
-"""Names that a save may leave behind; whatever else is in the folder is not ours to remove."""
+"""Names of files that a save may leave behind; other files in the folder are never removed."""
 
 
 @dataclass(frozen=True)
 class StoredCamera:
-    """Where a training image was taken: poses that are known to see the scene."""
+    """Camera and pose of a training image, from which the scene is known to be visible."""
 
     name: str
     intrinsics: Intrinsics
@@ -57,7 +57,7 @@ class StoredCamera:
 
 @dataclass(frozen=True)
 class MapInfo:
-    """What ``map.json`` holds."""
+    """The content of ``map.json``."""
 
     backend: str
     config: dict[str, Any]
@@ -92,6 +92,7 @@ class Map:
 
 
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
+    """Return the cameras of training views in the form that ``map.json`` holds."""
     return tuple(
         StoredCamera(
             v.frame.name, v.frame.intrinsics, tuple(tuple(r) for r in v.T_ref_camera.matrix().tolist())
@@ -101,7 +102,7 @@ def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
 
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
-    """An untrained field (an ``nn.Module``) and its config, as ``info`` describes them."""
+    """Return an untrained field (an ``nn.Module``) and its config, as ``info`` describes them."""
     config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
     try:
         field = backend.build(config, info.bounds)
@@ -114,7 +115,7 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
 
 
 def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
-    """Write one whole map; what an earlier save left is removed once the new one stands."""
+    """Write a map, and remove the files of an earlier one once the new one is complete."""
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
     training = None if info.complete else f"training-{name}"
     info = replace(info, weights=f"weights-{name}", training=training, surface=None, landmarks=None)
@@ -162,7 +163,7 @@ def _save_part(folder: Path, of: MapInfo, part: str, tensors: dict[str, Tensor])
 
 
 def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
-    """With T_world_camera, float64."""
+    """Return the cameras of the training images with their ``T_world_camera`` (float64)."""
     return [
         (c.intrinsics, SE3.from_matrix(torch.tensor(c.T_world_camera, dtype=torch.float64)))
         for c in info.cameras
@@ -170,7 +171,7 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
 
 
 def load_info(folder: Path) -> MapInfo:
-    """Read and judge ``map.json``. Raises ``InputError`` where it is no map, or one of another version."""
+    """Return the checked content of ``map.json``. Raises ``InputError`` where it describes no map, or one of another version."""
     path = folder / DESCRIPTION
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
@@ -226,7 +227,7 @@ def load_surface(path: Path) -> SurfaceMap:
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
-    """What the interrupted training of ``field`` needs to go on."""
+    """Return the state from which the interrupted training of ``field`` can be resumed."""
     if info.training is None:
         raise InputError(f"{folder}: training is complete ({info.step} steps), nothing to resume")
     weights = read_tensors(folder / info.weights)
@@ -285,18 +286,18 @@ def _check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path)
 
 
 def _packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Contiguous and unshared, as safetensors wants them."""
+    """Return contiguous copies on the CPU, as safetensors needs them."""
     return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
 
 
 def _sweep(folder: Path) -> None:
-    """Remove what saves left that ``map.json`` does not name: earlier ones, and those that did not come to their end."""
+    """Remove files of earlier and of interrupted saves, which ``map.json`` does not name."""
     try:
         found = json.loads((folder / DESCRIPTION).read_bytes())
         kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks")}
     except FileNotFoundError:
         kept = set()
-    except (OSError, ValueError, AttributeError):  # damaged: nothing tells what is of use
+    except (OSError, ValueError, AttributeError):  # damaged: which files are in use is unknown
         return
     for file in list(folder.iterdir()):
         if OURS.fullmatch(file.name) and file.name not in kept:

@@ -23,6 +23,7 @@ from bidnerf_core.scenes.primitives import Primitive, Shape
 from bidnerf_core.scenes.textures import Texture
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
+from bidnerf_core.voxel_grid import VoxelGrid
 
 CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
@@ -66,16 +67,15 @@ def of_points(
     positions: Tensor, rgb: Tensor, normal: tuple[float, float, float], cells: int = 20
 ) -> SurfaceMap:
     """Surfels of one plane as they are, at most one a cell, in the cube from -1 to 1."""
-    cell = 2 / cells
-    x, y, z = ((positions + 1) / cell).floor().long().unbind(-1)
-    numbers = (x * cells + y) * cells + z
+    grid = VoxelGrid.cube(BOUNDS, cells)
+    numbers = grid.numbers(positions)
     assert (numbers.diff() > 0).all(), "one a cell, in the order of the cells"
     count = len(positions)
     surfels = Surfels(
         positions, positions.new_tensor(normal).expand(count, 3), rgb, positions.new_zeros((count, 3, 3))
     )
     keyframes = torch.eye(4, dtype=torch.float64)[None]
-    return SurfaceMap(surfels, (-1.0, -1.0, -1.0), cell, nearest_surfels(numbers, (cells,) * 3), keyframes)
+    return SurfaceMap(surfels, grid, nearest_surfels(numbers, grid.shape), keyframes)
 
 
 def patch(half: int = 5, dtype: torch.dtype = torch.float32) -> SurfaceMap:

@@ -96,14 +96,14 @@ def test_a_field_shows_its_surface() -> None:
     assert told == [(i, 10) for i in range(1, 11)]
     assert height(surface).abs().max() < 1
     assert torch.equal(surface.keyframes, torch.stack([T.matrix() for T in poses]))
-    assert surface.nearest.device.type == "cpu"
+    assert surface.nearest_in_cell.device.type == "cpu"
 
 
 def test_the_grid_has_no_more_cells_than_were_asked_for() -> None:
     for bounds in (baked.BOUNDS, replace(baked.BOUNDS, lower=(-1.0, -0.9, 0.599), upper=(1.0, 1.0, 0.601))):
         surface = bake(baked.FIELD, bounds, [], ball_views(), replace(baked.CONFIG, cells=5000))
-        assert 2500 < surface.nearest.numel() <= 5000
-        for size, side in zip(surface.nearest.shape, bounds.size, strict=True):
+        assert 2500 < surface.nearest_in_cell.numel() <= 5000
+        for size, side in zip(surface.grid.shape, bounds.size, strict=True):
             assert size * surface.cell >= side
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.mapping.casting import cast
+from bidnerf_core.mapping.casting import cast, trace
 
 
 def rays(count: int, generator: Generator) -> tuple[torch.Tensor, torch.Tensor]:
@@ -50,7 +50,7 @@ def test_beside_the_grid_and_behind_the_camera() -> None:
 def test_it_meets_what_a_trace_meets(generator: Generator) -> None:
     surface = baked.toy()
     origins, directions = rays(400, generator)
-    traced, found = surface.trace(origins, directions), cast(surface, origins, directions)
+    traced, found = trace(surface, origins, directions), cast(surface, origins, directions)
     both = traced.isfinite() & found.met
     assert int(both.sum()) > 50
     assert float((traced.isfinite() == found.met).float().mean()) > 0.95  # they do not reach equally far

@@ -347,10 +347,10 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "unknown setting": (add_setting("widht", 3), ("map.json: config", "no field 'widht'", "mean 'width'")),
     "setting of another type": (add_setting("width", "big"), ("config: width", "'big'", "expected int")),
-    "setting out of range": (add_setting("width", 0), ("map.json: config", "width is 0, expected 1 or more")),
+    "setting out of range": (add_setting("width", 0), ("map.json: config", "width is 0, expected 1 to")),
     "setting that cannot be built": (
         of_description(lambda content: content["config"]["encoding"].update(log2_table_size=99)),
-        ("map.json", "log2_table_size must be in 1..30, got 99"),
+        ("map.json", "log2_table_size is 99, expected 1 to 30"),
     ),
     "bounds inside out": (
         of_description(lambda content: content["bounds"].update(lower=[9, 9, 9])),

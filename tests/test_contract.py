@@ -75,7 +75,11 @@ class WaveBackend:
 
         def outcome(step: int, generator: Generator) -> StepOutcome:
             batch = bank.draw(256, generator)
-            error = (render(field, batch.rays, batch.background, generator).rgb - batch.rgb).square().mean()
+            error = (
+                (render(field, batch.rays, batch.background, generator).rgb - batch.observed.rgb)
+                .square()
+                .mean()
+            )
             return StepOutcome(error, float(error.detach()))
 
         groups = [{"params": list(field.parameters()), "lr": 0.02}]
@@ -649,7 +653,7 @@ def stale_save(report: Report) -> Any:
 @pytest.mark.parametrize(
     ("backend", "said"),
     [
-        (reporting(step=every_other), "report.step was told of [(1, 60), (3, 60)"),
+        (reporting(step=every_other), "report.step was called with [(1, 60), (3, 60)"),
         (reporting(step=nan_loss), "loss or PSNR that is not finite"),
         (reporting(due=lambda report: lambda step: False), "saved after steps [], expected [1, 30, 60]"),
         (reporting(due=lambda report: lambda step: True), "and only then"),
@@ -686,7 +690,7 @@ class Forgetting(WaveBackend):
         (Deaf(), "TrainingStopped says step 31"),
         (
             reporting(resume=lambda report: lambda: None),
-            "resumed after step 30, it told of steps [1, 2, ... 60]",
+            "resumed after step 30, it reported steps [1, 2, ... 60]",
         ),
         (Forgetting(), "a resumed training arrives elsewhere"),
     ],

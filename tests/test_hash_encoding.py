@@ -90,7 +90,7 @@ def test_levels_of_the_default_configuration() -> None:
     ],
 )
 def test_refuses_a_wrong_configuration(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="must"):
+    with pytest.raises(ValueError, match="expected"):
         HashEncoding(HashEncodingConfig(**wrong))  # type: ignore[arg-type]
 
 

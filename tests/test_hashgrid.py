@@ -12,9 +12,11 @@ from torch import Tensor
 import tiny
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
 from bidnerf_core.rendering import render
+from bidnerf_core.voxel_grid import VoxelGrid
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
 from bidnerf_hashgrid.occupancy import OccupancyGrid
+from voxels import cell_centres, cells_of
 
 BOUNDS = SceneBounds((-1.2, -0.4, 0.1), (0.8, 0.7, 1.3), 0.1, 8.0, (0.3, 0.6, 0.9))
 RESOLUTION = 12
@@ -57,9 +59,7 @@ def marched(grid: OccupancyGrid, rays: Rays, offset: Tensor) -> list[Tensor]:
         distance = near + (steps + offset[i]) * grid.step
         distance = distance[distance < far]
         positions = rays.origins[i] + distance[:, None] * rays.directions[i]
-        cells = ((positions - grid.lower.double()) / grid.side * grid.resolution).floor().long()
-        x, y, z = cells.clamp(0, grid.resolution - 1).unbind(-1)
-        found.append(distance[grid.occupied[x, y, z]])
+        found.append(distance[grid.occupied[cells_of(grid.grid, positions)]])
     return found
 
 
@@ -107,8 +107,7 @@ def test_samples_are_in_occupied_cells() -> None:
     samples = grid(rays)
     whole = samples.valid & (samples.ends - samples.starts > grid.step * 0.999)
     assert whole.sum() > 0.9 * samples.valid.sum()
-    cells = ((rays.at(samples.middles)[whole] - grid.lower.double()) / grid.side * grid.resolution).long()
-    assert bool(grid.occupied[tuple(cells.unbind(-1))].all())
+    assert bool(grid.occupied[cells_of(grid.grid, rays.at(samples.middles)[whole])].all())
 
 
 def test_samples_repeat_without_jitter_and_with_the_same_one() -> None:
@@ -160,8 +159,7 @@ class Clouds:
     sampler: RaySampler
 
     def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
-        cells = ((positions - self.grid.lower.to(positions)) / self.grid.side * self.grid.resolution).long()
-        inside = self.grid.occupied[tuple(cells.clamp(0, RESOLUTION - 1).unbind(-1))]
+        inside = self.grid.occupied[cells_of(self.grid.grid, positions)]
         density = torch.where(inside, 4 + 3 * torch.sin(7 * positions).sum(-1), 0)
         return FieldValues(density.clamp(min=0), 0.5 + 0.5 * torch.sin(5 * positions))
 
@@ -169,7 +167,7 @@ class Clouds:
 @pytest.mark.parametrize("seed", range(3))
 def test_leaving_out_empty_cells_changes_no_image(seed: int) -> None:
     cells = random_cells(0.4, seed)
-    centres, margin = OccupancyGrid(BOUNDS, RESOLUTION).centres(), max(BOUNDS.size) / RESOLUTION
+    centres, margin = cell_centres(VoxelGrid.cube(BOUNDS, RESOLUTION)), max(BOUNDS.size) / RESOLUTION
     lower, upper = torch.tensor(BOUNDS.lower) + margin, torch.tensor(BOUNDS.upper) - margin
     cells &= ((centres > lower) & (centres < upper)).all(-1)  # what the limits cut short is at the border
     sparse, full, rays = grid_of(cells), grid_of(torch.ones_like(cells)), random_rays(600)
@@ -198,7 +196,7 @@ def test_a_new_grid_holds_everything() -> None:
 def test_peaks_rise_at_once_fade_when_visited_and_stay_when_not() -> None:
     grid = grid_of(torch.zeros((RESOLUTION,) * 3, dtype=torch.bool))
     grid.peak.fill_(0.5)
-    here, there = grid.centres()[3, 4, 5], grid.centres()[6, 7, 8]
+    here, there = cell_centres(grid.grid)[[3, 6], [4, 7], [5, 8]]
     grid.observe(torch.stack([here, there, here, here]), torch.tensor([0.1, 0.9, 0.2, 0.0]), fade=0.8)
     assert float(grid.peak[3, 4, 5]) == pytest.approx(0.4)
     assert float(grid.peak[6, 7, 8]) == pytest.approx(0.9)
@@ -275,7 +273,7 @@ def test_levels_are_coarse_and_fine(field: HashGridField) -> None:
     assert fine is field
     assert isinstance(coarse, RadianceField)
     assert coarse.sampler is field.coarse_sampler
-    assert coarse.sampler.resolution * 2 == field.sampler.resolution
+    assert coarse.sampler.grid.shape[0] * 2 == field.sampler.grid.shape[0]
 
 
 @pytest.mark.parametrize("level", [0, 1])

@@ -14,6 +14,7 @@ from bidnerf_core.sampling import AroundDepth, Importance, Resampled, Stratified
 from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.testing import samples as laws
 from bidnerf_hashgrid.occupancy import OccupancyGrid
+from voxels import cell_centres
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.05, 8.0)
 COUNT = 9
@@ -117,7 +118,9 @@ def test_a_surface_in_a_grid_is_seen_where_it_is() -> None:
     where = rays(300)
     exact = render(Resampled(ball, Stratified(4000)), where)
     cells = OccupancyGrid(BOUNDS, 8)
-    cells.restrict((cells.centres().norm(dim=-1) - 0.8).abs() < 0.3)  # the shell, and gaps inside and out
+    cells.restrict(
+        (cell_centres(cells.grid).norm(dim=-1) - 0.8).abs() < 0.3
+    )  # the shell, and gaps inside and out
     rough = render(Resampled(ball, cells), where)
     cut = render(Resampled(ball, Importance(Resampled(ball, cells), 64)), where)
     hit = exact.opacity > 0.99

@@ -16,7 +16,7 @@ from bidnerf_core.field import Rays, RaySamples
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render, rendering_weights
 from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.training import RayBank, RayBatch, Silent, depth_term, supervised_loss
+from bidnerf_core.training import RayBank, Silent, TrainingBatch, depth_term, supervised_loss
 from bidnerf_hashgrid import backend as hashgrid
 from bidnerf_vanilla import VanillaConfig
 from bidnerf_vanilla import backend as vanilla
@@ -37,7 +37,7 @@ BACKENDS = {
 }
 
 
-def ray(density: torch.Tensor, measured: float) -> tuple[Rendering, RayBatch]:
+def ray(density: torch.Tensor, measured: float) -> tuple[Rendering, TrainingBatch]:
     """One ray through ten cells of half a metre, and what was measured along it."""
     borders = torch.linspace(0, 5, 11, dtype=density.dtype)[None]
     samples = RaySamples(borders[:, :-1], borders[:, 1:], torch.ones(1, 10, dtype=torch.bool))
@@ -45,7 +45,7 @@ def ray(density: torch.Tensor, measured: float) -> tuple[Rendering, RayBatch]:
     distance = (weights * samples.middles).sum(-1)
     rgb = torch.zeros(1, 3, dtype=density.dtype)
     zero = density.new_zeros(1, 3)
-    batch = RayBatch(Rays(zero, zero, zero[:, 0], zero[:, 0] + 5), rgb, density.new_tensor([measured]), zero)
+    batch = tiny.black_batch(Rays(zero, zero, zero[:, 0], zero[:, 0] + 5), density.new_tensor([measured]))
     return Rendering(rgb, distance, weights.sum(-1), weights, samples), batch
 
 

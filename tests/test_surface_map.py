@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 import baked
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.casting import trace
 from bidnerf_core.mapping.surface_map import nearest_surfels
 from bidnerf_core.scenes.primitives import Box, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import blotches
@@ -47,8 +48,8 @@ def test_beyond_the_grid_its_border_counts(generator: Generator) -> None:
     surface = baked.toy()
     far = 100 * torch.randn((300, 3), generator=generator)
     outside = far[(far.abs() > 1).any(-1)]
-    assert torch.equal(surface.touch(outside), surface.touch(outside.clamp(-1, 1)))
-    assert surface.touch(outside[:60].reshape(3, 20, 3)).shape == (3, 20)
+    assert torch.equal(surface.nearest(outside), surface.nearest(outside.clamp(-1, 1)))
+    assert surface.nearest(outside[:60].reshape(3, 20, 3)).shape == (3, 20)
 
 
 def solid(shape: Shape) -> tuple[SurfaceMap, Primitive]:
@@ -66,7 +67,7 @@ def towards(targets: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
 def test_half_lines_meet_the_surface_where_the_solid_is(shape: Shape, generator: Generator) -> None:
     surface, truth = solid(shape)
     origins, directions = towards(0.6 * torch.rand((400, 3), generator=generator) - 0.3, generator)
-    found = surface.trace(origins, directions)
+    found = trace(surface, origins, directions)
     expected = truth.distance(origins.T.contiguous(), directions.T.contiguous())
     assert (found - expected).abs().median() < surface.cell
     assert (found - expected).abs().quantile(0.98) < 3 * surface.cell  # grazing ones meet it early
@@ -75,11 +76,11 @@ def test_half_lines_meet_the_surface_where_the_solid_is(shape: Shape, generator:
 def test_half_lines_that_miss_meet_nothing(generator: Generator) -> None:
     surface, _ = solid(Sphere(0.4))
     origins, directions = towards(torch.zeros((50, 3)), generator)
-    assert surface.trace(origins, -directions).isinf().all()  # behind
+    assert trace(surface, origins, -directions).isinf().all()  # behind
     across = torch.nn.functional.normalize(torch.linalg.cross(directions, origins.flip(-1)), dim=-1)
-    assert surface.trace(origins, across).isinf().all()  # past the grid
+    assert trace(surface, origins, across).isinf().all()  # past the grid
     aside = torch.tensor([[-2.0, 0.8, 0.8]]), torch.tensor([[1.0, 0.0, 0.0]])
-    assert surface.trace(*aside).isinf().all()  # through the grid, past the ball
+    assert trace(surface, *aside).isinf().all()  # through the grid, past the ball
 
 
 def test_stray_surfels_do_not_enlarge_the_scene() -> None:

@@ -13,7 +13,7 @@ from bidnerf_core.mapping import surface_from_tensors, surface_tensors
 def test_there_and_back() -> None:
     surface = baked.toy()
     again = surface_from_tensors(surface_tensors(surface))
-    assert (again.lower, again.cell) == (surface.lower, surface.cell)
+    assert again.grid == surface.grid
     for name, value in surface_tensors(surface).items():
         found = surface_tensors(again)[name]
         assert found.dtype == value.dtype
@@ -23,9 +23,10 @@ def test_there_and_back() -> None:
 def test_an_uneven_corner_comes_back_exactly() -> None:
     from dataclasses import replace
 
-    odd = replace(baked.toy(), lower=(0.1, 1 / 3, -1e-7), cell=1 / 7)
+    toy = baked.toy()
+    odd = replace(toy, grid=replace(toy.grid, lower=(0.1, 1 / 3, -1e-7), cell=1 / 7))
     again = surface_from_tensors(surface_tensors(odd))
-    assert (again.lower, again.cell) == (odd.lower, odd.cell)
+    assert again.grid == odd.grid
 
 
 def nan(value: Tensor) -> Tensor:
@@ -38,7 +39,7 @@ def nan(value: Tensor) -> Tensor:
         ("positions", nan, "positions holds NaN"),
         ("cell", nan, "cell holds NaN"),
         ("cell", torch.zeros_like, "cell is 0"),
-        ("rgb", lambda v: v[1:], "several numbers"),
+        ("rgb", lambda v: v[1:], "equally many"),
         ("normals", lambda v: v[:, :2], "normals is"),
         ("nearest", lambda v: v + 1, "expected 0 to"),
         ("nearest", lambda v: v - 1, "expected 0 to"),

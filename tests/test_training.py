@@ -19,18 +19,18 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.pixels import all_pixels, observe
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.training import (
-    MEASURED_SHARE,
     Progress,
     RayBank,
-    RayBatch,
     Report,
     Silent,
     StepOutcome,
+    TrainingBatch,
     TrainingState,
     TrainingStopped,
     cosine,
     fit,
 )
+from bidnerf_core.training.ray_bank import MEASURED_SHARE
 from bidnerf_hashgrid import HashGridField, backend
 
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.5, 6.0, (0.2, 0.4, 0.6))
@@ -254,7 +254,7 @@ def random_views(count: int, alpha: bool, depth: bool, seed: int = 0) -> list[Vi
     return views
 
 
-def drawn(views: list[View], count: int = 400) -> tuple[RayBatch, list[Tensor], Tensor]:
+def drawn(views: list[View], count: int = 400) -> tuple[TrainingBatch, list[Tensor], Tensor]:
     """A batch, and for each of its rays what ``observe`` says of its pixel: origin, direction, colour, distance; alpha."""
     bank = RayBank(views, BOUNDS)
     batch = bank.draw(count, torch.Generator().manual_seed(1))
@@ -276,12 +276,12 @@ def test_rays_are_those_of_the_pixels(alpha: bool, depth: bool) -> None:
     expected = BOUNDS.rays(origins, directions)
     for name in ("origins", "directions", "near", "far"):
         torch.testing.assert_close(getattr(batch.rays, name), getattr(expected, name), atol=2e-6, rtol=2e-6)
-    torch.testing.assert_close(batch.distance, distance, atol=1e-6, rtol=1e-6)
-    assert bool((batch.distance > 0).any()) == depth
+    torch.testing.assert_close(batch.observed.distance, distance, atol=1e-6, rtol=1e-6)
+    assert bool((batch.observed.distance > 0).any()) == depth
     torch.testing.assert_close(torch.linalg.vector_norm(batch.rays.directions, dim=-1), torch.ones(400))
     shown = (1 - cover)[:, None] * (batch.background - torch.tensor(BOUNDS.background))
-    torch.testing.assert_close(batch.rgb, rgb + shown)
-    assert torch.equal(batch.rgb[cover == 1], rgb[cover == 1])
+    torch.testing.assert_close(batch.observed.rgb, rgb + shown)
+    assert torch.equal(batch.observed.rgb[cover == 1], rgb[cover == 1])
 
 
 def test_a_background_that_shows_through_is_another_for_each_ray() -> None:
@@ -290,7 +290,7 @@ def test_a_background_that_shows_through_is_another_for_each_ray() -> None:
     assert bool((cover == 1).any())
     assert len(batch.background.unique(dim=0)) == len(batch.background)
     assert bool(((batch.background >= 0) & (batch.background <= 1)).all())
-    changed = (batch.rgb != rgb).any(-1)
+    changed = (batch.observed.rgb != rgb).any(-1)
     assert torch.equal(changed, cover < 1)
 
 
@@ -302,15 +302,15 @@ def test_without_alpha_the_background_is_that_of_the_scene() -> None:
 def test_views_with_and_without_alpha_and_depth_mix() -> None:
     views = [*random_views(2, True, True), *random_views(2, False, False, seed=1)]
     batch, (_, _, rgb, distance), cover = drawn(views)
-    torch.testing.assert_close(batch.distance, distance, atol=1e-6, rtol=1e-6)
-    assert torch.equal(batch.rgb[cover == 1], rgb[cover == 1])
+    torch.testing.assert_close(batch.observed.distance, distance, atol=1e-6, rtol=1e-6)
+    assert torch.equal(batch.observed.rgb[cover == 1], rgb[cover == 1])
     assert bool((distance == 0).any())
 
 
 def test_every_pixel_is_as_likely_as_any_other() -> None:
     bank = RayBank(random_views(3, False, False), BOUNDS)
     batch = bank.draw(20000, torch.Generator().manual_seed(0))
-    _, counts = batch.rgb.unique(dim=0, return_counts=True)
+    _, counts = batch.observed.rgb.unique(dim=0, return_counts=True)
     assert len(counts) == bank.count
     expected = 20000 / bank.count
     assert bool(((counts - expected).abs() < 6 * expected**0.5).all())
@@ -324,15 +324,15 @@ def test_where_few_pixels_have_depth_a_share_of_the_rays_goes_through_them() -> 
         few[number].frame.depth[3, 2] = 1.0 + number  # type: ignore[index]
     bank = RayBank(few, BOUNDS)
     batch = bank.draw(400, torch.Generator().manual_seed(0))
-    measured = batch.distance > 0
+    measured = batch.observed.distance > 0
     assert float(measured.float().mean()) == pytest.approx(MEASURED_SHARE, abs=0.05)
-    assert len(batch.distance[measured].unique()) == 3
+    assert len(batch.observed.distance[measured].unique()) == 3
     for view in (few[0], few[1], few[4]):
         seen = observe(view, torch.tensor([[2, 3]]))
-        here = (batch.distance - seen.distance).abs() < 1e-5
+        here = (batch.observed.distance - seen.distance).abs() < 1e-5
         assert int(here.sum()) > 10
         torch.testing.assert_close(batch.rays.directions[here], seen.directions.expand(int(here.sum()), 3))
-    assert len(batch.distance[~measured]) > 250
+    assert len(batch.observed.distance[~measured]) > 250
 
 
 def test_the_same_generator_draws_the_same_rays(generator: torch.Generator) -> None:
@@ -342,6 +342,6 @@ def test_the_same_generator_draws_the_same_rays(generator: torch.Generator) -> N
     other = bank.draw(50, generator)
     generator.set_state(state)
     again = bank.draw(50, generator)
-    assert torch.equal(one.rgb, again.rgb)
+    assert torch.equal(one.observed.rgb, again.observed.rgb)
     assert torch.equal(one.background, again.background)
-    assert not torch.equal(one.rgb, other.rgb)
+    assert not torch.equal(one.observed.rgb, other.observed.rgb)

@@ -15,10 +15,13 @@ import torch
 
 from bidnerf_core import registry
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.field import Rays
 from bidnerf_core.frames import View
+from bidnerf_core.observations import Observations
 from bidnerf_core.scenes.closed_form import views as seen_from
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.training import TrainingBatch
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid.encoding import HashEncodingConfig
 
@@ -60,6 +63,13 @@ def options(steps: int = STEPS) -> list[str]:
 
 def views(count: int = 6, seed: int = 0) -> list[View]:
     return seen_from(demo_object(), CAMERA, orbit(3.5, count, seed=seed))
+
+
+def black_batch(rays: Rays, distance: torch.Tensor) -> TrainingBatch:
+    """Black pixels with measured distances (r; metres, 0 for none), before black."""
+    coloured = torch.ones(len(distance), dtype=torch.bool)
+    black = torch.zeros_like(rays.origins)
+    return TrainingBatch(rays, Observations(rays.origins, rays.directions, black, distance, coloured), black)
 
 
 def write_dataset(folder: Path, train: int = 6, test: int = 3, depth: bool = True) -> Path:

@@ -1,4 +1,4 @@
-"""Bins: equal parts of a ray's way through the scene's box; and the choice of a few of them."""
+"""Bins, which are equal parts of a ray's segment in the scene's box, and the choice of a few of them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from bidnerf_core.sampling import Stratified
 
 @dataclass(frozen=True)
 class Bins:
-    """All bins of each ray: what is shaded in dense training. A ``RaySampler``.
+    """All bins of each ray, as dense training shades them: a ``RaySampler``.
 
-    A ray's bins depend on the box alone. Where the ray's own [near, far] is narrower, they are cut off; where it is
-    wider, there is nothing to see beyond the box.
+    A ray's bins depend on the box alone. They are cut off where the ray's own [near, far] is narrower, and do not reach
+    beyond the box where it is wider.
     """
 
     bounds: SceneBounds
@@ -33,7 +33,7 @@ class Bins:
 
     @torch.no_grad()
     def through(self, rays: Rays) -> Rays:
-        """The same rays with the whole of their way through the box."""
+        """Return the rays with the whole of their segment in the box."""
         return self.bounds.rays(rays.origins.detach(), rays.directions.detach())
 
 
@@ -41,8 +41,8 @@ class Bins:
 class Sparse:
     """The bins that the oracle chooses, at least one of each ray that meets the scene: a ``RaySampler``.
 
-    Bins whose score is above ``threshold``, the best ``most`` of them, nearest first. The choice carries no gradient: a
-    pose is felt through the positions that were chosen.
+    Of the bins whose score is above ``threshold`` these are the best ``most``, nearest first. The choice carries no
+    gradient; the derivative by the pose comes from the positions of the chosen bins.
     """
 
     oracle: Oracle
@@ -60,7 +60,7 @@ class Sparse:
 
 
 def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
-    """What the oracle says of the bins of rays; differentiable in the oracle's parameters."""
+    """Return the oracle's scores of the bins of rays, as logits; differentiable in the oracle's parameters."""
     shape = rays.near.shape
     whole = bins.through(rays)
     ends = torch.stack([whole.near, whole.far], dim=-1)
@@ -72,11 +72,11 @@ def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
 
 
 def chosen(samples: RaySamples, scores: Float[Tensor, "*r n"], threshold: float, most: int) -> RaySamples:
-    """Of each ray the best ``most`` samples above ``threshold``, and the best one in any case, if it is valid."""
+    """Return each ray's best ``most`` samples above ``threshold``, and its best one in any case if that is valid."""
     count = scores.shape[-1]
     best, index = scores.topk(min(most, count), dim=-1)
     taken: Bool[Tensor, "*r k"] = best > threshold
     taken[..., 0] = best[..., 0] >= 0
-    index = index.masked_fill(~taken, count).sort(dim=-1).values  # nearest first, those not taken last
+    index = index.masked_fill(~taken, count).sort(dim=-1).values  # nearest first, the others last
     valid, index = index < count, index.clamp(max=count - 1)
     return RaySamples(samples.starts.gather(-1, index), samples.ends.gather(-1, index), valid)

@@ -1,53 +1,26 @@
-"""Dense training: all bins of a ray are shaded, and the oracle's scores say how much each of them counts."""
+"""Dense training, in which all bins of a ray are shaded and weighted by the oracle's scores."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_adanerf.field import AdaNerfField
-from bidnerf_core.carving import occupied_cells
-from bidnerf_core.field import FieldValues, Rays, RaySamples, SceneBounds
-from bidnerf_core.frames import View
+from bidnerf_core.field import FieldValues, Rays, RaySamples
 from bidnerf_core.rendering import Rendering
+from bidnerf_core.voxel_grid import OccupancyMask
 
-TOLERANCE = 0.05
-"""Part by which the measured depth of a real sensor may be off."""
 PROBED = 1 / 16
-"""Share of the bins without room for matter that are shaded all the same, to learn that they are empty."""
-
-
-@dataclass(frozen=True, eq=False)
-class Room:
-    """A cube of cells about the scene: where the training views leave room for matter. It serves training only."""
-
-    lower: Float[Tensor, "3"]
-    side: float  # metres
-    cells: Bool[Tensor, "n n n"]
-
-    @staticmethod
-    def left_by(views: Sequence[View], bounds: SceneBounds, resolution: int) -> Room:
-        side = max(bounds.size)
-        x, y, z = ((a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True))
-        half = side / 2
-        lower, upper = (x - half, y - half, z - half), (x + half, y + half, z + half)
-        cells = occupied_cells(views, lower, upper, (resolution,) * 3, TOLERANCE)
-        return Room(torch.tensor(lower), side, cells)
-
-    def holds(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
-        count = len(self.cells)
-        x, y, z = ((positions - self.lower) * (count / self.side)).long().clamp_(0, count - 1).unbind(-1)
-        return self.cells.view(-1)[(x * count + y) * count + z]
+"""Fraction of the bins without room for matter that are shaded all the same, so that the field learns that they are empty."""
 
 
 def dense_samples(
-    field: AdaNerfField, rays: Rays, room: Room | None, generator: Generator
+    field: AdaNerfField, rays: Rays, room: OccupancyMask | None, generator: Generator
 ) -> tuple[RaySamples, Tensor]:
-    """The bins that are shaded, jittered, and which of them are known to be empty."""
+    """Return the jittered bins that are shaded, and which of them are known to be empty."""
     samples = field.bins(rays, generator)
     if room is None:
         return samples, torch.zeros_like(samples.valid)
@@ -57,10 +30,10 @@ def dense_samples(
 
 
 def soft_student(scores: Float[Tensor, "r n"], threshold: float) -> Float[Tensor, "r n"]:
-    """How much bins count in the soft phase: those above the threshold fully, as they will, the others in proportion.
+    """Return the weights of bins in the soft phase: 1 above the threshold, as afterwards, and in proportion to the score below.
 
-    In the paper a bin counts as much as its score itself. Matter then has to be denser than it is where scores are
-    middling, and is too dense once those bins count fully: on Lego the dense rendering lost 1 dB in this phase.
+    In the paper the weight is the score itself. Where scores are middling, density then has to be too large, and stays so
+    when those bins later count fully: on Lego the dense rendering lost 1 dB in this phase.
     """
     return (scores / max(threshold, 1e-6)).clamp(max=1)
 
@@ -71,7 +44,7 @@ def render_softly(
     scores: Float[Tensor, "r n"],
     background: Float[Tensor, "r 3"],
 ) -> Rendering:
-    """Volume rendering in which each bin's opacity is multiplied with a score (Kurz et al. 2022, section 3)."""
+    """Render with each bin's opacity multiplied by its score (Kurz et al. 2022, section 3)."""
     absorbed = torch.where(samples.valid, values.density * (samples.ends - samples.starts), 0)
     alpha = -torch.expm1(-absorbed) * scores
     passed = torch.log1p(-alpha * (1 - 1e-6))  # its logarithm; the factor keeps it finite
@@ -82,6 +55,6 @@ def render_softly(
 
 
 def opacity(values: FieldValues, samples: RaySamples, which: Bool[Tensor, "r n"]) -> Float[Tensor, ""]:
-    """Mean of ``1 - exp(-sigma dt)`` over some of the bins, without scores."""
+    """Return the mean of ``1 - exp(-sigma dt)`` over some of the bins, without scores."""
     absorbed = (values.density * (samples.ends - samples.starts))[which]
     return -torch.expm1(-absorbed).sum() / which.sum().clamp(min=1)

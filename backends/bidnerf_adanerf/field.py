@@ -1,4 +1,4 @@
-"""The field of AdaNeRF (Kurz et al. 2022): a shading network, asked where a sampling network wants it to be."""
+"""The field of AdaNeRF (Kurz et al. 2022): a shading network that is evaluated where a sampling network chooses."""
 
 from __future__ import annotations
 
@@ -16,26 +16,25 @@ from bidnerf_adanerf.networks import Oracle, ShadingNetwork
 from bidnerf_core.field import FieldValues, SceneBounds
 
 SHARPNESS = 30.0
-"""Density per side of the scene at a raw density of about 1: networks whose outputs are small see surfaces."""
+"""Density, per side of the scene, at a raw density of about 1: networks with small outputs can represent surfaces."""
 THINNESS = 1.0
-"""How far raw density is shifted down, so that an untrained field is nearly transparent."""
+"""Shift of raw density that makes an untrained field nearly transparent."""
 
 
 class AdaNerfField(nn.Module):
-    """Density and colour of points of a scene's box; ``sampler`` chooses the few of a ray that matter.
+    """Density and colour in a scene's box, with a ``sampler`` that chooses the few points of a ray that matter.
 
-    There are no coarser ``levels``: the shading network is trained where the oracle looks, at one level of detail.
+    There are no coarser ``levels``: the shading network is trained at the oracle's samples, at one level of detail.
     """
 
-    middle: Float[Tensor, "3"]
+    centre: Float[Tensor, "3"]
 
     def __init__(self, config: AdaNerfConfig, bounds: SceneBounds) -> None:
         super().__init__()
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
-        self.register_buffer("middle", torch.tensor(middle), persistent=False)
+        self.register_buffer("centre", torch.tensor(bounds.centre), persistent=False)
         self.shading = ShadingNetwork(
             config.width, config.layers, config.position_frequencies, config.direction_frequencies
         )
@@ -56,9 +55,9 @@ class AdaNerfField(nn.Module):
         return DenseField(self)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Positions are brought into the cube [-1, 1], densities are per its side: no unit of length matters."""
+        """Return the values at positions that are scaled to the cube [-1, 1], so that the unit of length has no effect."""
         shape = positions.shape[:-1]
-        points = (positions.reshape(-1, 3) - self.middle) * (2 / self.side)
+        points = (positions.reshape(-1, 3) - self.centre) * (2 / self.side)
         raw, rgb = self.shading(points, directions.reshape(-1, 3))
         density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
@@ -66,7 +65,7 @@ class AdaNerfField(nn.Module):
 
 @dataclass(frozen=True)
 class DenseField:
-    """The same field shaded in all its bins, without the oracle: what the sparse one is to look like."""
+    """The field with all bins shaded, without the oracle: the rendering that the sparse one is to reproduce."""
 
     sparse: AdaNerfField
 

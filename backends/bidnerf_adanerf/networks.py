@@ -1,4 +1,4 @@
-"""The two networks of AdaNeRF and the encoding of what they are given."""
+"""The two networks of AdaNeRF and the encoding of their inputs."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch.nn import functional
 
 
 def encoded_width(frequencies: int) -> int:
-    """How many numbers encode a point of three coordinates."""
+    """Return how many numbers encode a point."""
     return 3 * (1 + 2 * frequencies)
 
 
 def encode(points: Float[Tensor, "*p 3"], frequencies: int) -> Float[Tensor, "*p f"]:
-    """``(p, sin(2^k pi p), cos(2^k pi p))`` for k below ``frequencies`` (Mildenhall et al. 2020, eq. 4), p in [-1, 1]."""
+    """Return ``(p, sin(2^k pi p), cos(2^k pi p))`` for k below ``frequencies`` (Mildenhall et al. 2020, eq. 4), p in [-1, 1]."""
     octaves = torch.arange(frequencies, dtype=points.dtype, device=points.device)
     angles = (points[..., None, :] * (torch.pi * 2**octaves)[:, None]).flatten(-2)
     return torch.cat([points, angles.sin(), angles.cos()], dim=-1)
 
 
 def trunk(inputs: int, width: int, layers: int) -> nn.Sequential:
-    """Hidden layers with rectifiers."""
+    """Return ``layers`` hidden layers with rectifiers."""
     widths = [inputs, *[width] * layers]
     pairs = pairwise(widths)
     return nn.Sequential(*(m for a, b in pairs for m in (nn.Linear(a, b), nn.ReLU(inplace=True))))
@@ -45,7 +45,7 @@ class ShadingNetwork(nn.Module):
     def forward(
         self, points: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
-        """Density before its activation, and rgb in [0, 1], of ``points`` in the cube [-1, 1]."""
+        """Return density before its activation, and rgb in [0, 1], at ``points`` of the cube [-1, 1]."""
         hidden = self.trunk(encode(points, self.frequencies[0]))
         turned = encode(directions, self.frequencies[1])
         seen = functional.relu(self.view(torch.cat([hidden, turned], dim=-1)), inplace=True)
@@ -53,10 +53,10 @@ class ShadingNetwork(nn.Module):
 
 
 class Oracle(nn.Module):
-    """The sampling network: scores all bins of a ray in one evaluation, knowing nothing but the ray.
+    """The sampling network: scores all bins of a ray in one evaluation, from the ray alone.
 
-    A ray is described by points at equal steps of its way through the scene, the first where it enters and the last where
-    it leaves. So rays that see the same part of the scene look alike, wherever their camera is: outside or within.
+    Its input are points at equal steps along the ray's segment in the scene, from where it enters to where it leaves. Rays
+    that see the same part of the scene thus have similar inputs, whether their camera is outside or inside.
     """
 
     places: Float[Tensor, "k"]
@@ -70,11 +70,11 @@ class Oracle(nn.Module):
         nn.init.constant_(self.scores.bias, FULL)
 
     def forward(self, enter: Float[Tensor, "r 3"], leave: Float[Tensor, "r 3"]) -> Float[Tensor, "r n"]:
-        """Logits of the scores of rays that enter and leave the scene at these points of the cube [-1, 1]."""
+        """Return the logits of the scores of rays that enter and leave the scene at these points of the cube [-1, 1]."""
         places = self.places[:, None]
         points = torch.lerp(enter[:, None], leave[:, None], places)
         return self.scores(self.trunk(encode(points, self.frequencies).flatten(1)))
 
 
 FULL = 3.0
-"""Logit of the scores before training: all bins count, and there is a gradient to make them count less."""
+"""Logit of the scores before training: high enough for all bins to count, low enough for a gradient."""

@@ -1,4 +1,4 @@
-"""How an AdaNeRF is trained: densely, then with ever fewer bins, then at the bins that are left."""
+"""Training of an AdaNeRF: with all bins, then with ever fewer of them, then with those that are left."""
 
 from __future__ import annotations
 
@@ -11,49 +11,53 @@ from torch import Generator
 
 from bidnerf_adanerf.bins import ray_logits
 from bidnerf_adanerf.config import AdaNerfConfig
-from bidnerf_adanerf.dense import Room, dense_samples, opacity, render_softly, soft_student
+from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_student
 from bidnerf_adanerf.field import AdaNerfField
 from bidnerf_adanerf.oracle_loss import oracle_loss
+from bidnerf_core.carving import occupied_voxels
+from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import query_samples, render, rendering_weights
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
+from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 
 PROBE = 4096
-"""Rays from which is learnt how many samples a ray takes."""
+"""Number of rays from which the mean number of samples of a ray is estimated."""
 
 
 class Phase(Enum):
-    """What a step does; each phase begins where the one before has arrived."""
+    """What a step does; each phase continues from the one before."""
 
-    DENSE = "all bins are shaded and count; the oracle learns to tell which of them matter"
-    SOFT = "all bins are shaded, and count as much as their scores say, which are made sparse"
-    SPARSE = "only the bins that the oracle chooses are shaded; it learns no more"
+    DENSE = "all bins are shaded and count; the oracle learns which of them matter"
+    SOFT = "all bins are shaded and weighted by their scores, which are made sparse"
+    SPARSE = "only the bins that the oracle chooses are shaded; the oracle is no longer trained"
 
 
 def phase_at(step: int, config: AdaNerfConfig) -> Phase:
+    """Return the phase of a step."""
     soft = round(config.dense_part * config.steps)
     sparse = round((config.dense_part + config.soft_part) * config.steps)
     return Phase.DENSE if step < soft else Phase.SOFT if step < sparse else Phase.SPARSE
 
 
 def sparsity(step: int, config: AdaNerfConfig) -> float:
-    """What a mean score of 1 costs: nothing before the soft phase, then ever more, all of it from half of that on."""
+    """Return the weight of the mean score in the loss: 0 before the soft phase, then growing until that is half over."""
     begin, length = config.dense_part * config.steps, config.soft_part * config.steps
     return config.sparsity_weight * min(1.0, max(0.0, (step - begin) / max(1.0, length / 2)))
 
 
 def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
-    room = Room.left_by(views, field.bounds, config.room_resolution) if config.carve else None
+    """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
+    room = room_for_matter(views, field.bounds, config.room_resolution) if config.carve else None
     bank = RayBank(views, field.bounds)
 
     @cache
-    def rays_per_step(sparse: bool) -> int:  # nothing changes it during a phase, nor where training resumes
+    def rays_per_step(sparse: bool) -> int:  # constant in a phase, also where training resumes
         probe = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
         generator = Generator().manual_seed(config.seed)
         samples = field.sampler(probe) if sparse else dense_samples(field, probe, room, generator)[0]
-        asked = 1 + float(samples.valid.sum()) / PROBE  # the oracle costs about as much as a sample
-        return max(1, min(config.rays_at_most, int(config.samples_per_step / asked)))
+        evaluations = 1 + float(samples.valid.sum()) / PROBE  # the oracle costs about as much as a sample
+        return max(1, min(config.rays_at_most, int(config.samples_per_step / evaluations)))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
         phase = phase_at(step, config)
@@ -66,10 +70,17 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
     fit(field, groups, outcome, config.steps, report, seed=config.seed)
 
 
+def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int) -> OccupancyMask:
+    """Return where the training views leave room for matter. It serves training only and is not saved."""
+    room = OccupancyMask(VoxelGrid.cube(bounds, resolution))
+    room.cells.copy_(occupied_voxels(views, room.grid))
+    return room
+
+
 def dense_step(
-    field: AdaNerfField, batch: RayBatch, room: Room | None, config: AdaNerfConfig, step: int, generator: Generator
+    field: AdaNerfField, batch: TrainingBatch, room: OccupancyMask | None, config: AdaNerfConfig, step: int, generator: Generator
 ) -> StepOutcome:  # fmt: skip
-    """All bins are shaded, and count in full or, in the soft phase, as much as their scores say."""
+    """Return the loss with all bins shaded, which count in full or, in the soft phase, according to their scores."""
     samples, empty = dense_samples(field, batch.rays, room, generator)
     values = query_samples(field, batch.rays, samples)
     logits = ray_logits(field.oracle, field.bins, batch.rays)
@@ -87,9 +98,9 @@ def dense_step(
 
 
 def sparse_step(
-    field: AdaNerfField, batch: RayBatch, config: AdaNerfConfig, generator: Generator
+    field: AdaNerfField, batch: TrainingBatch, config: AdaNerfConfig, generator: Generator
 ) -> StepOutcome:
-    """As in localization: the oracle, which learns no more, chooses, and the shading network makes the best of it."""
+    """Return the loss of rendering as in localization: the oracle, which is not trained any more, chooses the samples."""
     rendering = render(field, batch.rays, batch.background, generator)
     loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
-    return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch.rgb)))
+    return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))

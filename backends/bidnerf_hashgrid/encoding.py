@@ -14,12 +14,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.settings import Range, Settings
 
 # The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
@@ -27,19 +30,26 @@ CPU_CHUNK = 32768
 
 
 @dataclass(frozen=True)
-class HashEncodingConfig:
+class HashEncodingConfig(Settings):
     """Hyperparameters of table 1 of the paper: L, F, log2 T, N_min and N_max.
 
     The interpolation ``smooth`` passes the position in a cell through 3t^2 - 2t^3 (appendix A), so that the derivative
     of the encoding by position is continuous.
     """
 
-    levels: int = 16  # of resolution
-    features: int = 2  # of an entry; even numbers are faster
-    log2_table_size: int = 19  # entries of a level's table, as a power of two
-    base_resolution: float = 16  # cells along a side at the coarsest level
-    finest_resolution: float = 512  # and at the finest
+    levels: Annotated[int, Range(1, 64)] = 16  # of resolution
+    features: Annotated[int, Range(1, 64)] = 2  # of an entry; even numbers are faster
+    log2_table_size: Annotated[int, Range(1, 30)] = 19  # entries of a level's table, as a power of two
+    base_resolution: Annotated[float, Range(1, 2**20)] = 16  # cells along a side at the coarsest level
+    finest_resolution: Annotated[float, Range(1, 2**20)] = 512  # and at the finest
     interpolation: Literal["linear", "smooth"] = "linear"  # between the corners of a cell
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.base_resolution > self.finest_resolution:
+            raise InputError(
+                f"base_resolution is {self.base_resolution}, expected {self.finest_resolution} (finest_resolution) or less"
+            )
 
 
 @dataclass(frozen=True)
@@ -52,15 +62,7 @@ class _Level:
 
 
 def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
-    """Resolutions by eqs. 2 and 3; a level whose vertices fit in the table is stored without a hash."""
-    if not 1 <= config.log2_table_size <= 30:
-        raise ValueError(f"log2_table_size must be in 1..30, got {config.log2_table_size}")
-    if config.levels < 1 or config.features < 1:
-        raise ValueError("levels and features must be at least 1")
-    if not 1 <= config.base_resolution <= config.finest_resolution:
-        raise ValueError("resolutions must satisfy 1 <= base_resolution <= finest_resolution")
-    if config.interpolation not in ("linear", "smooth"):
-        raise ValueError(f"interpolation must be linear or smooth, got {config.interpolation!r}")
+    """Return the levels, with resolutions by eqs. 2 and 3; one whose vertices fit in the table is stored without a hash."""
     growth = math.log(config.finest_resolution / config.base_resolution) / max(config.levels - 1, 1)
     levels = []
     for index in range(config.levels):
@@ -77,7 +79,7 @@ def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
 def _vertices(
     points: Float[Tensor, "3 n"], level: _Level, dtype: torch.dtype
 ) -> tuple[Int[Tensor, "3 2 n"], Float[Tensor, "3 n"]]:
-    """What the lower and the upper vertex of each axis add to a corner's index, and the position in the cell."""
+    """Return the terms of the lower and upper vertex of each axis in a corner's index, and the position in the cell."""
     scaled = points * level.resolution
     # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
     lower = scaled.to(dtype).clamp_(0, level.resolution - 1)
@@ -88,14 +90,14 @@ def _vertices(
 
 
 def _corner_indices(terms: Int[Tensor, "3 2 m"], level: _Level) -> Int[Tensor, " 8*m"]:
-    """Table index of the eight corners (eq. 4, or the dense index), ordered (z, y, x, point)."""
+    """Return the table indices of the eight corners (eq. 4, or the dense index), ordered (z, y, x, point)."""
     combine = torch.bitwise_xor if level.hashed else torch.add
     x, y, z = terms.unbind()
     return combine(combine(z[:, None], y)[:, :, None], x).view(-1)
 
 
 def _weights(fraction: Float[Tensor, "3 n"], level: _Level, unit: int) -> Float[Tensor, "3 w"]:
-    """Weight of the upper vertex by axis (the fraction, or its smoothstep), repeated within a unit."""
+    """Return the weight of the upper vertex by axis (the fraction, or its smoothstep), repeated within a unit."""
     return _repeat(fraction * fraction * (3 - 2 * fraction) if level.smooth else fraction, unit)
 
 
@@ -108,7 +110,7 @@ def _unit(features: int) -> int:
 
 
 def _as_units(values: Float[Tensor, "*shape w"], unit: int) -> Shaped[Tensor, "*shape n"]:
-    """View of adjacent pairs of floats as complex numbers, if the unit is a pair."""
+    """Return a view of adjacent pairs of floats as complex numbers, if the unit is a pair."""
     return torch.view_as_complex(values.unflatten(-1, (-1, 2))) if unit == 2 else values
 
 
@@ -126,7 +128,7 @@ def _interpolate(corners: Float[Tensor, "2 2 2 w"], weights: Float[Tensor, "3 w"
 def _interpolate_with_slopes(
     corners: Float[Tensor, "2 2 2 w"], weights: Float[Tensor, "3 w"]
 ) -> tuple[Float[Tensor, " w"], list[Float[Tensor, " w"]]]:
-    """Interpolated value and its derivatives by the weights of x, y and z."""
+    """Return the interpolated value and its derivatives by the weights of x, y and z."""
     x, y, z = weights.unbind()
     slopes: list[Tensor] = []
     for weight in (z, y, x):
@@ -137,7 +139,7 @@ def _interpolate_with_slopes(
 
 
 def _spread(gradient: Float[Tensor, " w"], weights: Float[Tensor, "3 w"]) -> Float[Tensor, "2 2 2 w"]:
-    """Transpose of ``_interpolate``: the gradient to each of the eight corners."""
+    """Return the gradient to each of the eight corners: the transpose of ``_interpolate``."""
     for weight in weights.unbind():
         corners = gradient.new_empty(2, *gradient.shape)
         torch.mul(gradient, weight, out=corners[1])

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 
@@ -18,21 +20,23 @@ LARGEST_LOG_DENSITY = 12.0
 
 
 @dataclass(frozen=True)
-class FieldConfig:
+class FieldConfig(Settings):
     """Size of the field."""
 
     encoding: HashEncodingConfig = field(
         default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=19, finest_resolution=768)
     )
-    width: int = 64  # of the hidden layers
-    colour_layers: int = 2  # hidden layers of the colour network
-    geometry_features: int = 15  # that the density network passes on to the colour network
-    grid_resolution: int = 128  # cells of the occupancy grid along the longest side of the scene
-    coarse_levels: int = 4  # levels of the encoding that the coarse field keeps
+    width: Count = 64  # of the hidden layers
+    colour_layers: Count = 2  # hidden layers of the colour network
+    geometry_features: Count = 15  # that the density network passes on to the colour network
+    grid_resolution: Annotated[int, Range(2, 1024)] = (
+        128  # cells of the occupancy grid along the longest side of the scene
+    )
+    coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 
 
 class HashGridField(nn.Module):
-    """Density and colour of points of a scene's box. ``levels`` are the field with its fine levels masked, and itself."""
+    """Density and colour in a scene's box. Its ``levels`` are the field with its fine encoding levels masked, and itself."""
 
     lower: Float[Tensor, "3"]
 
@@ -41,8 +45,8 @@ class HashGridField(nn.Module):
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
-        self.register_buffer("lower", torch.tensor([m - self.side / 2 for m in middle]), persistent=False)
+        lower = [middle - self.side / 2 for middle in bounds.centre]
+        self.register_buffer("lower", torch.tensor(lower), persistent=False)
         self.encoding = HashEncoding(config.encoding)
         self.geometry = nn.Sequential(
             nn.Linear(self.encoding.width, config.width),
@@ -67,10 +71,10 @@ class HashGridField(nn.Module):
     def query_levels(
         self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"], active: int | None
     ) -> FieldValues:
-        """As ``query``, with the first ``active`` levels of the encoding only."""
+        """Return the values with the first ``active`` levels of the encoding only (None: all)."""
         shape = positions.shape[:-1]
         features = self.geometry(self.encode(positions.reshape(-1, 3), active))
-        # Per side of the scene, so that an untrained field is equally thin whatever the unit of length.
+        # Per side of the scene, so that an untrained field is equally thin in any unit of length.
         density = features[:, 0].clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
         seen = torch.cat([features[:, 1:], spherical_harmonics(directions.reshape(-1, 3))], dim=-1)
         return FieldValues(density.reshape(shape), self.colour(seen).reshape(*shape, 3))
@@ -86,7 +90,7 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
 
 @dataclass(frozen=True)
 class CoarseField:
-    """A hash-grid field seen through its coarse levels only: blurred, cheaper, with wider gradients."""
+    """A hash-grid field with its coarse encoding levels only: blurred, cheaper, with gradients of wider range."""
 
     fine: HashGridField
 
@@ -99,7 +103,7 @@ class CoarseField:
 
 
 def spherical_harmonics(directions: Float[Tensor, "p 3"]) -> Float[Tensor, "p 9"]:
-    """Real spherical harmonics of degrees 0 to 2 at unit directions."""
+    """Return the real spherical harmonics of degrees 0 to 2 at unit directions."""
     x, y, z = directions.unbind(-1)
     return torch.stack(
         [

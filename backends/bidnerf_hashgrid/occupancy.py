@@ -1,27 +1,27 @@
-"""Occupancy grid: where a field holds matter that can be seen, and the sampler that asks only there."""
+"""Occupancy grid: where a field has visible matter, and a sampler of these places only."""
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Generator, Tensor, nn
 
 from bidnerf_core.field import Rays, RaySamples, SceneBounds
+from bidnerf_core.voxel_grid import VoxelGrid
 
 BLOCK = 8
-"""Steps along a ray that are skipped together where nothing is near."""
+"""Steps along a ray that are skipped together where no occupied cell is near."""
 
 
 class OccupancyGrid(nn.Module):
-    """A cube of cells around the scene; a ``RaySampler`` of equal steps, valid in occupied cells only.
+    """A cube of cells around the scene, and a ``RaySampler`` of equal steps within its occupied cells.
 
-    A cell counts as occupied while some training ray gave weight to it: matter that no ray sees, such as the inside of a
-    solid, costs nothing. ``peak`` is the largest rendering weight seen in a cell, fading with each step that visits it;
-    a cell that no ray visits keeps its state. Occupied cells are those above a threshold and, while surfaces may still
-    move, their neighbours.
+    A cell is occupied while some training ray has weight in it: matter that no ray sees, such as the inside of a solid, is
+    not sampled. ``peak`` is the largest rendering weight observed in a cell; it fades with each step that visits the cell,
+    and a cell that no ray visits keeps it. Occupied cells are those whose peak is above a threshold and, while surfaces may
+    still move, their neighbours.
     """
 
-    lower: Float[Tensor, "3"]
     peak: Float[Tensor, "n n n"]
     samples_per_ray: Float[Tensor, ""]  # running mean over training rays
     occupied: Bool[Tensor, "n n n"]
@@ -29,13 +29,10 @@ class OccupancyGrid(nn.Module):
 
     def __init__(self, bounds: SceneBounds, resolution: int, steps_per_cell: int = 2) -> None:
         super().__init__()
-        self.resolution = resolution
-        self.side = max(bounds.size)
-        self.step = self.side / (resolution * steps_per_cell)
+        self.grid = VoxelGrid.cube(bounds, resolution)
+        self.step = max(bounds.size) / (resolution * steps_per_cell)  # metres
         self._reach = -(-BLOCK // (2 * steps_per_cell))  # cells from the middle of a block to its ends
-        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
-        self.register_buffer("lower", torch.tensor([m - self.side / 2 for m in middle]), persistent=False)
-        shape = (resolution,) * 3
+        shape = self.grid.shape
         self.register_buffer("peak", torch.ones(shape))
         self.register_buffer("samples_per_ray", torch.full((), float(resolution)))
         self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool))
@@ -44,21 +41,21 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def restrict(self, allowed: Bool[Tensor, "n n n"]) -> None:
-        """Empty the cells that are known to hold nothing."""
+        """Mark all cells but ``allowed`` as empty."""
         self.peak *= allowed
         self.prune(0.0)
 
     @torch.no_grad()
     def observe(self, positions: Float[Tensor, "p 3"], weights: Float[Tensor, "p"], fade: float) -> None:
-        """Take note of the weights that one batch of rays gave to sampled positions."""
-        cells = self._cells(positions)
+        """Update peaks by the rendering weights of one batch's samples, at ``positions`` (metres, world)."""
+        cells = self.grid.numbers(positions)
         seen = torch.zeros_like(self.peak).view(-1).scatter_reduce_(0, cells, weights.to(self.peak), "amax")
         flat = self.peak.view(-1)
         flat[cells] = torch.maximum(flat[cells] * fade, seen[cells])
 
     @torch.no_grad()
     def prune(self, threshold: float, grow: bool = True) -> None:
-        """Decide anew which cells are occupied: those that count, and their neighbours if surfaces may still move."""
+        """Recompute which cells are occupied: those whose peak is above ``threshold`` and, with ``grow``, their neighbours."""
         self.occupied.copy_(_dilated(self.peak > threshold, 1 if grow else 0))
         self._refresh()
 
@@ -74,16 +71,14 @@ class OccupancyGrid(nn.Module):
         steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
         distance = start[:, None] + steps + (offset[ray] * self.step)[:, None]
         positions = origins[ray][:, None] + distance[..., None] * directions[ray][:, None]
-        within = (
-            (positions >= self.lower.to(positions)) & (positions <= (self.lower + self.side).to(positions))
-        ).all(-1)
-        kept = self.occupied.view(-1)[self._cells(positions)] & (distance < far[ray][:, None]) & within
+        occupied = self.grid.at(self.occupied, positions) & self.grid.contains(positions)
+        kept = occupied & (distance < far[ray][:, None])
         return self._padded(distance[kept], ray[:, None].expand_as(kept)[kept], near, far, shape)
 
     def _busy_blocks(
         self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Ray index and start of each run of ``BLOCK`` steps that passes near an occupied cell, in order."""
+        """Return the ray and the start of each run of ``BLOCK`` steps that passes near an occupied cell, in order."""
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
         starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
@@ -91,13 +86,13 @@ class OccupancyGrid(nn.Module):
         ray, block = inside.nonzero(as_tuple=True)
         start = starts[ray, block]
         middle = origins[ray] + (start + length / 2)[:, None] * directions[ray]
-        busy = self.near_occupied.view(-1)[self._cells(middle)]
+        busy = self.grid.at(self.near_occupied, middle)
         return ray[busy], start[busy]
 
     def _padded(
         self, distance: Tensor, ray: Tensor, near: Tensor, far: Tensor, shape: torch.Size
     ) -> RaySamples:
-        """Samples gathered to the front of their ray's row; rows are as long as the longest."""
+        """Return the samples, gathered at the front of their ray's row; all rows are as long as the longest."""
         counts = torch.bincount(ray, minlength=len(near))
         width = int(counts.amax()) if len(near) else 0
         slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
@@ -111,21 +106,12 @@ class OccupancyGrid(nn.Module):
             starts.reshape(*shape, width), ends.reshape(*shape, width), valid.reshape(*shape, width)
         )
 
-    def _cells(self, positions: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
-        scaled = (positions - self.lower.to(positions)) * (self.resolution / self.side)
-        x, y, z = scaled.long().clamp_(0, self.resolution - 1).unbind(-1)
-        return (x * self.resolution + y) * self.resolution + z
-
-    def centres(self) -> Float[Tensor, "n n n 3"]:
-        axis = (torch.arange(self.resolution, device=self.lower.device) + 0.5) * (self.side / self.resolution)
-        return self.lower + torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
-
     def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))
 
 
 def _dilated(cells: Bool[Tensor, "n n n"], reach: int) -> Bool[Tensor, "n n n"]:
-    """Occupied cells and all within ``reach`` of them along each axis: a cube is the product of three lines."""
+    """Return the cells within a cube of ``reach`` cells around any of ``cells``; the cube is the product of three lines."""
     grown = cells.clone()
     for axis in range(3):
         for _ in range(reach):

@@ -1,53 +1,48 @@
-"""How a hash-grid field is trained."""
+"""Training of a hash-grid field: its settings and its recipe."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
-from torch import Generator, Tensor
+from torch import Generator
 
-from bidnerf_core.carving import occupied_cells
+from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.settings import Count, NotNegative, Range
+from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
-
-LEAST = {
-    "width": 1, "colour_layers": 1, "geometry_features": 1, "grid_resolution": 2, "coarse_levels": 0, "steps": 1, "samples_per_step": 1,
-    "learning_rate": 0, "coarse_every": 0, "depth_weight": 0, "seed": 0, "rays_at_most": 1, "prune_from": 0,
-    "prune_every": 1, "prune_fade": 0, "prune_threshold": 0,
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class HashGridConfig(FieldConfig):
-    """Size of the field and its training. The defaults suit a few minutes on a small CPU."""
+    """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
-    steps: int = 1600  # of the optimizer
-    samples_per_step: int = 65536  # the number of rays follows from it
-    learning_rate: float = 1e-2  # of the tables; the networks learn at a quarter of it
-    coarse_every: int = 4  # one step in so many trains the coarse field
-    depth_weight: float = 0.1  # of the depth term beside the colour term; 0 leaves depth out
-    seed: int = 0  # of initial weights and of all that is drawn at random
-    rays_at_most: int = 16384  # a step, however few samples they take
-    prune_from: int = 200  # step from which empty cells are left out
-    prune_every: int = 16  # steps between two such rounds
-    prune_fade: float = 0.95  # a cell's largest weight fades by this each time that rays visit it
-    prune_threshold: float = 0.01  # rendering weight up to which a cell counts as empty
-    grow_until: float = 0.6  # share of the steps in which the neighbours of occupied cells are asked as well
-    carve: bool = True  # start from the cells that the views' depth and silhouettes leave
+    steps: Count = 1600  # of the optimizer
+    samples_per_step: Count = 65536  # it decides the number of rays
+    learning_rate: NotNegative = 1e-2  # of the tables; that of the networks is a quarter of it
+    coarse_every: Annotated[int, Range(0)] = 4  # every so many steps, the coarse field is trained; 0: never
+    depth_weight: NotNegative = 0.1  # of the depth term beside the colour term; 0 leaves depth out
+    seed: Annotated[int, Range(0)] = 0  # of the initial weights and of all random draws
+    rays_at_most: Count = 16384  # a step, even if they take few samples
+    prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
+    prune_every: Count = 16  # steps from one update of the occupied cells to the next
+    prune_fade: Annotated[float, Range(0, 1)] = 0.95  # factor on a cell's weight when rays visit it
+    prune_threshold: NotNegative = 0.01  # rendering weight up to which a cell is empty
+    grow_until: NotNegative = (
+        0.6  # fraction of the steps in which neighbours of occupied cells are sampled too
+    )
+    carve: bool = True  # begin with the cells that the views' depth and silhouettes leave
 
     def __post_init__(self) -> None:
-        for name, least in LEAST.items():
-            value = getattr(self, name)
-            if not value >= least:
-                raise InputError(f"{name} is {value}, expected {least} or more")
-        if self.coarse_every == 1 or self.prune_fade > 1:
+        super().__post_init__()
+        if self.coarse_every == 1:
             raise InputError(
-                "coarse_every is 1 or prune_fade above 1: the field itself would never be trained or pruned"
+                "coarse_every is 1, expected 0 or 2 and more: the field itself would not be trained"
             )
         if self.coarse_every > self.prune_every:
             raise InputError(
@@ -56,10 +51,10 @@ class HashGridConfig(FieldConfig):
 
 
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve and report.resume() is None:
         for grid in (field.sampler, field.coarse_sampler):
-            grid.restrict(_room_for_matter(grid, views))
+            grid.restrict(occupied_voxels(views, grid.grid))
     bank = RayBank(views, field.bounds)
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
@@ -77,24 +72,17 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         count = max(1, min(config.rays_at_most, affordable))
         batch = bank.draw(count, generator)
         rendering = render(level, batch.rays, batch.background, generator)
-        _tend(grid, batch, rendering, step, config)
+        _update(grid, batch, rendering, step, config)
         loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
     fit(field, groups, outcome, config.steps, report, seed=config.seed)
 
 
-def _room_for_matter(grid: OccupancyGrid, views: Sequence[View]) -> Tensor:
-    upper = grid.lower + grid.side
-    shape = (grid.resolution,) * 3
-    # Measured depth of a real sensor is off by a few per cent, and a cell that is emptied by mistake is lost.
-    return occupied_cells(views, tuple(grid.lower.tolist()), tuple(upper.tolist()), shape, tolerance=0.05)
-
-
-def _tend(
-    grid: OccupancyGrid, batch: RayBatch, rendering: Rendering, step: int, config: HashGridConfig
+def _update(
+    grid: OccupancyGrid, batch: TrainingBatch, rendering: Rendering, step: int, config: HashGridConfig
 ) -> None:
-    """Keep the occupancy grid abreast of what the rays saw."""
+    """Update the occupancy grid by one step's rendering."""
     valid = rendering.samples.valid
     positions = batch.rays.at(rendering.samples.middles)[valid]
     grid.observe(positions.detach(), rendering.weights.detach()[valid], config.prune_fade)

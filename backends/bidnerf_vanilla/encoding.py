@@ -8,17 +8,17 @@ from torch import Tensor
 
 
 def encoded_width(frequencies: int, include_input: bool) -> int:
-    """How many numbers encode a point of three coordinates."""
+    """Return how many numbers encode a point."""
     return 3 * (2 * frequencies + include_input)
 
 
 def positional_encoding(
     points: Float[Tensor, "p 3"], frequencies: int, include_input: bool = True
 ) -> Float[Tensor, "p f"]:
-    """``(p, sin(2^0 pi p), cos(2^0 pi p), ..., sin(2^(L-1) pi p), cos(2^(L-1) pi p))`` (eq. 4).
+    """Return ``(p, sin(2^0 pi p), cos(2^0 pi p), ..., sin(2^(L-1) pi p), cos(2^(L-1) pi p))`` (eq. 4).
 
-    Coordinates are in [-1, 1], half a period of the lowest frequency. Each frequency has its three sines, then its three
-    cosines; ``p`` itself goes first, or is left out.
+    Coordinates are in [-1, 1], one period of the lowest frequency. Of each frequency come the three sines, then the three
+    cosines. ``p`` itself comes first, or is left out.
     """
     octaves = torch.arange(frequencies, dtype=points.dtype, device=points.device)
     angles = points[:, None, :] * (torch.pi * 2**octaves)[:, None]

@@ -1,8 +1,9 @@
-"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, the second asked where the first found matter."""
+"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, the second sampled where the first has found matter."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -10,58 +11,62 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.sampling import Importance, Stratified
+from bidnerf_core.sampling import Importance, OccupiedOnly, Stratified
+from bidnerf_core.settings import Count, Range
+from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
-from bidnerf_vanilla.room import Room, Within
 
 SHARPNESS = 30.0
-"""Density per side of the scene at a raw density of about 1: networks whose outputs are small see surfaces."""
+"""Density, per side of the scene, at a raw density of about 1: networks with small outputs can represent surfaces."""
 THINNESS = 1.0
-"""How far raw density is shifted down, so that an untrained field is nearly transparent (Barron et al. 2021, mip-NeRF)."""
+"""Shift of raw density that makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF)."""
 
 
 @dataclass(frozen=True)
 class FieldConfig(NetworkConfig):
     """Size of the field."""
 
-    coarse_samples: int = 64  # intervals of a ray at which the coarse network is asked
-    fine_samples: int = 32  # how many more the fine network is asked at, placed by the coarse one
-    room_resolution: int = 64  # cells along the longest side of the scene; those seen to be empty are skipped
+    coarse_samples: Count = 64  # intervals of a ray at which the coarse network is evaluated
+    fine_samples: Count = 32  # further intervals of the fine network, placed by the coarse one
+    room_resolution: Annotated[int, Range(2, 1024)] = (
+        64  # cells along the longest side of the scene; those that views show to be empty are skipped
+    )
 
 
 class Level(nn.Module):
-    """One network, and where on a ray it is asked."""
+    """A network and its sampler."""
 
-    middle: Float[Tensor, "3"]
+    centre: Float[Tensor, "3"]
 
     def __init__(self, config: NetworkConfig, bounds: SceneBounds, sampler: RaySampler) -> None:
         super().__init__()
         self.sampler = sampler
         self.side = max(bounds.size)
-        middle = [(a + b) / 2 for a, b in zip(bounds.lower, bounds.upper, strict=True)]
-        self.register_buffer("middle", torch.tensor(middle), persistent=False)
+        self.register_buffer("centre", torch.tensor(bounds.centre), persistent=False)
         self.network = NerfNetwork(config)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Positions are brought into the cube [-1, 1], densities are per its side: no unit of length matters."""
+        """Return the values at positions that are scaled to the cube [-1, 1], so that the unit of length has no effect."""
         shape = positions.shape[:-1]
-        points = (positions.reshape(-1, 3) - self.middle) * (2 / self.side)
+        points = (positions.reshape(-1, 3) - self.centre) * (2 / self.side)
         raw, rgb = self.network(points, directions.reshape(-1, 3))
         density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
 
 
 class VanillaField(nn.Module):
-    """The fine level, and the coarse one in ``levels``. Hierarchical sampling (section 5.2) is what composes them."""
+    """The fine level, with the coarse one in ``levels``. The fine sampler is hierarchical (section 5.2): it uses the coarse level."""
 
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
         super().__init__()
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        self.room = Room(bounds, config.room_resolution)
-        self.coarse = Level(config, bounds, Within(self.room, Stratified(config.coarse_samples)))
-        self.fine = Level(config, bounds, Within(self.room, Importance(self.coarse, config.fine_samples)))
+        self.room = OccupancyMask(VoxelGrid.cube(bounds, config.room_resolution))
+        self.coarse = Level(config, bounds, OccupiedOnly(self.room, Stratified(config.coarse_samples)))
+        self.fine = Level(
+            config, bounds, OccupiedOnly(self.room, Importance(self.coarse, config.fine_samples))
+        )
 
     @property
     def sampler(self) -> RaySampler:

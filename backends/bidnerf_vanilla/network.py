@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_vanilla.encoding import encoded_width, positional_encoding
 
 
 @dataclass(frozen=True)
-class NetworkConfig:
+class NetworkConfig(Settings):
     """Size of one MLP."""
 
-    layers: int = 4  # hidden layers from which density is read off
-    width: int = 128  # of each; the layer that looks at the direction has half of it
-    skip: int = 2  # how many layers go before the position is fed in once more; 0 never
-    position_frequencies: int = (
-        8  # octaves of sines and cosines; the scene's longest side is one period of the first
+    layers: Count = 4  # hidden layers before the density
+    width: Count = 128  # of each; the layer that takes the direction has half of it
+    skip: Annotated[int, Range(0)] = 2  # number of layers before the position is fed in once more; 0: never
+    position_frequencies: Annotated[int, Range(0, 64)] = (
+        8  # octaves of sines and cosines; the first has the scene's longest side as its period
     )
-    direction_frequencies: int = 2
+    direction_frequencies: Annotated[int, Range(0, 64)] = 2
     include_input: bool = True  # feed positions and directions themselves in, beside their sines
 
 
 class NerfNetwork(nn.Module):
-    """Encoded position to raw density, with the encoded direction also to colour.
+    """Maps encoded positions to raw density and, with encoded directions, to colour.
 
-    The paper's linear layer between the two parts has no activation: it is one with the linear layer that follows.
+    The paper's linear layer between the two parts has no activation, so it is merged with the linear layer that follows.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -44,13 +46,13 @@ class NerfNetwork(nn.Module):
         self.colour = nn.Linear(max(1, config.width // 2), 3)
 
     def _is_fed(self, number: int) -> bool:
-        """Whether a layer takes the position besides what the layer before it made of it."""
+        """Return whether a layer takes the encoded position besides the previous layer's output."""
         return number == self.config.skip > 0
 
     def forward(
         self, points: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
-        """Density before its activation, and rgb in [0, 1], of ``points`` in the cube [-1, 1]."""
+        """Return density before its activation, and rgb in [0, 1], at ``points`` of the cube [-1, 1]."""
         config = self.config
         position = positional_encoding(points, config.position_frequencies, config.include_input)
         direction = positional_encoding(directions, config.direction_frequencies, config.include_input)

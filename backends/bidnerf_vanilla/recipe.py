@@ -1,56 +1,46 @@
-"""How a NeRF is trained."""
+"""Training of a NeRF: its settings and its recipe."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Generator
 
+from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
-from bidnerf_core.training import RayBank, RayBatch, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.settings import Count, NotNegative, Range
+from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
-LEAST = {
-    "layers": 1, "width": 1, "skip": 0, "position_frequencies": 0, "direction_frequencies": 0, "coarse_samples": 1,
-    "fine_samples": 1, "room_resolution": 2, "steps": 1, "samples_per_step": 1, "rays_at_most": 1, "learning_rate": 0,
-    "depth_weight": 0, "seed": 0,
-}  # fmt: skip
 PROBE = 4096
-"""Rays from which is learnt how many samples a ray takes."""
+"""Number of rays from which the mean number of samples of a ray is estimated."""
 
 
 @dataclass(frozen=True)
 class VanillaConfig(FieldConfig):
-    """Size of the field and its training. The defaults suit some forty minutes on a small CPU."""
+    """Size and training of the field. With the defaults, training takes about forty minutes on a small CPU."""
 
-    steps: int = 20000  # of the optimizer
-    samples_per_step: int = 4096  # of the fine network, about; the number of rays follows from it
-    rays_at_most: int = 4096  # a step, however few samples they take
-    learning_rate: float = 3e-3
-    depth_weight: float = 0.1  # of the depth term beside the colour term; 0 leaves depth out
-    seed: int = 0  # of initial weights and of all that is drawn at random
-    carve: bool = True  # ask no network where the views' depth and silhouettes leave no room for matter
+    steps: Count = 20000  # of the optimizer
+    samples_per_step: Count = 4096  # of the fine network, approximately; it decides the number of rays
+    rays_at_most: Count = 4096  # a step, even if they take few samples
+    learning_rate: NotNegative = 3e-3
+    depth_weight: NotNegative = 0.1  # of the depth term beside the colour term; 0 leaves depth out
+    seed: Annotated[int, Range(0)] = 0  # of the initial weights and of all random draws
+    carve: bool = True  # skip the cells that the views' depth and silhouettes show to be empty
 
     def __post_init__(self) -> None:
-        for name, least in LEAST.items():
-            value = getattr(self, name)
-            if not value >= least:
-                raise InputError(f"{name} is {value}, expected {least} or more")
+        super().__post_init__()
         if not (self.include_input or self.position_frequencies):
             raise InputError("position_frequencies is 0 without include_input, expected one of them")
 
     @classmethod
-    def small(cls) -> VanillaConfig:
-        """The defaults."""
-        return cls()
-
-    @classmethod
     def paper(cls) -> VanillaConfig:
-        """Sizes and training of the paper (section 5.3, appendix A)."""
+        """Return the sizes and the training of the paper (section 5.3, appendix A)."""
         return cls(
             layers=8, width=256, skip=5, position_frequencies=10, direction_frequencies=4, coarse_samples=64,
             fine_samples=128, steps=200_000, samples_per_step=4096 * 192, learning_rate=5e-4, carve=False,
@@ -58,9 +48,9 @@ class VanillaConfig(FieldConfig):
 
 
 def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, report: Report) -> None:
-    """Fit ``field`` to ``views``; see ``fit`` for checkpoints and stopping."""
+    """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve:
-        field.room.carve(views)
+        field.room.cells.copy_(occupied_voxels(views, field.room.grid))
     bank = RayBank(views, field.bounds)
     rays_per_step = _rays_per_step(field, bank, config)
 
@@ -72,19 +62,19 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
 
 
 def step_outcome(
-    field: VanillaField, batch: RayBatch, depth_weight: float, generator: Generator
+    field: VanillaField, batch: TrainingBatch, depth_weight: float, generator: Generator
 ) -> StepOutcome:
-    """Both levels must see what was seen (eq. 6); the samples that are counted are the fine level's."""
+    """Return the loss of both levels (eq. 6), and the colour error and the samples of the fine one."""
     coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
     rough, _ = supervised_loss(coarse, batch, field.side, depth_weight)
     loss, mse = supervised_loss(fine, batch, field.side, depth_weight)
-    return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch.rgb)))
+    return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch)))
 
 
 @torch.no_grad()
 def _rays_per_step(field: VanillaField, bank: RayBank, config: VanillaConfig) -> int:
-    """Where there is little room for matter, a step affords more rays."""
+    """Return the number of rays of a step: the fewer samples a ray takes, the more rays."""
     rays = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
-    asked = field.coarse.sampler(rays).valid
-    samples = float(asked.sum() + config.fine_samples * asked.any(-1).sum()) / PROBE
+    coarse = field.coarse.sampler(rays).valid
+    samples = float(coarse.sum() + config.fine_samples * coarse.any(-1).sum()) / PROBE
     return max(1, min(config.rays_at_most, int(config.samples_per_step / max(samples, 1.0))))

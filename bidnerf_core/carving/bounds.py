@@ -1,4 +1,4 @@
-"""The box that holds a scene, and how near and far it is: from depth, from silhouettes, or guessed from the cameras."""
+"""Estimation of a scene's box and of its near and far distance: from depth, from silhouettes, or from the cameras alone."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 
-OUTLIERS = 1e-3  # the part of measured points at either end of each axis that may be wrong
-POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements that are looked at: in all, and at least of each view
-SPARSE_MARGIN = 0.1  # of the box's size, at each end, where a few points are all that was measured
-FAR_MARGIN = 1.1  # a camera may stand a little farther off than any of the views did
-LEAST_NEAR = 0.01  # of far, where cameras stand in the box and nothing was measured
+OUTLIERS = 1e-3  # fraction of the measured points, at either end of each axis, that may be wrong
+POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements that are used: in all, and at least of each view
+SPARSE_MARGIN = 0.1  # of the box's size, at each end, where only a few points were measured
+FAR_MARGIN = 1.1  # a camera may be a little farther away than any of the views
+LEAST_NEAR = 0.01  # of far, where cameras are inside the box and nothing was measured
 LEAST_SPREAD = 0.01  # mean squared sine of the angles between optical axes and their mean: about 6 degrees
-INWARD = 0.8  # the part of the cameras that must have the point in sight that all look at
-ROOM = 4.0  # how far a hand-held camera sees, in parts of how far it was moved: a guess
+INWARD = 0.8  # fraction of the cameras that must see the point that all of them look at
+ROOM = 4.0  # assumed range of a hand-held camera's view, in multiples of the extent of its positions
 
 
 def estimate_bounds(
     views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> SceneBounds:
-    """The box that holds what ``views`` (poses in the world) show, and how near and far it is from their cameras.
+    """Return the box that holds what ``views`` (poses in the world) show, and its range of distances from their cameras.
 
-    With depth (dense in half of the views, or any where there are no silhouettes): the middle 99.8 % along each axis of what was
-    measured. With silhouettes (alpha): the visual hull. With colour only it is a guess: of cameras that look inward, a
-    cube about the point they look at, as large as an image is there; of others (a room), the box of the cameras and of
-    all that they have in sight within ``ROOM`` times the extent of their places. Raises ``InputError`` where colour is
-    all there is and all cameras are in one place.
+    With depth (dense in half of the views, or any where there are no silhouettes) the box holds the middle 99.8 % of the
+    measured points along each axis. With silhouettes (alpha) it is that of the visual hull. With colour only it is a guess:
+    for cameras that look inward, a cube around the point they look at, as large as what an image shows there; for others (a
+    room), the box of the cameras and of what they see within ``ROOM`` times the extent of their positions. Raises
+    ``InputError`` where there is only colour and all cameras are in one place.
     """
     if not views:
         raise InputError("scene bounds: no views to estimate them from")
@@ -53,7 +53,7 @@ def estimate_bounds(
 
 
 def _measured_box(views: Sequence[View], margin: float) -> tuple[Box, float]:
-    """Box of the points that depth images show, and half the least distance from a camera; both without outliers."""
+    """Return the box of the measured points, and half the least distance of one from its camera; both without outliers."""
     share = max(POINTS_OF_VIEW, POINTS // len(views))
     parts = [measured_points(view, share) for view in views]
     points, distances = torch.cat([p for p, _ in parts]), torch.cat([d for _, d in parts])
@@ -64,7 +64,7 @@ def _measured_box(views: Sequence[View], margin: float) -> tuple[Box, float]:
 
 
 def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """About ``share`` of a view's measurements: points (metres, world), and their distances from the camera."""
+    """Return about ``share`` of a view's measured points (metres, world) and their distances from the camera (metres)."""
     depth = view.frame.depth
     if depth is None:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
@@ -74,7 +74,7 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
 
 
 def _guessed_box(views: Sequence[View]) -> Box:
-    """From the cameras alone, see ``estimate_bounds``."""
+    """Return the box that the cameras alone suggest, see ``estimate_bounds``."""
     places = _places(views)
     if (middle := _looked_at(views)) is not None:
         half = (torch.linalg.vector_norm(places - middle, dim=-1) * _tangents(views)).amax()
@@ -89,7 +89,7 @@ def _guessed_box(views: Sequence[View]) -> Box:
 
 
 def _looked_at(views: Sequence[View]) -> Float[Tensor, "3"] | None:
-    """The point nearest to all optical axes (least squares), if most cameras have it in sight, from different sides."""
+    """Return the point nearest to all optical axes (least squares), if most cameras see it and from different sides."""
     places, tangents = _places(views), _tangents(views)
     axes = torch.stack([view.T_ref_camera.rotation[:, 2].double() for view in views])
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
@@ -103,14 +103,14 @@ def _looked_at(views: Sequence[View]) -> Float[Tensor, "3"] | None:
 
 
 def _corner_rays(view: View) -> Float[Tensor, "4 3"]:
-    """Towards the corners of the image, as far as the plane z = 1 (camera frame)."""
+    """Return the points at z = 1 (camera frame) that the corners of the image show."""
     camera = view.frame.intrinsics
     corners = [[x, y] for x in (0, camera.width) for y in (0, camera.height)]
     return camera.unproject(torch.tensor(corners, dtype=torch.float64))
 
 
 def _tangents(views: Sequence[View]) -> Float[Tensor, "v"]:
-    """Of the angle between each view's optical axis and the farthest corner of its image."""
+    """Return the tangent of the angle between each view's optical axis and the farthest corner of its image."""
     return torch.stack([torch.linalg.vector_norm(_corner_rays(view)[:, :2], dim=-1).amax() for view in views])
 
 
@@ -119,12 +119,12 @@ def _places(views: Sequence[View]) -> Float[Tensor, "v 3"]:
 
 
 def _nearest(views: Sequence[View], box: Box) -> float:
-    """From the nearest camera to the box (metres); 0 where one is inside."""
+    """Return the distance of the box from the nearest camera (metres); 0 where one is inside."""
     outside = torch.maximum(box[0] - _places(views), _places(views) - box[1]).clamp(min=0)
     return torch.linalg.vector_norm(outside, dim=-1).amin().item()
 
 
 def _farthest(views: Sequence[View], box: Box) -> float:
-    """From the farthest camera to the farthest corner of the box (metres)."""
+    """Return the largest distance of a corner of the box from a camera (metres)."""
     across = torch.maximum((_places(views) - box[0]).abs(), (_places(views) - box[1]).abs())
     return torch.linalg.vector_norm(across, dim=-1).amax().item()

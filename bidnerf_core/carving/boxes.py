@@ -1,4 +1,4 @@
-"""Boxes along the axes of the world, and rays towards what a view shows of them."""
+"""Axis-aligned boxes of the world, and rays of a view's pixels."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ MARGIN = 0.03  # of the box's size, at each end
 def grown(
     lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = MARGIN
 ) -> Box:
-    """By a margin; a box without thickness gets some."""
+    """Return the box with a margin of ``share`` of its size, and ``at_least`` metres, at each end; a flat box gets some thickness."""
     size = upper - lower
     margin = torch.maximum(size * share, size.amax() * 0.01).clamp(min=at_least)
     return lower - margin, upper + margin
 
 
 def met(box: Box, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> float:
-    """The part of the rays that meet the box (slab method)."""
+    """Return the fraction of the rays that meet the box (slab method)."""
     slope = 1 / torch.where(directions == 0, torch.finfo(directions.dtype).tiny, directions)
     first, second = (box[0] - origins) * slope, (box[1] - origins) * slope
     near, far = torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
@@ -42,7 +42,7 @@ def corner(point: Float[Tensor, "3"]) -> Corner:
 def rays_of(
     view: View, wanted: Bool[Tensor, "h w"], share: int
 ) -> tuple[Float[Tensor, "n 3"], tuple[Int[Tensor, "n"], Int[Tensor, "n"]]]:
-    """About ``share`` of the wanted pixels, evenly spread: points at z = 1 (camera frame), and (rows, columns)."""
+    """Return about ``share`` of the wanted pixels, evenly spread: their points at z = 1 (camera frame), and rows and columns."""
     rows, columns = wanted.nonzero(as_tuple=True)
     stride = max(1, len(rows) // share)
     rows, columns = rows[::stride], columns[::stride]

@@ -1,4 +1,4 @@
-"""Grids of cells, emptied where views see through them. A cell counts as the sphere around it."""
+"""Carving: cells of a box are emptied where views see through them. A cell is judged by the sphere around it."""
 
 from __future__ import annotations
 
@@ -12,11 +12,21 @@ from bidnerf_core.carving.boxes import Corner
 from bidnerf_core.carving.free_space import FreeSpace
 from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
+from bidnerf_core.voxel_grid import VoxelGrid
 
 BLOCK = 8
-"""Cells along the side of a block. Blocks out of a view's sight cost that view next to nothing."""
+"""Cells along the side of a block. A block that a view does not see costs that view next to nothing."""
 BLOCKS_AT_ONCE = 128
-"""What is looked at in one go: it stays in the cache, and memory stays bounded."""
+"""Blocks that are processed together: few enough to stay in the cache."""
+SENSOR_TOLERANCE = 0.05
+"""Relative error of depth allowed for in training: real sensors err by a few per cent, and a cell emptied by mistake is lost."""
+
+
+def occupied_voxels(
+    views: Sequence[View], grid: VoxelGrid, tolerance: float = SENSOR_TOLERANCE
+) -> Bool[Tensor, "x y z"]:
+    """Return which cells of ``grid`` may hold matter, see ``occupied_cells``."""
+    return occupied_cells(views, grid.lower, grid.upper, grid.shape, tolerance)
 
 
 def occupied_cells(
@@ -27,13 +37,13 @@ def occupied_cells(
     tolerance: float = 0.02,
     footprint: int = 8,
 ) -> Bool[Tensor, "nx ny nz"]:
-    """The cells of the box ``lower``..``upper`` (metres, world) that may hold matter.
+    """Return which cells of the box ``lower``..``upper`` (metres, world) may hold matter.
 
     A cell is emptied when two views (one, if there is only one) see all of it as free: as background (alpha 0), or nearer
-    than the measured depth by more than the part ``tolerance`` of it. Pixels that measured nothing free nothing, nor does
-    a view in which the cell's radius is over ``footprint`` pixels.
+    than the measured depth by more than the fraction ``tolerance`` of it. Pixels without a measurement empty nothing, nor
+    does a view in which the cell's radius is over ``footprint`` pixels.
     """
-    grid = _Grid(lower, upper, shape)
+    grid = _Blocks(lower, upper, shape)
     votes = torch.zeros(grid.blocks.shape[1], BLOCK**3, dtype=torch.uint8)
     needed = 1 if len(views) < 2 else 2
     undecided = torch.ones(len(votes), dtype=torch.bool)
@@ -49,8 +59,8 @@ def occupied_cells(
     return grid.assembled(votes < needed)
 
 
-class _Grid:
-    """A box of cells, in cubic blocks that together may reach over it."""
+class _Blocks:
+    """The cells of a box in blocks of equally many, which together may reach beyond it."""
 
     def __init__(self, lower: Corner, upper: Corner, shape: tuple[int, int, int]) -> None:
         self.shape = shape
@@ -62,7 +72,7 @@ class _Grid:
         self.block_radius = self.cell_radius * BLOCK
 
     def middles(self, T_world_camera: SE3) -> tuple[Float[Tensor, "3 b"], Float[Tensor, "3 c"]]:
-        """Middles of each block's first cell in the camera's frame, and what to add for each cell of a block (metres)."""
+        """Return the centre of each block's first cell (metres, camera frame) and the offset of each cell of a block from there."""
         T_camera_world = T_world_camera.to(torch.float64).inverse()  # the world's origin may be far away
         first = T_camera_world.apply(self.lower + self.size / 2)[:, None]
         step = T_camera_world.rotation * self.size
@@ -70,7 +80,7 @@ class _Grid:
         return (first + step @ (self.blocks * BLOCK).double()).float(), within.float()
 
     def assembled(self, values: Bool[Tensor, "b c"]) -> Bool[Tensor, "nx ny nz"]:
-        """Blocks put in their places, and cut off at the end of the box."""
+        """Return the blocks' values as one array, cut off where the box ends."""
         whole = values.reshape(*self.counts, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5)
         nx, ny, nz = self.shape
         return whole.reshape([count * BLOCK for count in self.counts])[:nx, :ny, :nz].contiguous()

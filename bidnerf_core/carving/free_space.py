@@ -1,6 +1,6 @@
-"""What a view sees through: how far each of its pixels is free of matter, and which spheres lie wholly in that freedom.
+"""The free space of a view: how far each of its pixels sees no matter, and which spheres lie wholly within that space.
 
-It errs on the side of matter: a pixel counts as the worst of its neighbours, and what was not measured as matter.
+In doubt space counts as occupied: where nothing was measured, and wherever a neighbouring pixel sees less far.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ LONGEST_SIDE = 400
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """How deep a view sees nothing. Level k holds the least such depth (planar z) within k pixels of each pixel."""
+    """The depth up to which a view is free. Level k holds the least such depth (planar z) within k pixels of each pixel."""
 
     intrinsics: Intrinsics  # of the shrunken image
-    levels: Float[Tensor, "k h w"]  # metres; 0: no statement
+    levels: Float[Tensor, "k h w"]  # metres; 0: unknown
     reach: float  # metres: the largest depth of all
     edges: Float[
         Tensor, "4 3"
@@ -36,18 +36,18 @@ class FreeSpace:
         free = _free_depth(view.frame, tolerance)
         factor = math.ceil(max(free.shape) / LONGEST_SIDE)
         levels = [_shrunk(free, factor)]
-        for _ in range(footprint):  # what lies beyond the image's edge is unknown
+        for _ in range(footprint):  # beyond the image's edge nothing is known
             levels.append(-functional.max_pool2d(-functional.pad(levels[-1], (1, 1, 1, 1))[None], 3, 1)[0])
         camera = _shrunk_camera(view.frame.intrinsics, factor, levels[0])
         return FreeSpace(camera, torch.stack(levels), free.amax().item(), _edges(view.frame.intrinsics))
 
     def may_free(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
-        """Whether any of the sphere around each point is in sight, and not behind everything."""
+        """Return whether the view sees any of the sphere around each point (camera frame, metres), before its farthest depth."""
         in_sight = (self.edges @ points > -radius).all(dim=0)
         return in_sight & (points[2] > -radius) & (points[2] - radius < self.reach)
 
     def frees(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
-        """Whether all of the sphere of ``radius`` metres around each point (camera frame, metres) is seen as free."""
+        """Return whether all of the sphere of ``radius`` metres around each point (camera frame, metres) is free."""
         deepest = points[2] + radius
         columns, rows, pixels = self._footprint(points, radius)
         count, height, width = self.levels.shape
@@ -60,7 +60,7 @@ class FreeSpace:
         return known & (deepest < least)
 
     def _footprint(self, points: Float[Tensor, "3 n"], radius: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Column, row and radius of each sphere's image in whole pixels; the radius is infinite off the lens."""
+        """Return column, row and radius of each sphere's image in whole pixels; the radius is infinite outside the field of view."""
         camera = self.intrinsics
         inverse = 1 / points[2]
         x, y = points[0] * inverse, points[1] * inverse
@@ -72,16 +72,16 @@ class FreeSpace:
             slope * (1 + squared) / (1 - product)
         )  # tan(a + b) - tan(a): the far side of the sphere's image
         pixels = (wide * max(camera.fx, camera.fy)).ceil()
-        pixels = torch.where(product < 1, pixels, torch.inf)  # NaN, too, is no statement
+        pixels = torch.where(product < 1, pixels, torch.inf)  # and where it is NaN
         if not camera.distortion:
             return (x * camera.fx + camera.cx).floor(), (y * camera.fy + camera.cy).floor(), pixels
         u, v = camera.project(points.T).floor().unbind(-1)
-        # lenses stretch a little; beyond the image their polynomials fold back into it
+        # Distortion stretches a little; beyond the image its polynomial may fold back into the image.
         return u, v, torch.where((self.edges @ points > 0).all(dim=0), (pixels * 1.25).ceil(), torch.inf)
 
 
 def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
-    """Planar z up to which each pixel is free: unlimited over background, 0 where nothing is known."""
+    """Return the planar z (metres) up to which each pixel is free: infinite over background, 0 where nothing is known."""
     free = torch.zeros(frame.rgb.shape[:2])
     if frame.depth is not None:
         free = frame.depth.float() * (1 - tolerance)
@@ -91,7 +91,7 @@ def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
 
 
 def _shrunk(free: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "h2 w2"]:
-    """The least of each block of pixels; one that reaches over the edge is unknown."""
+    """Return the least value of each block of pixels; a block that reaches beyond the edge is unknown."""
     height, width = free.shape
     padded = functional.pad(free, (0, -width % factor, 0, -height % factor))
     return -functional.max_pool2d(-padded[None], factor)[0]
@@ -103,7 +103,7 @@ def _shrunk_camera(camera: Intrinsics, factor: int, free: Float[Tensor, "h w"]) 
 
 
 def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:
-    """Planes about the smallest upright rectangle of directions that holds the image's border, however it is bent."""
+    """Return the planes through the smallest upright rectangle at z = 1 that holds the image's border, which distortion bends."""
     w, h = camera.width, camera.height
     along = torch.linspace(0, 1, 33, dtype=torch.float64)
     still = torch.zeros_like(along)

@@ -1,4 +1,4 @@
-"""The box around the visual hull: what silhouettes, seen from many sides, leave room for."""
+"""The box of the visual hull: of what silhouettes, seen from many sides, leave room for."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from bidnerf_core.frames import View
 HULL = (64, 64, 64)
 CARVING_ROUNDS = 3  # each in the box that the one before found
 WITNESSES = (0.5, 0.25, 0.1, 0.0)
-"""Of the most views that see something at one cell: where fewer do is periphery, which hardly any view could empty."""
-EXPLAINED = 0.999  # the part of the pixels with matter whose rays must meet the box
+"""Thresholds on how many views see something at a cell, as fractions of the largest such number. Cells below are periphery:
+so few views see them that hardly any could have emptied them."""
+EXPLAINED = 0.999  # fraction of the pixels with matter whose rays must meet the box
 RAYS_OF_VIEW = 500
 
 
 def has_outline(view: View) -> bool:
-    """Whether there is background in the image; alpha that is 1 all over tells nothing."""
+    """Return whether the image shows background: alpha that is 1 everywhere carries no information."""
     return view.frame.alpha is not None and bool((view.frame.alpha <= 0).any())
 
 
 def carved_box(box: Box, views: Sequence[View]) -> Box:
-    """The box around those cells that no two views see through and that many views see something at.
+    """Return the box of the cells that no two views see through and at which many views see something.
 
-    How many are many is settled by the silhouettes: the most for which the box still explains them.
+    The threshold on their number is the largest of ``WITNESSES`` for which the box still explains the silhouettes.
     """
     origins, directions = _rays_to_matter(views)
     for _ in range(CARVING_ROUNDS):
@@ -47,7 +48,7 @@ def carved_box(box: Box, views: Sequence[View]) -> Box:
 
 
 def _rays_to_matter(views: Sequence[View]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Origins and directions (world) of a sample of the pixels whose alpha is over a half."""
+    """Return origins and directions (world) of the rays of a sample of the pixels whose alpha is over a half."""
     origins, directions = [], []
     for view in views:
         assert view.frame.alpha is not None  # it has an outline
@@ -58,7 +59,7 @@ def _rays_to_matter(views: Sequence[View]) -> tuple[Float[Tensor, "n 3"], Float[
 
 
 def _witnesses(views: Sequence[View], points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """How many views see something (alpha over 0) where each point (metres, world) is."""
+    """Return how many views see something (alpha over 0) at each point (metres, world)."""
     return torch.stack([_shows_something(view, points) for view in views]).sum(dim=0)
 
 

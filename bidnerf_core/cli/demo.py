@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import imageio.v3 as iio
 from rich.table import Table
 
-from bidnerf_core.backend import Backend
+from bidnerf_core.backend import Backend, quick_config
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli.common import (
     DEFAULT_BACKEND,
@@ -96,9 +96,7 @@ def _demonstrated(
     seen = views(scene, CAMERA, orbit(RADIUS, TRAINING_VIEWS, seed=seed))
     unseen = views(scene, CAMERA, orbit(RADIUS, frames, elevation=(15.0, 50.0), seed=seed + 1))
     try:
-        config = getattr(
-            chosen, "quick_config", chosen.config_type
-        )()  # a backend may offer one for small scenes
+        config = quick_config(chosen)
         config = config if steps is None else dataclasses.replace(config, steps=steps)
     except TypeError as error:
         raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has") from error

@@ -16,6 +16,7 @@ from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.mapping.casting import trace
 from bidnerf_core.se3 import SE3
 
 WELL_BEFORE = 0.04
@@ -87,7 +88,7 @@ def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
     some, surface = cost.cloud.first(SIGHT_LINES), cost.surface
     origins, ends = (T.apply(x.double()).to(some.points) for x in (some.origins, some.points))
     length = torch.linalg.vector_norm(ends - origins, dim=-1)
-    met = surface.trace(origins, (ends - origins) / length.clamp(min=1e-9)[:, None])
+    met = trace(surface, origins, (ends - origins) / length.clamp(min=1e-9)[:, None])
     # Grazing lines meet coarse cells early.
     slack = max(WELL_BEFORE * surface.extent, 4 * surface.cell)
     return float((met < length - slack).float().mean())

@@ -1,4 +1,4 @@
-"""The surface that a field shows: baked once from any field, asked for the nearest piece of it in constant time."""
+"""What is baked beside a field: its surface, as surfels with a grid that finds the nearest one in constant time."""
 
 from bidnerf_core.mapping.baking import BakeConfig, bake
 from bidnerf_core.mapping.surface_map import SurfaceMap

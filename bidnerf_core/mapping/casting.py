@@ -1,4 +1,4 @@
-"""Looking at a baked surface along rays: what each meets, or how closely it passes by."""
+"""Sphere tracing of a baked surface (Hart 1996): where rays meet it, or how closely they pass by."""
 
 from __future__ import annotations
 
@@ -8,53 +8,66 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.field import SceneBounds
 from bidnerf_core.mapping.surface_map import SurfaceMap
 
 ROUND = 6
-"""Steps between which rays that are done are put aside."""
+"""Steps between which rays that have met the surface or left the grid are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """Where each of r rays met the surface, or came closest to it for its distance."""
+    """Where each ray met the surface or, of those that met nothing, came closest to it as an angle."""
 
     met: Bool[Tensor, "r"]
-    along: Float[Tensor, "r"]  # metres along the ray to there
+    along: Float[Tensor, "r"]  # metres along the ray to that place
     index: Int[Tensor, "r"]  # the surfel there
 
 
 def cast(
-    surface: SurfaceMap, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"], steps: int = 36
+    surface: SurfaceMap,
+    origins: Float[Tensor, "r 3"],
+    directions: Float[Tensor, "r 3"],
+    steps: int = 36,
+    reach: float | None = None,
 ) -> Cast:
-    """Sphere tracing (Hart 1996) that remembers the least clearance, as an angle. ``directions`` are unit.
+    """Trace rays (metres, world; unit directions) until they are within ``reach`` of a surfel (metres; by default the
+    surface's own). A step is as long as the clearance, and a cell at least.
 
-    A ray that passes the grid by is said to come closest where it is nearest to the grid's middle.
+    A ray that does not cross the grid counts as closest where it is nearest to the grid's centre.
     """
-    x, y, z = (
-        low + size * surface.cell for low, size in zip(surface.lower, surface.nearest.shape, strict=True)
-    )
-    rays = SceneBounds(surface.lower, (x, y, z), 0.0, 1e9).rays(origins, directions)
-    middle = origins.new_tensor([(a + b) / 2 for a, b in zip(surface.lower, (x, y, z), strict=True)])
-    best = ((middle - origins) * directions).sum(-1).clamp(min=0)
-    index = surface.touch(rays.at(best[:, None])[:, 0].nan_to_num())
+    reach = surface.reach if reach is None else reach
+    rays, cell = surface.grid.rays(origins, directions), surface.grid.cell
+    best = ((origins.new_tensor(surface.grid.centre) - origins) * directions).sum(-1).clamp(min=0)
+    index = surface.nearest(rays.at(best[:, None])[:, 0])
     least, met = torch.full_like(best, torch.inf), torch.zeros_like(best, dtype=torch.bool)
     left = (rays.near < rays.far).nonzero()[:, 0]
     here, o, d, far = rays.near[left], origins[left], directions[left], rays.far[left]
     for step in range(steps):
         points = o + here[:, None] * d
-        touched = surface.touch(points)
-        clear = torch.linalg.vector_norm(points - surface.surfels.positions[touched], dim=-1)
-        hit = clear < surface.reach
-        angle = torch.where(hit, 0, clear / here.clamp(min=surface.cell))
+        nearest = surface.nearest(points)
+        clearance = torch.linalg.vector_norm(points - surface.surfels.positions[nearest], dim=-1)
+        hit = clearance < reach
+        angle = torch.where(hit, 0, clearance / here.clamp(min=cell))
         closer = angle < least[left]
         which = left[closer]
-        least[which], best[which], index[which] = angle[closer], here[closer], touched[closer]
+        least[which], best[which], index[which] = angle[closer], here[closer], nearest[closer]
         met[left[hit]] = True
-        here = torch.where(hit, here, here + clear.clamp(min=surface.cell))
+        here = torch.where(hit, here, here + clearance.clamp(min=cell))
         if step % ROUND == ROUND - 1:
             on = (here < far) & ~hit
             left, here, o, d, far = left[on], here[on], o[on], d[on], far[on]
             if not len(left):
                 break
     return Cast(met, best, index)
+
+
+def trace(
+    surface: SurfaceMap, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"], steps: int = 48
+) -> Float[Tensor, "*r"]:
+    """Return the distance (metres) at which each ray comes within a cell of the surface inside the grid, infinite where it
+    does not. ``directions`` are unit.
+    """
+    shape, (origins, directions) = directions.shape[:-1], (x.reshape(-1, 3) for x in (origins, directions))
+    found = cast(surface, origins, directions, steps, surface.grid.cell)
+    within = found.met & (found.along < surface.grid.rays(origins, directions).far)
+    return torch.where(within, found.along, torch.inf).reshape(shape)

@@ -1,4 +1,4 @@
-"""Surfels: small pieces of a surface, fused from points that were seen."""
+"""Surfels: small discs of a surface, fused from points."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 NEIGHBOURS = 12
-"""How many surfels tell the plane and the colours about one of them."""
+"""How many surfels the plane and the colour gradient of one of them are fitted to."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Points of a surface with its plane and its colours there. World frame, metres."""
+    """Points of a surface with its normals and colours there. World frame, metres."""
 
     positions: Float[Tensor, "n 3"]
-    normals: Float[Tensor, "n 3"]  # unit; which of the two ways they point means nothing
+    normals: Float[Tensor, "n 3"]  # unit; their sign has no meaning
     rgb: Float[Tensor, "n 3"]
     rgb_gradient: Float[Tensor, "n 3 3"]  # channel by axis, per metre, within the plane
 
@@ -28,7 +28,7 @@ class Surfels:
 
 
 def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[Tensor, "n"], list[Tensor]]:
-    """Which cells hold points, and the means of the points' ``values`` by cell."""
+    """Return which cells hold points, in ascending order, and the means of the points' ``values`` in each of them."""
     found, place, counts = cells.unique(return_inverse=True, return_counts=True)
     means = [
         torch.zeros((len(found), v.shape[-1]), dtype=v.dtype).index_add_(0, place, v) / counts[:, None]
@@ -38,7 +38,7 @@ def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[
 
 
 def fused(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
-    """Surfels from merged points: each is given the plane of its neighbours and moved onto it."""
+    """Return surfels of merged points: to each its neighbours' plane is fitted, and it is moved onto that plane."""
     near = _neighbours(positions, NEIGHBOURS)
     offsets = positions[near] - positions[:, None]
     mean = offsets.mean(1)
@@ -50,7 +50,7 @@ def fused(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels
 
 
 def _neighbours(positions: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n k"]:
-    """Indices of the nearest points, the point itself among them."""
+    """Return the indices of each point's nearest points, itself among them."""
     points = positions.numpy()
     _, index = cKDTree(points).query(points, k=min(count, len(points)), workers=-1)
     return torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), -1))
@@ -59,11 +59,11 @@ def _neighbours(positions: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n k
 def _gradient(
     offsets: Float[Tensor, "n k 3"], normals: Float[Tensor, "n 3"], rgb: Float[Tensor, "n k 3"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Least squares of colour over place, within the plane (Park et al. 2017, "Colored point cloud registration", eq. 10)."""
+    """Return the least-squares gradient of colour within the plane (Park et al. 2017, "Colored point cloud registration", eq. 10)."""
     flat = offsets - (offsets * normals[:, None]).sum(-1, keepdim=True) * normals[:, None]
     spread = flat.mT @ flat
     size = spread.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(flat.dtype).tiny)
-    # Along the normal nothing is known: any weight there gives 0, and a little everywhere tames thin strips.
+    # Any weight along the normal makes the gradient 0 there; a little weight everywhere regularizes thin strips.
     held = normals[:, :, None] * normals[:, None] + 0.02 * torch.eye(3)
     system = spread / size[:, None, None] + held
     seen = flat.mT @ (rgb - rgb.mean(1, keepdim=True)) / size[:, None, None]

@@ -1,4 +1,4 @@
-"""A baked surface as named tensors, for storage, and back."""
+"""Conversion of a baked surface to named tensors, for storage, and back."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from torch import Tensor
 from bidnerf_core.mapping.surface_map import SurfaceMap
 from bidnerf_core.mapping.surfels import Surfels
 from bidnerf_core.se3 import SE3
+from bidnerf_core.voxel_grid import VoxelGrid
 
 KINDS = {
     "positions": ((-1, 3), torch.float32),
@@ -19,21 +20,25 @@ KINDS = {
     "lower": ((3,), torch.float64),
     "cell": ((), torch.float64),
 }
-"""Shape, -1 for any length, and dtype."""
+"""Shape (-1: any length) and dtype of each tensor."""
 
 
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
+    """Return all that a surface consists of, under the names and in the dtypes of ``KINDS``."""
     parts = surface.surfels
     found = {
         "positions": parts.positions, "normals": parts.normals, "rgb": parts.rgb, "rgb_gradient": parts.rgb_gradient,
-        "nearest": surface.nearest, "keyframes": surface.keyframes,
-        "lower": torch.tensor(surface.lower, dtype=torch.float64), "cell": torch.tensor(surface.cell, dtype=torch.float64),
+        "nearest": surface.nearest_in_cell, "keyframes": surface.keyframes,
+        "lower": torch.tensor(surface.grid.lower, dtype=torch.float64), "cell": torch.tensor(surface.cell, dtype=torch.float64),
     }  # fmt: skip
     return {name: found[name].to(kind).contiguous().clone() for name, (_, kind) in KINDS.items()}
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
-    """Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, kind or content."""
+    """Return the surface that ``surface_tensors`` gave as ``tensors``.
+
+    Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
+    """
     for name, (shape, kind) in KINDS.items():
         value = tensors[name]
         fits = len(shape) == value.dim() and all(
@@ -45,13 +50,14 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
             raise ValueError(f"{name} holds NaN or infinity")
     count, nearest = len(tensors["positions"]), tensors["nearest"]
     if any(len(tensors[name]) != count for name in ("normals", "rgb", "rgb_gradient")) or not count:
-        raise ValueError("surfels of no or of several numbers")
+        raise ValueError("expected equally many positions, normals and colours of surfels, and at least one")
     if not nearest.numel() or not 0 <= int(nearest.min()) <= int(nearest.max()) < count:
-        raise ValueError(f"nearest names surfels that are not there, expected 0 to {count - 1}")
+        raise ValueError(f"nearest has indices of surfels that do not exist, expected 0 to {count - 1}")
     if not float(tensors["cell"]) > 0:
         raise ValueError(f"cell is {float(tensors['cell'])}, expected a length")
     if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
         raise ValueError("no keyframe, or one that is not rigid")
     surfels = Surfels(*(tensors[name] for name in ("positions", "normals", "rgb", "rgb_gradient")))
-    x, y, z = tensors["lower"].tolist()
-    return SurfaceMap(surfels, (x, y, z), float(tensors["cell"]), nearest, tensors["keyframes"])
+    (x, y, z), (nx, ny, nz) = tensors["lower"].tolist(), nearest.shape
+    grid = VoxelGrid((x, y, z), float(tensors["cell"]), (nx, ny, nz))
+    return SurfaceMap(surfels, grid, nearest, tensors["keyframes"])

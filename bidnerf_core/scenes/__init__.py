@@ -1,1 +1,1 @@
-"""Scenes in closed form, with exact colour and depth: what the demo, the tests and the benches are made of."""
+"""Closed-form scenes with exact colour and depth, for the demo, the tests and the benchmarks."""

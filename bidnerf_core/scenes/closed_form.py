@@ -1,7 +1,7 @@
 """Closed-form scenes with exact depth.
 
-A scene is a list of painted solids; its colour does not depend on the direction it is seen from, so any
-radiance field can learn it, and its depth is exact, so any error is the field's.
+A scene is a list of painted solids. Its colour does not depend on the viewing direction, so any radiance field can learn
+it; its depth is exact, so any error is the field's.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays meet first."""
+    """The first surface on each ray."""
 
     distance: Float[Tensor, "*r"]  # metres along the ray; inf where nothing is met
     rgb: Float[Tensor, "*r 3"]  # lit; the background's where nothing is met
@@ -32,17 +32,17 @@ class Hits:
 
 @dataclass(frozen=True, eq=False)
 class ClosedFormScene:
-    """Painted solids under one far light; Lambertian, without cast shadows."""
+    """Painted Lambertian solids under one distant light, without cast shadows."""
 
     primitives: Sequence[Primitive]
     bounds: SceneBounds
     name: str
     light: tuple[float, float, float] = (0.4, -0.5, 0.77)  # direction towards it, world
-    contrast: float = 0.6  # how much darker a surface is that is turned away from the light
+    contrast: float = 0.6  # how much darker a surface is that faces away from the light
 
     @torch.no_grad()
     def intersect(self, origins: Float[Tensor, "*#r 3"], directions: Float[Tensor, "*r 3"]) -> Hits:
-        """First surface along unit ``directions`` (world, metres); one origin may serve many rays."""
+        """Return the first surface along unit ``directions`` (metres, world). One origin may be shared by all rays."""
         rays = directions.reshape(-1, 3).T.contiguous()
         shared = origins.numel() == 3
         starts = (origins if shared else origins.expand_as(directions)).to(rays).reshape(-1, 3).T
@@ -63,7 +63,7 @@ class ClosedFormScene:
     def render(
         self, intrinsics: Intrinsics, T_world_camera: SE3, name: str = "", supersample: int = 2
     ) -> Frame:
-        """An image from a pose: colour and coverage averaged over each pixel, depth exact at its centre."""
+        """Render an image from a pose: colour and coverage are averaged over each pixel, depth is exact at its centre."""
         if supersample < 1:
             raise InputError(f"supersample is {supersample}, expected at least 1")
         steps = (torch.arange(supersample) + 0.5) / supersample - 0.5
@@ -79,7 +79,7 @@ class ClosedFormScene:
         return Frame(name or self.name, hits.rgb.mean(0), intrinsics, depth, alpha)
 
     def _nearest(self, origins: Float[Tensor, "3 #n"], rays: Float[Tensor, "3 n"]) -> tuple[Tensor, Tensor]:
-        """Distance to the first surface (inf: none), and which primitive it is (-1: none)."""
+        """Return the distance to the first surface (metres; inf: none) and the index of its primitive (-1: none)."""
         distance = torch.full_like(rays[0], torch.inf)
         owner = torch.full_like(rays[0], -1, dtype=torch.int16)
         for i, primitive in enumerate(self.primitives):
@@ -102,12 +102,12 @@ class ClosedFormScene:
 
 
 def views(scene: ClosedFormScene, intrinsics: Intrinsics, poses: Sequence[SE3]) -> list[View]:
-    """The scene as seen from each pose (``T_world_camera``); frames are named 0000, 0001 ..."""
+    """Render the scene from each pose (``T_world_camera``); frames are named 0000, 0001 ..."""
     return [View(scene.render(intrinsics, T, f"{i:04d}"), T) for i, T in enumerate(poses)]
 
 
 def _may_meet(primitive: Primitive, origins: Float[Tensor, "3 #n"], rays: Float[Tensor, "3 n"]) -> Tensor:
-    """Indices of the rays worth a try: of those from one origin, the cone about the primitive; else all."""
+    """Return the indices of the rays that may meet the primitive: from a shared origin, those in the cone around its ball."""
     towards = primitive.T_world_shape.translation.to(rays) - origins[:, 0]
     beyond = float(towards @ towards) - (primitive.shape.reach * 1.01 + 1e-3) ** 2
     if origins.shape[1] > 1 or beyond <= 0:
@@ -116,7 +116,7 @@ def _may_meet(primitive: Primitive, origins: Float[Tensor, "3 #n"], rays: Float[
 
 
 def _world_rays(intrinsics: Intrinsics, T_world_camera: SE3, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit directions (... 3) in the world through ``pixels``, and how long each is where its z is 1."""
+    """Return unit directions (... 3; world) through ``pixels``, and the length of each at z = 1 (camera frame)."""
     rays = intrinsics.unproject(pixels)
     length = torch.linalg.vector_norm(rays, dim=-1)
     return T_world_camera.to(rays).rotate(rays / length[..., None]), length

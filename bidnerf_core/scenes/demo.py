@@ -1,6 +1,6 @@
-"""Two closed-form scenes to try things on: a toy on its own and a furnished room. World axes: z up; metres.
+"""The two demo scenes, in closed form: a toy lorry and a furnished room. World axes: z up; metres.
 
-Neither is mapped onto itself by any rotation or mirror, so a pose is never ambiguous.
+No rotation or reflection maps either onto itself, so a pose is never ambiguous.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ WHITE: Colour = (0.99, 0.98, 0.95)
 
 
 def demo_object() -> ClosedFormScene:
-    """A toy lorry, nose towards +x, within the cube from -1 to 1; seen from outside, white behind it."""
+    """Return a toy lorry, nose towards +x, within the cube from -1 to 1, before a white background."""
     bounds = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
     return ClosedFormScene([*_lorry(), *_wheels(), *_load()], bounds, "demo_object")
 
 
 def demo_room() -> ClosedFormScene:
-    """A living room of 4 x 3 x 2.5 m about the z axis, floor at 0; seen from inside."""
+    """Return a living room of 4 x 3 x 2.5 m around the z axis with its floor at z = 0, to be seen from inside."""
     bounds = SceneBounds((-2.05, -1.55, -0.05), (2.05, 1.55, 2.55), 0.05, 6.0)
     parts = [*_walls(), *_table(), *_sofa(), *_shelf(), *_decoration()]
     return ClosedFormScene(parts, bounds, "demo_room", light=(0.45, -0.3, 0.85), contrast=0.4)
@@ -156,7 +156,7 @@ def _sofa() -> list[Primitive]:
 
 
 def _shelf() -> list[Primitive]:
-    """Against the wall at -x."""
+    """Return the shelf, which stands against the wall at -x, with its books."""
     boards = [
         _solid(Box((0.16, 0.6, 0.02)), (-1.84, -0.6, z), stripes(WOOD, OAK, (0, 1, 0), 0.4))
         for z in (0.4, 0.85, 1.3)
@@ -198,7 +198,7 @@ def _decoration() -> list[Primitive]:
 def _solid(
     shape: Shape, place: Sequence[float], texture: Texture, yaw: float = 0, pitch: float = 0, roll: float = 0
 ) -> Primitive:
-    """Turned about x (roll), then y (pitch), then z (yaw), degrees, and put at ``place``."""
+    """Return a shape that is rotated about x (roll), then y (pitch), then z (yaw), in degrees, and moved to ``place`` (metres)."""
     rotation = torch.eye(3, dtype=torch.float64)
     for axis, angle in enumerate((roll, pitch, yaw)):
         turn = torch.zeros(6, dtype=torch.float64)

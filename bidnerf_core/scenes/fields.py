@@ -1,4 +1,4 @@
-"""Radiance fields in closed form, known everywhere and in any precision: what tests hold others against."""
+"""Radiance fields in closed form, exact everywhere and in any precision: references for tests."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from bidnerf_core.se3 import SE3
 class GaussianBlobs:
     """A sum of isotropic Gaussian clouds with smoothly changing colour; infinitely differentiable.
 
-    It computes in the precision of the positions. ``moved`` puts the whole scene elsewhere, so that a test can check
-    that a moved world gives a moved answer.
+    It computes in the precision of the positions. ``moved`` moves the whole scene, so that a test can check that a moved
+    world gives a moved answer.
     """
 
     centres: Float[Tensor, "k 3"]  # metres, frame of the field
@@ -32,7 +32,7 @@ class GaussianBlobs:
 
     @staticmethod
     def random(count: int = 5, seed: int = 0, samples: int = 64, density: float = 12.0) -> GaussianBlobs:
-        """Blobs within the cube from -1 to 1, none like another (float64)."""
+        """Return ``count`` different blobs within the cube from -1 to 1 (float64)."""
         if count < 1:
             raise InputError(f"{count} blobs, expected at least 1")
         generator = torch.Generator().manual_seed(seed)
@@ -49,13 +49,13 @@ class GaussianBlobs:
         return FieldValues(clouds.sum(-1), 0.5 + 0.45 * torch.sin(local @ self.waves.to(local).T + 0.7))
 
     def moved(self, T_new_world: SE3) -> GaussianBlobs:
-        """The field that has at ``T_new_world.apply(p)`` what this one has at ``p``."""
+        """Return the field that has at ``T_new_world.apply(p)`` the values that this one has at ``p``."""
         return replace(self, T_world_field=T_new_world.to(self.T_world_field.rotation) @ self.T_world_field)
 
 
 @dataclass(frozen=True, eq=False)
 class HomogeneousBall:
-    """Constant density and colour within a sphere: what a ray loses there is known, 1 - exp(-density * chord)."""
+    """Constant density and colour within a sphere, whose opacity is known: 1 - exp(-density * chord)."""
 
     radius: float  # metres
     density: float  # per metre
@@ -69,7 +69,7 @@ class HomogeneousBall:
         return FieldValues(density, positions.new_tensor(self.rgb).expand(positions.shape))
 
     def chord(self, rays: Rays) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
-        """Distances at which each ray enters and leaves the ball in [near, far]; equal where it misses."""
+        """Return the distances (metres) at which each ray enters and leaves the ball in [near, far]; equal where it misses."""
         origins, directions = torch.broadcast_tensors(rays.origins, rays.directions)
         starts = (origins - origins.new_tensor(self.centre)).reshape(-1, 3).T
         enter, leave = Sphere(self.radius).interval(starts, directions.reshape(-1, 3).T)
@@ -79,6 +79,6 @@ class HomogeneousBall:
         return enter, torch.maximum(enter, leave)
 
     def opacity(self, rays: Rays) -> Float[Tensor, "*r"]:
-        """Exact (Beer-Lambert)."""
+        """Return the exact opacity of each ray (Beer-Lambert)."""
         enter, leave = self.chord(rays)
         return -torch.expm1(-self.density * (leave - enter))

@@ -1,7 +1,7 @@
-"""Solids that a ray meets in closed form.
+"""Solids with closed-form ray intersections.
 
-Every shape is convex and lies about the origin of its own frame, so a line meets it in one interval. Rays come as
-rows (3 n: x, y and z each contiguous), which is several times as fast as (n 3) for the few operations done here.
+Every shape is convex and centred on the origin of its own frame, so a line meets it in one interval. Rays are arrays of
+shape (3 n), with x, y and z each contiguous: for the few operations here that is several times as fast as (n 3).
 """
 
 from __future__ import annotations
@@ -18,31 +18,33 @@ from bidnerf_core.scenes.textures import Texture, dominant_axis
 from bidnerf_core.se3 import SE3
 
 PARALLEL_BELOW = 1e-12
-"""Components of a direction under this are set to it: the same ray for any purpose, and it may be divided by."""
+"""Components of a direction below this are set to it, to avoid a division by zero; the change of the ray is negligible."""
 
 
 @runtime_checkable
 class Shape(Protocol):
-    """A convex solid about the origin; metres, its own frame."""
+    """A convex solid around the origin of its own frame; metres."""
 
     @property
     def reach(self) -> float:
-        """Radius of a ball about the origin that holds the shape."""
+        """Radius of a ball around the origin that contains the shape (metres)."""
         ...
 
     def interval(
         self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Where lines enter and leave (metres along ``directions``, maybe < 0); leave < enter on a miss."""
+        """Return where lines enter and leave (metres along ``directions``, possibly negative); leave < enter on a miss."""
         ...
 
     def normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Outward unit normals at points of the surface."""
+        """Return outward unit normals at points of the surface."""
         ...
 
 
 @dataclass(frozen=True)
 class Sphere:
+    """A ball."""
+
     radius: float
 
     def __post_init__(self) -> None:
@@ -56,7 +58,7 @@ class Sphere:
         self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]
     ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         middle = -(origins * directions).sum(0)
-        nearest = origins + middle * directions  # its length does not cancel, unlike |o|^2 - (o.d)^2
+        nearest = origins + middle * directions  # its length suffers no cancellation, unlike |o|^2 - (o.d)^2
         return _chord(middle, self.radius**2 - (nearest * nearest).sum(0))
 
     def normals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -65,7 +67,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Box:
-    """Corners at plus and minus ``half``."""
+    """A cuboid with its corners at plus and minus ``half`` (metres)."""
 
     half: tuple[float, float, float]
 
@@ -94,7 +96,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """Axis z, capped at plus and minus ``half``; a flat one is a disc."""
+    """A cylinder around the z axis, from minus to plus ``half`` (metres); a flat one is a disc."""
 
     radius: float
     half: float
@@ -127,7 +129,7 @@ class Cylinder:
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
-    """A shape, where it is, and what it is painted with."""
+    """A shape with its pose and its texture."""
 
     shape: Shape
     T_world_shape: SE3
@@ -136,9 +138,9 @@ class Primitive:
     def distance(
         self, origins: Float[Tensor, "3 #n"], directions: Float[Tensor, "3 n"]
     ) -> Float[Tensor, " n"]:
-        """Metres to the first crossing ahead of the origin (world frame, unit directions); inf: none.
+        """Return the distance to the first crossing ahead of the origin (metres; world, unit directions); inf: none.
 
-        From inside a solid that is where the ray leaves it: a box seen from within is a room.
+        From inside a solid, that is where the ray leaves it: a box seen from inside is a room.
         """
         T = self.T_world_shape.to(directions)
         turned = T.rotation.mT @ directions
@@ -147,7 +149,7 @@ class Primitive:
         return torch.where((leave >= enter) & (leave > 0), first, torch.inf)
 
     def surface(self, points: Float[Tensor, "3 n"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-        """Paint (in [0, 1], unlit) and outward normal (world) at points of the surface (world)."""
+        """Return the unlit colour (in [0, 1]) and the outward normal (world) at points of the surface (world)."""
         T = self.T_world_shape.to(points)
         local = (T.rotation.mT @ (points - T.translation[:, None])).T
         normals = self.shape.normals(local)
@@ -155,7 +157,7 @@ class Primitive:
 
 
 def _chord(middle: Tensor, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """``middle`` -+ sqrt(squared); an interval turned inside out where that is negative."""
+    """Return ``middle`` -+ sqrt(squared); where ``squared`` is negative, an empty interval whose end is before its start."""
     half = squared.clamp(min=0).sqrt()
     half = torch.where(squared < 0, -torch.inf, half)
     return middle - half, middle + half

@@ -1,7 +1,7 @@
-"""Paint for closed-form scenes: smooth functions of the place, rich enough to tell one place from another.
+"""Textures for closed-form scenes: smooth functions of position, rich enough to tell one place from another.
 
-All of them are band-limited in practice: plane waves with softened edges, so that an image of 100 to 200 pixels from a
-usual distance shows them without aliasing.
+All are practically band-limited, being plane waves with softened edges: an image of 100 to 200 pixels from a usual distance
+shows them without aliasing.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ Texture = Callable[[Tensor, Tensor], Tensor]
 """Points (n 3; metres, frame of the shape) and outward unit normals (n 3) to colours (n 3) in [0, 1]."""
 
 DRIFT = ((2.3, 1.1, -1.7), (-1.3, 2.1, 1.9), (1.6, -1.9, 2.2))
-"""Radians per metre of the slow change of red, green and blue: periods of about two metres, each its own way."""
+"""Wave vectors (radians per metre) of the slow drift of red, green and blue: periods of about two metres."""
 
 
 @dataclass(frozen=True)
 class Waves:
-    """Two colours mixed by plane waves (radians per metre) that are multiplied, and a slow drift of the hue.
+    """Two colours mixed by the product of plane waves (radians per metre), with a slow drift of the hue.
 
-    One wave gives stripes, three give a chequered solid. Without the drift a pattern would look alike at every period,
-    and a pose could slip by one.
+    One wave gives stripes, three give a chequered solid. The drift makes a pattern's periods differ, so that a pose cannot be
+    off by one of them.
     """
 
     first: Colour
@@ -50,7 +50,7 @@ class Waves:
 
 @dataclass(frozen=True)
 class Blotches(Waves):
-    """The same waves, added: irregular spots and veins."""
+    """Two colours mixed by the sum of plane waves: irregular spots and veins."""
 
     def _pattern(self, waves: Float[Tensor, "k n"]) -> Float[Tensor, " n"]:
         return 0.5 + 0.5 * torch.tanh(self.hardness * waves.sum(0) / math.sqrt(len(self.waves)))
@@ -58,7 +58,7 @@ class Blotches(Waves):
 
 @dataclass(frozen=True)
 class Faces:
-    """A texture for each side: the one whose axis (+x, -x, +y, -y, +z, -z) is nearest to the normal."""
+    """A texture for each side (+x, -x, +y, -y, +z, -z); a point has that of the axis nearest to its normal."""
 
     sides: tuple[Texture, Texture, Texture, Texture, Texture, Texture]
 
@@ -73,21 +73,21 @@ class Faces:
 
 
 def checker(first: Colour, second: Colour, period: float | Vector, phase: float = 0.7) -> Waves:
-    """Soft cubes; ``period`` (metres) is twice the side of a cube, for all axes or for each."""
+    """Return soft cubes of alternating colour; ``period`` (metres) is twice the side of a cube, for all axes or for each."""
     px, py, pz = period if isinstance(period, tuple) else (period,) * 3
     waves = ((2 * math.pi / px, 0.0, 0.0), (0.0, 2 * math.pi / py, 0.0), (0.0, 0.0, 2 * math.pi / pz))
     return Waves(first, second, waves, (phase, phase + 0.5, phase + 0.9), hardness=5.0)
 
 
 def stripes(first: Colour, second: Colour, across: Vector, period: float, phase: float = 0.0) -> Waves:
-    """Soft bands, ``period`` metres from one to the next in direction ``across``."""
+    """Return soft bands that repeat every ``period`` metres in the direction ``across``."""
     length = math.hypot(*across)
     x, y, z = (2 * math.pi / period * a / length for a in across)
     return Waves(first, second, ((x, y, z),), (phase,), hardness=4.0)
 
 
 def blotches(first: Colour, second: Colour, period: float, seed: int) -> Blotches:
-    """Spots about half a ``period`` (metres) wide, without any repetition that could be seen."""
+    """Return spots about half a ``period`` (metres) wide that do not visibly repeat."""
     generator = torch.Generator().manual_seed(seed)
     directions = torch.nn.functional.normalize(torch.randn((7, 3), generator=generator), dim=-1)
     lengths = 2 * math.pi / period * torch.linspace(0.7, 1.5, 7)[:, None]
@@ -97,7 +97,7 @@ def blotches(first: Colour, second: Colour, period: float, seed: int) -> Blotche
 
 
 def dominant_axis(vectors: Float[Tensor, "n 3"]) -> Bool[Tensor, "n 3"]:
-    """True at the component of largest magnitude, the first of equals; ten times as fast as ``argmax``."""
+    """Return a mask of the component of largest magnitude, the first of equals; ten times as fast as ``argmax``."""
     x, y, z = vectors.abs().unbind(-1)
     first = (x >= y) & (x >= z)
     second = ~first & (y >= z)
@@ -105,5 +105,5 @@ def dominant_axis(vectors: Float[Tensor, "n 3"]) -> Bool[Tensor, "n 3"]:
 
 
 def _phase(points: Tensor, waves: tuple[Vector, ...], phases: tuple[float, ...]) -> Tensor:
-    """Rows (k n), like the rays: each wave is contiguous."""
+    """Return the phase of each wave at each point (k n; radians)."""
     return points.new_tensor(waves) @ points.T + points.new_tensor(phases)[:, None]

@@ -1,4 +1,4 @@
-"""Camera poses that show a scene well. World axes: z up; camera axes are OpenCV's (z forward, y down)."""
+"""Camera trajectories around and within a scene. World axes: z up; camera axes are OpenCV's (z forward, y down)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bidnerf_core.field import SceneBounds
 from bidnerf_core.se3 import SE3
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-"""Successive multiples of it (rad) fill a circle evenly, however many there are."""
+"""Angle (rad) whose successive multiples fill a circle evenly, however many there are."""
 
 
 def look_at(
@@ -22,7 +22,7 @@ def look_at(
     target: Sequence[float] | Float[Tensor, "3"],
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> SE3:
-    """``T_world_camera`` (float64) of a camera at ``eye`` with ``target`` in its middle and ``up`` upwards."""
+    """Return ``T_world_camera`` (float64) of a camera at ``eye`` that has ``target`` in the middle of its image and ``up`` upwards."""
     position = torch.as_tensor(eye, dtype=torch.float64)
     forward = torch.as_tensor(target, dtype=torch.float64) - position
     if not torch.linalg.vector_norm(forward) > 0:
@@ -42,10 +42,10 @@ def orbit(
     elevation: tuple[float, float] = (5.0, 80.0),
     seed: int = 0,
 ) -> list[SE3]:
-    """``T_world_camera`` on a sphere (metres) about ``centre`` and looking at it, evenly spread (Fibonacci).
+    """Return poses (``T_world_camera``) spread evenly over a sphere (Fibonacci) around ``centre``, which they look at.
 
-    ``elevation``: lowest and highest, degrees above the horizon; (-90, 90) is the whole sphere. ``seed`` turns the
-    spiral, so that two seeds share no place.
+    ``radius`` is in metres; ``elevation`` is the lowest and the highest, in degrees above the horizon, (-90, 90) being the
+    whole sphere. ``seed`` rotates the spiral, so that two seeds have no position in common.
     """
     turn, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).tolist()
     low, high = (math.sin(math.radians(e)) for e in elevation)
@@ -59,9 +59,9 @@ def orbit(
 
 
 def look_around(bounds: SceneBounds, count: int, seed: int = 0, spread: float = 0.5) -> list[SE3]:
-    """``T_world_camera`` inside a room, at head height, in all compass directions and a little up or down.
+    """Return poses (``T_world_camera``) inside a room, at head height, facing all compass directions, tilted up or down a little.
 
-    Each camera stands about ``spread`` of the way from the middle to the wall behind it, to see much of the room.
+    Each camera is about ``spread`` of the way from the middle of the room to the wall behind it, to see much of the room.
     """
     generator = torch.Generator().manual_seed(seed)
     lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (bounds.lower, bounds.upper))

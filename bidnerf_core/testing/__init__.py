@@ -1,10 +1,11 @@
-"""The contract that every backend keeps, as a test class for pytest. A plugin's whole test is::
+"""The contract of backends as a test class for pytest.
 
-from bidnerf_core.testing import BackendContract
+A plugin's whole test is::
 
+    from bidnerf_core.testing import BackendContract
 
-class TestMine(BackendContract):
-backend = my_package.backend
+    class TestMine(BackendContract):
+        backend = my_package.backend
 """
 
 from __future__ import annotations

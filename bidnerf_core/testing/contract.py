@@ -1,4 +1,4 @@
-"""``BackendContract``: what a backend promises, one test a promise."""
+"""``BackendContract``: what every backend has to fulfil, one test for each requirement."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from torch import Tensor, nn
 from bidnerf_core.backend import Backend
 from bidnerf_core.field import RadianceField, levels
 from bidnerf_core.testing import derivatives, recipes, samples, values
-from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.faults import calling, query, require
 from bidnerf_core.testing.scene import awkward_rays, joined, points, rgb_views, rgbd_views
 from bidnerf_core.testing.subject import Subject, called, frozen, precise
 
 
 class BackendContract(Subject):
-    """Inherit under a name that begins with ``Test`` and say which backend; pytest does the rest.
+    """Tests of a backend: subclass it under a name that begins with ``Test``, and set ``backend`` or ``name``.
 
-    ``backend`` is the object that the entry point names, or ``name`` is the entry point's. ``config`` should be small:
-    a few dozen steps of milliseconds, which suffice to learn something of 6 images of 24 x 24 pixels. Without it the
-    default config is taken, with fewer steps.
+    ``backend`` is the object that the entry point names, ``name`` the entry point's name. ``config`` should be small: a few
+    dozen steps of milliseconds each, enough to learn something from 6 images of 24 x 24 pixels. Without it, the default
+    config is used with fewer steps.
     """
 
     # What the entry point names.
@@ -86,7 +86,7 @@ class BackendContract(Subject):
                 " to come from a seed in the config",
             )
 
-    # What the field says, at each of its levels.
+    # The field's values, at each of its levels.
 
     def test_query_takes_any_shape(self) -> None:
         self._each(values.check_shapes)
@@ -102,7 +102,7 @@ class BackendContract(Subject):
 
     def test_query_follows_the_dtype(self) -> None:
         for field in self._fields():
-            with telling(f"{type(field).__name__}.double()"):
+            with calling(f"{type(field).__name__}.double()"):
                 doubled = copy.deepcopy(field).double()
             for level, moved in zip(levels(field), levels(cast(RadianceField, doubled)), strict=True):
                 values.check_precision(level, moved)
@@ -112,7 +112,7 @@ class BackendContract(Subject):
             return
         rays = joined(list(awkward_rays().values()))
         field = self._trained()
-        with telling(f"{type(field).__name__} on CUDA"):
+        with calling(f"{type(field).__name__} on CUDA"):
             moved = copy.deepcopy(field).to("cuda")
             names = (f.name for f in dataclasses.fields(rays))
             elsewhere = dataclasses.replace(rays, **{name: getattr(rays, name).cuda() for name in names})
@@ -125,7 +125,7 @@ class BackendContract(Subject):
     def test_query_serves_several_threads(self) -> None:
         self._each(values.check_threads)
 
-    # Where the field is asked, and what is seen.
+    # Sampling and rendering.
 
     def test_samples_are_sorted_disjoint_and_on_the_ray(self) -> None:
         self._each(samples.check_intervals)
@@ -147,11 +147,11 @@ class BackendContract(Subject):
         for level in levels(self._trained()):
             derivatives.check_pose_gradient(*precise(level))
 
-    # What is saved.
+    # Storage.
 
     def test_saved_field_renders_the_same(self) -> None:
         trained, fresh = self._trained(), self._build(self._reread(self._config()))
-        with telling(f"{type(fresh).__name__}.load_state_dict of a saved state_dict"):
+        with calling(f"{type(fresh).__name__}.load_state_dict of a saved state_dict"):
             fresh.load_state_dict(recipes.stored(dict(trained.state_dict())))
         loaded = frozen(fresh)
         rays = joined(list(awkward_rays().values()))
@@ -165,7 +165,7 @@ class BackendContract(Subject):
             " bits; is some state not in state_dict (a plain attribute, a buffer with persistent=False)?",
         )
 
-    # How it is trained.
+    # Training.
 
     def test_training_learns_from_rgbd(self) -> None:
         recipes.check_learning(

@@ -1,4 +1,4 @@
-"""Derivatives of a field against finite differences."""
+"""Checks of a field's derivatives against finite differences."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor
 from bidnerf_core.field import RadianceField
 from bidnerf_core.rendering import render
 from bidnerf_core.se3 import SE3
-from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.faults import calling, query, require
 from bidnerf_core.testing.scene import SIDE, camera_rays, points, rgbd_views
 
 COUNT = 64
 AGREEING = 0.7
-"""Share of points at which derivatives must agree: a field may have kinks, which a step now and then crosses."""
+"""Fraction of the points at which derivatives must agree: a field may have kinks, which some steps cross."""
 
 Asked = Callable[[Tensor], Tensor]
-"""Points (n 3) to values (n c)."""
+"""A map of points (n 3) to values (n c)."""
 
 
 def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
-    """By position, along a random line through each point."""
+    """Check the derivative by position, along a random line through each point."""
     positions, directions = (x.to(dtype) for x in points(COUNT))
     along = points(COUNT, seed=1)[1].to(dtype)
     for what in ("density", "rgb"):
@@ -37,7 +37,7 @@ def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None
 
 
 def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
-    """By direction, along a random great circle through each, since directions stay unit."""
+    """Check the derivative by direction, along a random great circle through each, since directions are unit."""
     positions, directions = (x.to(dtype) for x in points(COUNT))
     along = points(COUNT, seed=1)[1].to(dtype)
     along = torch.nn.functional.normalize(
@@ -57,13 +57,13 @@ def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> Non
 
 
 def check_pose_gradient(field: RadianceField, dtype: torch.dtype) -> None:
-    """``render`` carries a gradient from what is seen to the camera's pose."""
+    """Check that rendered colour and distance have a gradient by the camera's pose."""
     delta = torch.zeros(6, dtype=dtype, requires_grad=True)
     start = rgbd_views()[0].T_ref_camera.to(dtype=dtype)
     nudge = torch.tensor([0.02, -0.03, 0.01, 0.02, 0.01, -0.02], dtype=dtype)
     T_world_camera: SE3 = start.retract(nudge).retract(delta)
     who = f"{type(field).__name__} rendered from a pose"
-    with telling(who):
+    with calling(who):
         rendering = render(field, camera_rays(T_world_camera))
         seen = {"rgb": rendering.rgb.square().mean(), "distance": rendering.distance.mean()}
     for what, value in seen.items():
@@ -79,7 +79,7 @@ DETACHED = "expected one: query must not detach positions or run under no_grad"
 def agreement(
     ask: Asked, moved: Callable[[float], Tensor], speed: Float[Tensor, "n 3"], dtype: torch.dtype
 ) -> Float[Tensor, ""]:
-    """Share of values whose derivative along a curve is that of finite differences, at the best of several steps.
+    """Return the fraction of values whose derivative along a curve is that of finite differences, at the best of several steps.
 
     ``moved(t)`` are the points at ``t`` on their curves, ``speed`` (n 3) is its derivative at 0.
     """
@@ -96,14 +96,14 @@ def agreement(
 
 
 def _slopes(ask: Asked, at: Float[Tensor, "n 3"], speed: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-    """Derivative of each channel along ``speed``, by reverse mode; zero where nothing depends on the argument."""
+    """Return the derivative of each channel along ``speed``, by reverse mode; 0 where it does not depend on the argument."""
     leaf = at.detach().requires_grad_()
     values = ask(leaf)
     slopes = torch.zeros_like(values)
     if not values.requires_grad:
         return slopes
     for c in range(values.shape[1]):
-        with telling("backward through query"):
+        with calling("backward through query"):
             (gradient,) = torch.autograd.grad(values[:, c].sum(), leaf, retain_graph=True, allow_unused=True)
         if gradient is not None:
             slopes[:, c] = (gradient * speed).sum(-1)

@@ -1,4 +1,4 @@
-"""How a breach of the contract is told: in one sentence that says what was found and what is expected."""
+"""Failures of the contract, each in one sentence that says what was found and what was expected."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples
 
 
 def require(condition: bool, fault: str) -> None:
-    """Not an ``assert``: those say nothing under ``python -O``."""
+    """Raise ``AssertionError`` unless ``condition`` holds. An ``assert`` would be skipped under ``python -O``."""
     if not condition:
         raise AssertionError(fault)
 
 
 @contextmanager
-def telling(doing: str) -> Iterator[None]:
-    """An exception of the backend's code becomes a breach that says what was asked of it."""
+def calling(doing: str) -> Iterator[None]:
+    """Turn an exception of the backend's code into a failure that names the call (``doing``)."""
     try:
         yield
     except AssertionError:
@@ -29,9 +29,9 @@ def telling(doing: str) -> Iterator[None]:
 
 
 def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) -> FieldValues:
-    """What ``field`` says, with shapes checked. ``of`` describes the points."""
+    """Return the field's values after a check of their shapes. ``of`` describes the points."""
     who = f"{type(field).__name__}.query of {of}"
-    with telling(who):
+    with calling(who):
         values = field.query(positions, directions)
     shape = tuple(positions.shape[:-1])
     for what, found, expected in (
@@ -47,9 +47,9 @@ def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) 
 
 
 def sample(field: RadianceField, rays: Rays, of: str, jitter: Generator | None = None) -> RaySamples:
-    """Where ``field`` wants to be asked, with shapes checked. ``of`` describes the rays."""
+    """Return the samples of the field's sampler after a check of their shapes. ``of`` describes the rays."""
     who = f"sampler {type(field.sampler).__name__} of {of}"
-    with telling(who):
+    with calling(who):
         samples = field.sampler(rays, jitter)
     shape, found = samples.starts.shape, tuple(rays.near.shape)
     require(

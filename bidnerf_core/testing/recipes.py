@@ -1,4 +1,4 @@
-"""Laws of ``Backend.train``: it learns, reports, saves when asked, stops when asked, and goes on as if it had not."""
+"""Checks of ``Backend.train``: it learns, reports, saves and stops on request, and resumes without a difference."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bidnerf_core.backend import Backend
 from bidnerf_core.field import RadianceField
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
-from bidnerf_core.testing.faults import require, telling
+from bidnerf_core.testing.faults import calling, require
 from bidnerf_core.testing.scene import BOUNDS, camera_rays, rgbd_views
 from bidnerf_core.training import Progress, TrainingState, TrainingStopped
 
@@ -24,7 +24,7 @@ LEARNED = 0.8
 
 
 class Recorder:
-    """A ``Report`` that writes down what it is told, and keeps states as a map on disk would: as bytes."""
+    """A ``Report`` that records progress, and keeps states as a map on disk does: as bytes."""
 
     def __init__(
         self, due: Sequence[int] = (), stop: int | None = None, state: TrainingState | None = None
@@ -51,8 +51,8 @@ class Recorder:
 
 
 def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """What comes back from a safetensors file."""
-    with telling("writing the tensors of a state to safetensors"):
+    """Return the tensors as they are read back from a safetensors file."""
+    with calling("writing the tensors of a state to safetensors"):
         packed = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
         return tensors_from_bytes(tensors_to_bytes(packed))
 
@@ -60,7 +60,7 @@ def stored(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 def check_learning(
     backend: Backend, make: Callable[[], RadianceField], config: Any, views: Sequence[View], kind: str
 ) -> RadianceField:
-    """``config.steps`` steps bring the rendered views nearer to those that were seen. Returns the trained field."""
+    """Check that ``config.steps`` steps bring the rendered views nearer to the given ones, and return the trained field."""
     field = make()
     before = colour_error(field)
     _train(backend, field, views, config, Recorder(), f"on {kind} views")
@@ -75,7 +75,7 @@ def check_learning(
 
 
 def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
-    """Every step is told, in order; saves come when due, hold the field, and no others come."""
+    """Check that every step is reported in order, and that states are saved when due, and only then, and hold the field."""
     total = config.steps
     due = sorted({1, total // 2, total})
     report = Recorder(due)
@@ -84,7 +84,7 @@ def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
     told = [(progress.step, progress.total) for progress in report.steps]
     require(
         told == [(i + 1, total) for i in range(total)],
-        f"{who}: report.step was told of {_shortly(told)}, expected (1, {total}) to ({total}, {total}), one a step",
+        f"{who}: report.step was called with {_shortly(told)}, expected (1, {total}) to ({total}, {total}), one a step",
     )
     odd = [p for p in report.steps if not (math.isfinite(p.loss) and math.isfinite(p.psnr))]
     require(not odd, f"{who}: reported a loss or PSNR that is not finite: {odd[:1]}")
@@ -101,12 +101,12 @@ def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
 
 
 def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: Any) -> None:
-    """Stopped in the middle, with ``TrainingStopped``, and gone on with, a training arrives at the same bits."""
+    """Check that a training that stops midway with ``TrainingStopped`` and is resumed ends with the same bits."""
     who, middle = f"{_name(backend)}.train", config.steps // 2
     first, second, third = make(), make(), make()
     beginning = stored(_state_of(first))
     _train(backend, first, rgbd_views(), config, Recorder(), "")
-    for field in (second, third):  # that builds differ is told elsewhere
+    for field in (second, third):  # whether builds differ is another test
         _module(field).load_state_dict(beginning)
     report = Recorder(stop=middle)
     try:
@@ -130,7 +130,7 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
     told = [progress.step for progress in rest.steps]
     require(
         told == list(range(middle + 1, config.steps + 1)),
-        f"{who}: resumed after step {middle}, it told of steps {_shortly(told)}, expected {middle + 1} to {config.steps}",
+        f"{who}: resumed after step {middle}, it reported steps {_shortly(told)}, expected {middle + 1} to {config.steps}",
     )
     _require_same(
         _state_of(third),
@@ -141,8 +141,8 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
 
 
 def colour_error(field: RadianceField) -> float:
-    """Mean squared error of colour over all pixels of the training views."""
-    with torch.no_grad(), telling(f"render by {type(field).__name__}"):
+    """Return the mean squared error of colour over all pixels of the training views."""
+    with torch.no_grad(), calling(f"render by {type(field).__name__}"):
         found = [
             render(field, camera_rays(view.T_ref_camera.to(torch.float32)), BOUNDS.background).rgb
             for view in rgbd_views()
@@ -155,7 +155,7 @@ def _train(
     backend: Backend, field: RadianceField, views: Sequence[View], config: Any, report: Recorder, how: str
 ) -> None:
     try:
-        with telling(f"{_name(backend)}.train {how}".rstrip()):
+        with calling(f"{_name(backend)}.train {how}".rstrip()):
             backend.train(field, views, config, report)
     except AssertionError as error:
         if isinstance(error.__cause__, TrainingStopped):

@@ -1,4 +1,4 @@
-"""Laws of a field's sampler, and of what is rendered with it."""
+"""Checks of a field's sampler, and of what is rendered with it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.field import RadianceField, Rays, RaySamples
 from bidnerf_core.rendering import Rendering, render
-from bidnerf_core.testing.faults import require, sample, telling
+from bidnerf_core.testing.faults import calling, require, sample
 from bidnerf_core.testing.scene import SIDE, awkward_rays, joined, picked
 from bidnerf_core.testing.values import close
 
@@ -16,7 +16,7 @@ BACKGROUND = (0.1, 0.5, 0.9)
 
 
 def check_intervals(field: RadianceField) -> None:
-    """Valid samples are sorted, disjoint and within [near, far]; rays that miss have none; zero rays are fine."""
+    """Check that valid samples are sorted, disjoint and within [near, far], and that rays that miss have none; also for no rays."""
     for of, rays in awkward_rays().items():
         for jitter, how in ((None, ""), (_generator(), " with jitter")):
             _check_order(field, rays, sample(field, rays, of + how, jitter), of + how)
@@ -49,7 +49,7 @@ def _check_order(field: RadianceField, rays: Rays, samples: RaySamples, of: str)
 
 
 def check_repeatable(field: RadianceField) -> None:
-    """The same samples each time without jitter; with it, the same for the same seed of the given generator."""
+    """Check that samples repeat without jitter and, with it, for the same seed of the given generator."""
     rays = joined(list(awkward_rays().values()))
     who = f"sampler {type(field.sampler).__name__}"
     with torch.random.fork_rng(devices=[]):
@@ -65,7 +65,7 @@ def check_repeatable(field: RadianceField) -> None:
 
 
 def check_rays_alone(field: RadianceField) -> None:
-    """What a ray sees does not depend on the rays beside it, nor on how they are arranged."""
+    """Check that the rendering of a ray does not depend on the other rays, nor on how they are arranged."""
     rays = joined(list(awkward_rays().values()))
     count = len(rays.near) // 4 * 4
     whole = seen(field, picked(rays, torch.arange(count)), "rays")
@@ -86,7 +86,7 @@ def check_rays_alone(field: RadianceField) -> None:
 
 
 def check_background(field: RadianceField) -> None:
-    """A ray that misses the scene sees the background and nothing else."""
+    """Check that a ray that misses the scene sees the background and nothing else."""
     found = seen(field, awkward_rays()["rays that miss the scene"], "rays that miss the scene")
     require(
         close(found, torch.tensor([*BACKGROUND, 0.0, 0.0]).expand_as(found)),
@@ -96,7 +96,7 @@ def check_background(field: RadianceField) -> None:
 
 
 def check_levels(field: RadianceField) -> None:
-    """Each level is a field, coarsest first; the last one is the field as it renders itself."""
+    """Check that each level is a field and that the last one renders as the field itself."""
     offered = tuple(getattr(field, "levels", None) or (field,))
     for number, level in enumerate(offered):
         require(
@@ -112,8 +112,8 @@ def check_levels(field: RadianceField) -> None:
 
 
 def seen(field: RadianceField, rays: Rays, of: str) -> Tensor:
-    """Colour, distance and opacity as five channels (*r 5)."""
-    with telling(f"render of {of} by {type(field).__name__}"), torch.no_grad():
+    """Return rendered colour, distance and opacity as five channels (*r 5)."""
+    with calling(f"render of {of} by {type(field).__name__}"), torch.no_grad():
         rendering: Rendering = render(field, rays, BACKGROUND)
     channels = [rendering.rgb, rendering.distance[..., None], rendering.opacity[..., None]]
     return torch.cat(channels, dim=-1)

@@ -1,4 +1,4 @@
-"""What a backend under test is shown: a tiny closed-form scene, and rays and points of every awkward kind."""
+"""Inputs of the contract: views of a tiny closed-form scene, and rays and points of every awkward kind."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ SIDE = max(BOUNDS.size)  # metres
 
 @cache
 def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
-    """A toy from six sides with exact depth, as an object without background or, as a sensor sees it, before white."""
+    """Return a toy from six sides with exact depth: with alpha or, as a sensor sees it, before white without."""
     seen = seen_from(demo_object(), CAMERA, orbit(3.5, 6))
     return tuple(v if coverage else replace(v, frame=replace(v.frame, alpha=None)) for v in seen)
 
 
 @cache
 def rgb_views() -> tuple[View, ...]:
-    """The same before white, without depth."""
+    """Return the toy from six sides before white, without depth and alpha."""
     return tuple(replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views(coverage=False))
 
 
 def camera_rays(T_world_camera: SE3) -> Rays:
-    """Rays through all pixels; differentiable in the pose, and in its precision."""
+    """Return rays through all pixels, in the precision of the pose and differentiable in it."""
     pixels = CAMERA.unproject(CAMERA.pixel_centres()).reshape(-1, 3).to(T_world_camera.translation)
     directions = T_world_camera.rotate(torch.nn.functional.normalize(pixels, dim=-1))
     return BOUNDS.rays(T_world_camera.translation.expand_as(directions), directions)
 
 
 def points(count: int, seed: int = 0) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Random positions within the box, and random unit directions."""
+    """Return random positions within the box, and random unit directions."""
     generator = torch.Generator().manual_seed(seed)
     lower, size = torch.tensor(BOUNDS.lower), torch.tensor(BOUNDS.size)
     return lower + size * torch.rand((count, 3), generator=generator), _directions(count, generator)
 
 
 def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
-    """Positions at which careless fields index out of range or overflow."""
+    """Return positions at which careless fields index out of range or overflow."""
     lower, upper = torch.tensor(BOUNDS.lower), torch.tensor(BOUNDS.upper)
     share = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     middle, corners = (lower + upper) / 2, lower + share * (upper - lower)
@@ -64,7 +64,7 @@ def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
 
 
 def awkward_rays() -> dict[str, Rays]:
-    """Rays of kinds that a sampler meets in localization."""
+    """Return rays of the kinds that occur in localization."""
     middle = (torch.tensor(BOUNDS.lower) + torch.tensor(BOUNDS.upper)) / 2
     inside, away = points(24)
     outside = middle - 2 * SIDE * away
@@ -80,7 +80,7 @@ def awkward_rays() -> dict[str, Rays]:
 
 
 def picked(rays: Rays, index: Tensor) -> Rays:
-    """Rays by their number, in the shape of ``index``."""
+    """Return the rays with the numbers ``index``, in its shape."""
     return Rays(rays.origins[index], rays.directions[index], rays.near[index], rays.far[index])
 
 

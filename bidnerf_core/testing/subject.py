@@ -1,4 +1,4 @@
-"""What is under test: a backend, its config, and fields that are built and trained with them."""
+"""The subject of the contract's tests: a backend, its config, and fields that are built and trained with them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from bidnerf_core.field import RadianceField, levels
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.testing import recipes
-from bidnerf_core.testing.faults import query, require, telling
+from bidnerf_core.testing.faults import calling, query, require
 from bidnerf_core.testing.scene import BOUNDS, points, rgbd_views
 
 STEPS = 40
-"""Length of a training where the test gives no ``config``."""
+"""Training steps where the test sets no ``config``."""
 
 
 class Subject:
-    """Says which backend, and makes fields of it."""
+    """Selects the backend, and builds and trains its fields."""
 
     backend: ClassVar[Any] = None
     name: ClassVar[str | None] = None
@@ -44,21 +44,21 @@ class Subject:
         return dataclasses.replace(self._backend().config_type(), steps=STEPS)
 
     def _reread(self, config: Any) -> Any:
-        """The config as a map on disk gives it back."""
-        with telling(f"{type(config).__name__} to JSON and back"):
+        """Return the config as it is read back from a map on disk."""
+        with calling(f"{type(config).__name__} to JSON and back"):
             text = json.dumps(to_plain(config, "config"), allow_nan=False)
             return from_plain(self._backend().config_type, json.loads(text), "config")
 
     def _build(self, config: Any = None) -> Any:
-        with telling(f"{called(self._backend())}.build"):
+        with calling(f"{called(self._backend())}.build"):
             return self._backend().build(self._config() if config is None else config, BOUNDS)
 
     def _trained(self) -> Any:
-        """A field after training on RGB-D views, frozen as a loaded map's; made once for each class of tests."""
+        """Return a field that was trained on RGB-D views and is frozen like that of a loaded map; one for each test class."""
         kept = type(self).__dict__.get("_kept")
         if kept is None:
             kept = self._build()
-            with telling(f"{called(self._backend())}.train"):
+            with calling(f"{called(self._backend())}.train"):
                 self._backend().train(kept, rgbd_views(), self._config(), recipes.Recorder())
             type(self)._kept = frozen(kept)  # type: ignore[attr-defined]
         return type(self).__dict__["_kept"]
@@ -68,7 +68,7 @@ class Subject:
         yield self._trained()
 
     def _each(self, check: Callable[[RadianceField], None]) -> None:
-        """At all levels, untrained and trained."""
+        """Run ``check`` on all levels of an untrained and of a trained field."""
         for field in self._fields():
             for level in levels(field):
                 check(level)
@@ -79,20 +79,20 @@ def frozen(field: Any) -> Any:
 
 
 def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
-    """A copy in float64 where the field has one, and its dtype; else the field itself."""
+    """Return a copy in float64 where the field supports it, else the field itself, and the dtype."""
     try:
         doubled = copy.deepcopy(field)
         _double(doubled)
         positions, directions = (x.double() for x in points(2))
         if query(doubled, positions, directions, "points").density.dtype == torch.float64:
             return doubled, torch.float64
-    except Exception:  # told by the test of dtypes
+    except Exception:  # reported by the test of dtypes
         pass
     return field, torch.float32
 
 
 def _double(field: Any) -> None:
-    """In place; a level that is no module moves the modules that it holds."""
+    """Convert a field to float64 in place; of a level that is no module, the modules that it holds."""
     if isinstance(field, nn.Module):
         field.double()
     else:

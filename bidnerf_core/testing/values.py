@@ -1,4 +1,4 @@
-"""Laws of ``RadianceField.query``: shapes, ranges, and that an answer depends on nothing but the question."""
+"""Checks of ``RadianceField.query``: shapes, ranges, and values that depend on the query alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ THREADS, ROUNDS = 4, 8
 
 
 def check_shapes(field: RadianceField) -> None:
-    """Any leading axes, also no points at all; the same values however the points are arranged."""
+    """Check any leading axes, also without any points, and that values do not depend on how the points are arranged."""
     positions, directions = points(7)
     flat = stacked(query(field, positions, directions, "7 points"))
     for shape in SHAPES:
@@ -31,7 +31,7 @@ def check_shapes(field: RadianceField) -> None:
 
 
 def check_ranges(field: RadianceField) -> None:
-    """Finite everywhere; density >= 0; rgb in [0, 1]."""
+    """Check that values are finite everywhere, density >= 0 and rgb in [0, 1]."""
     for of, positions in awkward_points().items():
         directions = points(len(positions), seed=1)[1]
         values = query(field, positions, directions, of)
@@ -52,7 +52,7 @@ def check_ranges(field: RadianceField) -> None:
 
 
 def check_precision(field: RadianceField, doubled: RadianceField) -> None:
-    """``field`` moved to float64 computes in it, and computes the same. ``doubled`` is the moved copy."""
+    """Check that ``doubled``, a copy of ``field`` in float64, computes in that precision and to the same values."""
     positions, directions = points(64)
     expected = query(field, positions, directions, "points in float32")
     found = query(doubled, positions.double(), directions.double(), "points in float64, after .double()")
@@ -74,7 +74,7 @@ def check_precision(field: RadianceField, doubled: RadianceField) -> None:
 
 
 def check_threads(field: RadianceField) -> None:
-    """Several threads that ask at once are told what one is told."""
+    """Check that concurrent queries give the values of a single one."""
     parts = [points(200 + 31 * i, seed=i) for i in range(THREADS)]
     alone = [stacked(query(field, *part, "points")) for part in parts]
 
@@ -92,12 +92,12 @@ def check_threads(field: RadianceField) -> None:
 
 
 def stacked(values: FieldValues) -> Tensor:
-    """Density and colour as four channels (*p 4)."""
+    """Return density and colour as four channels (*p 4)."""
     return torch.cat([values.density[..., None], values.rgb], dim=-1).detach()
 
 
 def close(found: Tensor, expected: Tensor, tolerance: float = 1e-4) -> bool:
-    """Equal to rounding, relative to the largest value of each channel."""
+    """Return whether values are equal to rounding, relative to the largest value of each channel."""
     if expected.numel() == 0:
         return found.shape == expected.shape
     scale = expected.abs().reshape(-1, expected.shape[-1]).amax(0).clamp(min=1e-6)

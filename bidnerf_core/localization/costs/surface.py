@@ -168,7 +168,7 @@ class SurfaceCost:
         surface, points = self.surface, self.cloud.points
         rotation, translation = T.rotation.to(points), T.translation.to(points)
         world = points @ rotation.mT + translation[:, None]
-        index = surface.touch(world)
+        index = surface.nearest(world)
         offset = world - surface.surfels.positions[index]
         normal = surface.surfels.normals[index]
         across = (offset * normal).sum(-1)

@@ -1,4 +1,4 @@
-"""Reading a checkpoint. Its architecture is read off the weights: the config file beside it may say something else."""
+"""Reading of checkpoints. The architecture is that of the weights, since the config file beside them may differ."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class Checkpoint:
 
 
 def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
-    """The networks in ``path``; nothing that it holds is run. ``octaves`` is the one choice that no weight shows.
+    """Return the networks in ``path``, without running any code in it. ``octaves`` is the only choice that no weight shows.
 
     Raises ``InputError``, in one line, where there is no such file, it holds code or no checkpoint of nerf-pytorch, the
-    fine network is missing, or the architecture is another.
+    fine network is missing, or the architecture is not known.
     """
     found = _loaded(path)
     if not isinstance(found, dict) or not isinstance(found.get(NETWORKS["coarse"]), dict):
@@ -52,9 +52,7 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
 def _loaded(path: Path) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file, expected a checkpoint of nerf-pytorch")
-    path.open(
-        "rb"
-    ).close()  # what keeps it from being read is told as it is; all later errors are the content's
+    path.open("rb").close()  # errors of reading the file pass as they are; all later ones are of its content
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # each kind of damage has an exception of its own
@@ -69,15 +67,19 @@ def _loaded(path: Path) -> Any:
 
 
 def _architecture(tensors: dict[str, Any], octaves: bool, where: str) -> NetworkConfig:
-    """What the shapes tell; and a network of that kind must have these tensors and no others."""
+    """Return the architecture that the shapes show, after a check that a network of it has just these tensors."""
     shapes = {name: tuple(getattr(value, "shape", ())) for name, value in tensors.items()}
     width, seen = _sizes(shapes.get("layer1.weight"), where)
     inputs = [shapes.get(f"layers_xyz.{i}.weight", ()) for i in range(sum(map(_is_hidden, shapes)))]
     turned = shapes.get("layers_dir.0.weight", (0, width + 27))[-1] - width
-    network = NetworkConfig(
-        1 + len(inputs), width, tuple(i for i, shape in enumerate(inputs, 1) if shape[-1:] == (width + seen,)),
-        *_frequencies(seen, where), *_frequencies(turned, where), octaves, "fc_out.weight" not in shapes,
-    )  # fmt: skip
+    skips = tuple(i for i, shape in enumerate(inputs, 1) if shape[-1:] == (width + seen,))
+    frequencies = *_frequencies(seen, where), *_frequencies(turned, where)
+    try:
+        network = NetworkConfig(
+            1 + len(inputs), width, skips, *frequencies, octaves, "fc_out.weight" not in shapes
+        )
+    except InputError as error:
+        raise InputError(f"{where}: unknown architecture, {error}") from error
     _check(tensors, shapes, Network(network), where)
     return network
 
@@ -93,7 +95,7 @@ def _sizes(shape: tuple[int, ...] | None, where: str) -> tuple[int, int]:
 
 
 def _frequencies(width: int, where: str) -> tuple[int, bool]:
-    """How many frequencies give that many numbers, and whether the input itself is among them."""
+    """Return how many frequencies give ``width`` numbers, and whether the input itself is among them."""
     if width < 3 or width % 3:
         raise InputError(f"{where}: unknown architecture, {width} inputs where a multiple of 3 was expected")
     return width // 6, width // 3 % 2 == 1

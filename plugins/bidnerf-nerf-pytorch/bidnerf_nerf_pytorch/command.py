@@ -1,4 +1,4 @@
-"""``bidnerf-import-nerf-pytorch``: a checkpoint becomes a map."""
+"""``bidnerf-import-nerf-pytorch``: conversion of a checkpoint to a map."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def import_checkpoint(
     Args:
         checkpoint: file that nerf-pytorch wrote (checkpoint*.ckpt)
         out: folder for the map
-        near: distance along a ray before which nothing is, in the scene's unit
-        far: distance along a ray beyond which nothing is
+        near: distance along a ray before which there is nothing, in the scene's unit
+        far: distance along a ray beyond which there is nothing
         background: colour where a ray meets nothing
-        box: lower and upper corner of what is of interest; what networks say outside of it is not looked at
-        coarse_samples: places on a ray at which the coarse network is asked
-        fine_samples: how many more the fine network is asked at
+        box: lower and upper corner of the scene; nothing outside is rendered
+        coarse_samples: places on a ray at which the coarse network is evaluated
+        fine_samples: further places at which the fine network is evaluated
         octaves: whether frequencies double (nerf-pytorch's log_sampling), which no weight shows
         overwrite: replace the map in --out
     """
@@ -69,10 +69,10 @@ def import_checkpoint(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit status 0, 1 with one line on stderr where the input is bad, 2 for wrong usage."""
+    """Run the command; return 0, 1 with one line on stderr where the input is bad, or 2 for wrong usage."""
     try:
         tyro.cli(import_checkpoint, args=arguments, prog=NAME)
-    except SystemExit as stopped:  # the parser has said all
+    except SystemExit as stopped:  # the parser has printed its message
         return stopped.code if isinstance(stopped.code, int) else DONE
     except KeyboardInterrupt:
         return _failed("interrupted", INTERRUPTED)

@@ -10,19 +10,20 @@ from torch import Tensor, nn
 
 from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
 from bidnerf_core.sampling import Importance, Stratified
+from bidnerf_core.settings import Count
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 
 
 @dataclass(frozen=True)
 class FieldConfig(NetworkConfig):
-    """Architecture of both networks, and where on a ray they are asked."""
+    """Architecture of both networks, and the number of their samples."""
 
-    coarse_samples: int = 64  # a ray
-    fine_samples: int = 64  # how many more for the fine network, placed by the coarse one
+    coarse_samples: Count = 64  # a ray
+    fine_samples: Count = 64  # further samples of the fine network, placed by the coarse one
 
 
 class Level(nn.Module):
-    """One network, and where it is asked. Positions are those of the world that it was trained in: nothing is scaled."""
+    """A network and its sampler. Positions are in the world that it was trained in and are not scaled."""
 
     def __init__(self, config: NetworkConfig, sampler: RaySampler) -> None:
         super().__init__()
@@ -36,7 +37,7 @@ class Level(nn.Module):
 
 
 class NerfPytorchField(nn.Module):
-    """What the fine network says; ``levels`` are what the coarse one says, and this."""
+    """The field of the fine network; ``levels`` are that of the coarse network and this one."""
 
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
         super().__init__()

@@ -3,32 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from bidnerf_core.settings import Count, Range, Settings
+
 
 @dataclass(frozen=True)
-class NetworkConfig:
+class NetworkConfig(Settings):
     """Architecture of one network."""
 
-    layers: int = 4  # that positions go through
-    width: int = 128  # of each; the layer that looks at the direction has half of it
-    skips: tuple[int, ...] = ()  # how many layers go before each one that takes the position once more
-    position_frequencies: int = 10
+    layers: Count = 4  # before the density
+    width: Annotated[int, Range(2, 10**7)] = 128  # of each; the layer that takes the direction has half of it
+    skips: tuple[int, ...] = ()  # number of layers before each one that takes the position once more
+    position_frequencies: Annotated[int, Range(0, 64)] = 10
     position_input: bool = True  # feed the position itself in, beside its sines
-    direction_frequencies: int = 4
+    direction_frequencies: Annotated[int, Range(0, 64)] = 4
     direction_input: bool = True
     octaves: bool = True  # frequencies 1, 2, 4 ... 2^(n-1); otherwise n in equal steps between the same ends
     view_dependent: bool = True  # whether colour depends on the direction
 
 
 class Network(nn.Module):
-    """Positions (world) and unit directions to raw density and colour.
+    """Maps positions (world) and unit directions to raw density and colour.
 
-    As in its original, the first layer has no activation. Unlike there, density begins as thin fog: where a ReLU makes it
-    zero all over, no gradient brings it back.
+    As in the original, the first layer has no activation. Unlike there, density is initially a thin fog: where a ReLU makes
+    it zero everywhere, there would be no gradient to recover from that.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -50,7 +53,7 @@ class Network(nn.Module):
     def forward(
         self, positions: Float[Tensor, "p 3"], directions: Float[Tensor, "p 3"]
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
-        """Density and colour, both before their activation."""
+        """Return density and colour, both before their activation."""
         config = self.config
         position = encoded(positions, config.position_frequencies, config.position_input, config.octaves)
         hidden = self.layer1(position)
@@ -66,14 +69,14 @@ class Network(nn.Module):
 
 
 def encoded_width(frequencies: int, include_input: bool) -> int:
-    """How many numbers encode three."""
+    """Return how many numbers encode a point."""
     return 3 * (2 * frequencies + include_input)
 
 
 def encoded(
     points: Float[Tensor, "p 3"], frequencies: int, include_input: bool, octaves: bool
 ) -> Float[Tensor, "p f"]:
-    """``(p, sin f1 p, cos f1 p, sin f2 p, ...)`` as nerf-pytorch orders it: unlike in NeRF's eq. 4 there is no pi."""
+    """Return ``(p, sin f1 p, cos f1 p, sin f2 p, ...)`` as nerf-pytorch orders it: unlike in NeRF's eq. 4 there is no pi."""
     steps = torch.arange(frequencies, dtype=points.dtype, device=points.device)
     if octaves:
         factors = 2**steps

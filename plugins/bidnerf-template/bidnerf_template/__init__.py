@@ -1,4 +1,4 @@
-"""A grid of voxels with trilinear interpolation: the least that is a backend."""
+"""A minimal backend: a grid of voxels with trilinear interpolation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class TemplateConfig:
 
 
 class TemplateField(nn.Module):
-    """What is asked for colour and density. All that is saved is its ``state_dict``."""
+    """The radiance field. Its ``state_dict`` is all that is saved."""
 
     def __init__(self, config: TemplateConfig, bounds: SceneBounds) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class TemplateField(nn.Module):
         )  # density and rgb, before activation
 
     def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
-        """Density (* per metre) and rgb (* 3) at positions (* 3, metres, world) along unit directions (* 3)."""
+        """Return density (* per metre) and rgb (* 3) at positions (* 3, metres, world) along unit directions (* 3)."""
         lower, upper = (positions.new_tensor(corner) for corner in (self.bounds.lower, self.bounds.upper))
         places = (positions.reshape(1, -1, 1, 1, 3) - lower) / (upper - lower) * 2 - 1
         raw = functional.grid_sample(self.grid[None], places, padding_mode="border", align_corners=True)
@@ -55,7 +55,7 @@ class TemplateField(nn.Module):
 
 
 class TemplateBackend:
-    """What the entry point names."""
+    """The object that the entry point names."""
 
     summary = "a grid of voxels with trilinear interpolation"
     config_type = TemplateConfig

@@ -1,4 +1,4 @@
-"""All that is asked of a backend is in the contract. A small config keeps the tests fast."""
+"""The contract tests all that is required of a backend. A small config keeps it fast."""
 
 from __future__ import annotations
 

@@ -1,0 +1,21 @@
+"""What training recipes share: batches of rays, the loss, and the loop with its schedule, checkpoints and resumption."""
+
+from bidnerf_core.training.loop import StepOutcome, cosine, fit
+from bidnerf_core.training.loss import depth_term, supervised_loss
+from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
+from bidnerf_core.training.report import Progress, Report, Silent, TrainingState, TrainingStopped
+
+__all__ = [
+    "Progress",
+    "RayBank",
+    "Report",
+    "Silent",
+    "StepOutcome",
+    "TrainingBatch",
+    "TrainingState",
+    "TrainingStopped",
+    "cosine",
+    "depth_term",
+    "fit",
+    "supervised_loss",
+]

@@ -1,0 +1,95 @@
+"""The rays of training views, and the batches that are drawn from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Generator, Tensor
+
+from bidnerf_core.field import Rays, SceneBounds
+from bidnerf_core.frames import SPARSE, View
+from bidnerf_core.observations import Observations
+
+MEASURED_SHARE = 0.25
+"""Fraction of a batch's rays that are drawn from pixels with depth, where so few have any that hardly one would be drawn
+otherwise (in DS-NeRF: half)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingBatch:
+    """Rays of training views, what was measured along them, and the background that colours were composed over."""
+
+    rays: Rays  # world
+    observed: Observations  # of the same rays, in the world; all of them have a colour
+    background: Float[Tensor, "r 3"]
+
+    def __len__(self) -> int:
+        return len(self.observed)
+
+
+class RayBank:
+    """All pixels of the training views, from which batches are drawn.
+
+    Where an image has an alpha channel, each batch has its background replaced by random colours, so that a field cannot
+    explain the background by matter of one colour (as in the code of Mueller et al. 2022).
+    """
+
+    def __init__(self, views: Sequence[View], bounds: SceneBounds) -> None:
+        self.bounds = bounds
+        frames = [view.frame for view in views]
+        sizes = torch.tensor([frame.rgb.shape[0] * frame.rgb.shape[1] for frame in frames])
+        self.offsets = sizes.cumsum(0) - sizes
+        self.count = int(sizes.sum())
+        self.has_alpha = any(frame.alpha is not None for frame in frames)
+        self.has_depth = any(frame.has_depth for frame in frames)
+        self._rgb = torch.cat([frame.rgb.reshape(-1, 3) for frame in frames])
+        if self.has_alpha:
+            one = [torch.ones(f.rgb.shape[:2]) if f.alpha is None else f.alpha for f in frames]
+            self._alpha = torch.cat([a.reshape(-1) for a in one])
+        if self.has_depth:
+            zero = [torch.zeros(f.rgb.shape[:2]) if f.depth is None else f.depth for f in frames]
+            self._depth = torch.cat([d.reshape(-1) for d in zero])
+        self._few = self._few_measured()
+        self._rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
+        self._origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
+        kinds = list(dict.fromkeys(frame.intrinsics for frame in frames))
+        grids = [kind.unproject(kind.pixel_centres()).reshape(-1, 3) for kind in kinds]
+        starts = torch.tensor([0, *[len(grid) for grid in grids]]).cumsum(0)
+        self._camera_rays = torch.cat(grids)  # z = 1
+        self._camera_start = torch.stack([starts[kinds.index(frame.intrinsics)] for frame in frames])
+
+    def draw(self, count: int, generator: Generator) -> TrainingBatch:
+        """Return the rays of ``count`` pixels, drawn uniformly from all views; a fixed part of them from pixels with depth, where
+        only few have any.
+        """
+        index = torch.randint(self.count, (count,), generator=generator)
+        if len(self._few):
+            some = round(MEASURED_SHARE * count)
+            index[:some] = self._few[torch.randint(len(self._few), (some,), generator=generator)]
+        view = torch.searchsorted(self.offsets, index, right=True) - 1
+        ray = self._camera_rays[self._camera_start[view] + index - self.offsets[view]]
+        length = torch.linalg.vector_norm(ray, dim=-1)
+        directions = (self._rotation[view] @ (ray / length[:, None])[..., None])[..., 0]
+        distance = self._depth[index] * length if self.has_depth else torch.zeros(count)
+        rgb, background = self._coloured(index, generator)
+        origins, coloured = self._origin[view], torch.ones(count, dtype=torch.bool)
+        observed = Observations(origins, directions, rgb, distance, coloured)
+        return TrainingBatch(self.bounds.rays(origins, directions), observed, background)
+
+    def _few_measured(self) -> Int[Tensor, "m"]:
+        """Return the indices of the pixels with depth where it is sparse (structure from motion), and none otherwise."""
+        if not self.has_depth:
+            return torch.zeros(0, dtype=torch.long)
+        measured = (self._depth > 0).nonzero()[:, 0]
+        return measured if len(measured) < SPARSE * self.count else measured[:0]
+
+    def _coloured(self, index: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
+        """Return the pixels' colours and the background colours that they are composed over."""
+        usual = torch.tensor(self.bounds.background).expand(len(index), 3)
+        if not self.has_alpha:
+            return self._rgb[index], usual
+        background = torch.rand((len(index), 3), generator=generator)
+        return self._rgb[index] + (1 - self._alpha[index])[:, None] * (background - usual), background
