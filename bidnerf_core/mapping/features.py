@@ -52,7 +52,9 @@ class Sift:
     """SIFT (Lowe 2004) by OpenCV, with the root normalisation of Arandjelovic and Zisserman 2012."""
 
     count: int = 2000  # keypoints, at most: those of highest contrast
-    contrast: float = 0.01  # under which an extremum is no keypoint; OpenCV's default of 0.04 leaves few indoors
+    contrast: float = (
+        0.01  # under which an extremum is no keypoint; OpenCV's default of 0.04 leaves few indoors
+    )
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -63,13 +65,13 @@ class Sift:
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         # The precise upscaling maps index x to 2 x: without it all keypoints of the first octave are a quarter of a
         # pixel off. A detector object is not safe to share between threads, and costs nothing to make.
-        sift = cv2.SIFT_create(
+        sift = cv2.SIFT.create(
             nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True
         )
         found, descriptors = sift.detectAndCompute(_grey(rgb), None)
         if descriptors is None or not len(found):
             return Keypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros((0, 128), dtype=torch.uint8))
-        pixels = cv2.KeyPoint.convert(found).astype(np.float32) + FIRST_CENTRE
+        pixels = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32) + FIRST_CENTRE
         sizes = np.array([keypoint.size for keypoint in found], dtype=np.float32)
         root = root_normalized(torch.from_numpy(np.asarray(descriptors, dtype=np.float32)))
         return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantized(root))

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.frames import Frame
-from bidnerf_core.mapping.landmark_fusion import Observations
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
 
 EDGE = 0.05
@@ -44,9 +44,7 @@ def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, 
     return torch.where(flat, median, 0)
 
 
-def depth_noise(
-    sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]
-) -> float:
+def depth_noise(sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]) -> float:
     """Standard deviation of measured depth as a share of it, robustly, from points that were triangulated."""
     known = depth > 0
     if int(known.sum()) < ENOUGH:
@@ -56,8 +54,8 @@ def depth_noise(
 
 
 def placed(
-    observations: Observations, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
-) -> tuple[Observations, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    observations: TrackedKeypoints, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
+) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Weighted mean of the back-projected points of each track without those that disagree, and its covariance.
 
     ``depth`` is what was measured at each observation, 0 where nothing was; ``relative`` its noise as a share.

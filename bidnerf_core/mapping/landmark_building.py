@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.mapping.features import Features, Sift
 from bidnerf_core.mapping.keypoint_depth import depth_noise, measured_depth, placed
-from bidnerf_core.mapping.landmark_fusion import Observations, fused
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
+from bidnerf_core.mapping.pose_scatter import pose_scatter
 from bidnerf_core.mapping.tracks import PosedKeypoints, epipolar_matches, joined
 from bidnerf_core.mapping.triangulation import (
     Sightings,
@@ -33,6 +34,7 @@ from bidnerf_core.mapping.view_pairs import likely_pairs
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+SIFT = Sift()
 TOLERANCES = (10.0, 4.0, 2.0)
 """Pixels from the projection beyond which an observation leaves its track, round by round."""
 TWO_VIEWS = 1.5
@@ -45,7 +47,9 @@ class LandmarkConfig:
 
     neighbours: int = 8  # images that each image is matched with
     parallax: float = 2.0  # degrees between the rays, at least; with less, measured depth places a point
-    singles: bool = True  # whether keypoints of a single image become landmarks where their depth was measured
+    singles: bool = (
+        True  # whether keypoints of a single image become landmarks where their depth was measured
+    )
     most: int = 200_000  # landmarks; 168 bytes each with SIFT
 
     def __post_init__(self) -> None:
@@ -58,7 +62,7 @@ class LandmarkConfig:
 
 def build_landmarks(
     views: Sequence[View],
-    features: Features = Sift(),
+    features: Features = SIFT,
     config: LandmarkConfig = LandmarkConfig(),
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
@@ -74,9 +78,13 @@ def build_landmarks(
     counter = _Counter(progress, len(views) + len(pairs))
     images = counter.over(_mapped(lambda view: _detected(view, features), views))
     matches = counter.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
-    label = joined([(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)], [len(p.keypoints) for p in images])
-    observations = Observations(images, label, torch.arange(len(label)))
-    depth = torch.cat([measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)])
+    label = joined(
+        [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)], [len(p.keypoints) for p in images]
+    )
+    observations = TrackedKeypoints(images, label, torch.arange(len(label)))
+    depth = torch.cat(
+        [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
+    )
     found = _located(observations, depth, config)
     if not len(found):
         raise InputError(
@@ -93,13 +101,18 @@ def _detected(view: View, features: Features) -> PosedKeypoints:
     return PosedKeypoints(keypoints, rays, focal, view.T_ref_camera.to("cpu", torch.float64))
 
 
-def _located(observations: Observations, depth: Float[Tensor, "m"], config: LandmarkConfig) -> LandmarkMap:
+def _located(
+    observations: TrackedKeypoints, depth: Float[Tensor, "m"], config: LandmarkConfig
+) -> LandmarkMap:
     """Landmarks that are triangulated; then those placed by depth, of the keypoints that are left."""
     tracked = torch.bincount(observations.point)[observations.point] > 1
     kept, positions, covariance = _triangulated(observations[tracked], radians(config.parallax))
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
-    triangulated = fused(kept, positions, pixel_noise**2 * covariance, pixel_noise)
+    triangulated = replace(
+        fused(kept, positions, pixel_noise**2 * covariance, pixel_noise),
+        pose_covariance=pose_scatter(kept, positions, pixel_noise),
+    )
     relative = depth_noise(sightings, positions, depth[kept.number])
     left = torch.ones_like(tracked).index_fill_(0, kept.number, False)
     left &= tracked | config.singles
@@ -108,9 +121,9 @@ def _located(observations: Observations, depth: Float[Tensor, "m"], config: Land
 
 
 def _triangulated(
-    observations: Observations, least: float
-) -> tuple[Observations, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Observations that agree, the points they show, and the points' covariance for a noise of one pixel.
+    observations: TrackedKeypoints, least: float
+) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """TrackedKeypoints that agree, the points they show, and the points' covariance for a noise of one pixel.
 
     ``least`` is the parallax (radians) that a point needs.
     """
@@ -127,7 +140,7 @@ def _triangulated(
 
 
 def _believable(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """Observations that fit, of points that fit in at least two images."""
+    """TrackedKeypoints that fit, of points that fit in at least two images."""
     fit = fitting(sightings, points, tolerance)
     seen = observations_per_point(sightings[fit], len(points))
     pairs = seen[sightings.point] == 2

@@ -15,20 +15,20 @@ from bidnerf_core.mapping.triangulation import Sightings
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class TrackedKeypoints:
     """Keypoints and the points that they show; the keypoints of all images, image by image, have one numbering."""
 
     images: Sequence[PosedKeypoints]
     point: Int[Tensor, "m"]
     number: Int[Tensor, "m"]  # of the keypoint
 
-    def __getitem__(self, index: Tensor) -> Observations:
-        return Observations(self.images, self.point[index], self.number[index])
+    def __getitem__(self, index: Tensor) -> TrackedKeypoints:
+        return TrackedKeypoints(self.images, self.point[index], self.number[index])
 
-    def compacted(self) -> tuple[Observations, Int[Tensor, "n"]]:
+    def compacted(self) -> tuple[TrackedKeypoints, Int[Tensor, "n"]]:
         """Number the points that are left from 0; also returns their numbers of before."""
         found, point = self.point.unique(return_inverse=True)
-        return Observations(self.images, point, self.number), found
+        return TrackedKeypoints(self.images, point, self.number), found
 
     @property
     def count(self) -> int:
@@ -60,12 +60,15 @@ class Observations:
 
 
 def fused(
-    observations: Observations,
+    observations: TrackedKeypoints,
     positions: Float[Tensor, "n 3"],
     covariance: Float[Tensor, "n 3 3"],
     noise: float,
 ) -> LandmarkMap:
-    """Landmarks at ``positions`` (metres, world) with their covariance; every one of them has an observation."""
+    """Landmarks at ``positions`` (metres, world) with their covariance; every one of them has an observation.
+
+    Their images are taken to be where they are said to be.
+    """
     count, sightings = len(positions), observations.sightings
     away = sightings.centre - positions[sightings.point]
     towards = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
@@ -83,6 +86,7 @@ def fused(
         _mean(metres[:, None], sightings.point, count)[:, 0].float(),
         torch.bincount(sightings.point, minlength=count).int(),
         noise,
+        torch.zeros((6, 6), dtype=torch.float64),
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.mapping.features import Keypoints, squared_distances
@@ -21,6 +21,9 @@ RATIO_IN_BAND = 0.85
 """The same share, of the next best one near the epipolar line."""
 APART = 4.0
 """Pixels from which on two keypoints of an image are different ones: SIFT gives one for each dominant orientation."""
+
+ONE_PLACE = 1e-12
+"""Metres between cameras under which there are no epipolar lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,49 +52,44 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
     if not len(a.keypoints) or not len(b.keypoints):
         return Matches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
     distance = squared_distances(a.keypoints.descriptors, b.keypoints.descriptors)
-    banded = torch.where(_off_line(a, b) <= BAND, distance, torch.inf)
+    banded = distance.masked_fill(~_on_line(a, b), torch.inf)
     best, partner = banded.min(dim=1)
     mutual = banded.argmin(dim=0)[partner] == torch.arange(len(partner))
     rows = (mutual & best.isfinite()).nonzero()[:, 0]
     best, partner = best[rows], partner[rows]
-    next_best = _next_best(distance[rows], partner, b.keypoints.pixels)
-    next_in_band = _next_best(banded[rows], partner, b.keypoints.pixels)
+    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < APART
+    next_best = distance[rows].masked_fill(near, torch.inf).amin(dim=1)
+    next_in_band = banded[rows].masked_fill(near, torch.inf).amin(dim=1)
     good = (best < RATIO_IN_BAND**2 * next_in_band) & (best < RATIO**2 * next_best)
     ambiguity = (best / next_best.clamp(min=1)).sqrt()
     return Matches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
 
 
-def _next_best(
-    distance: Float[Tensor, "r n"], partner: Int[Tensor, "r"], pixels: Float[Tensor, "n 2"]
-) -> Float[Tensor, "r"]:
-    """Least squared distance to a keypoint elsewhere in the image than the partner."""
-    near = torch.cdist(pixels[partner], pixels) < APART
-    return torch.where(near, torch.inf, distance).amin(dim=1)
+def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
+    """Whether a keypoint of ``b`` lies within ``BAND`` of the epipolar half-line of one of ``a``.
 
-
-def _off_line(a: PosedKeypoints, b: PosedKeypoints) -> Float[Tensor, "n m"]:
-    """Pixels between each keypoint of ``b`` and the epipolar half-line of each of ``a``.
-
-    It begins at the image of the infinitely far point of the ray. Between cameras at one place there is nothing but that
-    beginning.
+    The half-line begins at the image of the infinitely far point of the ray; between cameras at one place it is that
+    beginning and nothing else.
     """
     T_b_a = b.T_world_camera.inverse() @ a.T_world_camera
     rays, base = T_b_a.rotate(a.rays), T_b_a.translation
-    z = rays[:, 2:].abs().clamp(min=1e-9)
-    start = rays[:, :2] / z * rays[:, 2:].sign()
-    step = (base[:2] - base[2] * start) * rays[:, 2:].sign()  # where the image moves as the point comes nearer
+    front = rays[:, 2:].sign()
+    start = rays[:, :2] / rays[:, 2:].abs().clamp(min=1e-9) * front
+    step = (base[:2] - base[2] * start) * front  # where the image moves as the point comes nearer
     size = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
     forward = step / size.clamp(min=1e-300)
     sideways = torch.stack([-forward[:, 1], forward[:, 0]], dim=-1)
-    along, across = (
-        (axis @ b.rays[:, :2].mT - (axis * start).sum(-1, keepdim=True)) for axis in (forward, sideways)
+    seen = torch.cat([b.rays[:, :2], torch.ones_like(b.rays[:, :1])], dim=-1).float().mT
+    band = BAND / b.focal
+    if float(torch.linalg.vector_norm(base)) < ONE_PLACE:
+        return torch.cdist(start.float(), seen[:2].mT) <= band
+    across, along = (
+        torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen
+        for axis in (sideways, forward)
     )
     # A ray that points behind the other camera has no beginning in its image; all of the line stays.
-    beyond = (along < 0) & (rays[:, 2:] > 0)
-    away = torch.where(beyond, torch.hypot(along, across), across.abs())
-    if float(torch.linalg.vector_norm(base)) < 1e-12:
-        away = torch.cdist(start, b.rays[:, :2])
-    return away * b.focal
+    least = torch.where(front > 0, -band, -torch.inf).float()
+    return (across.abs_() <= band) & (along >= least)
 
 
 def joined(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
@@ -101,7 +99,9 @@ def joined(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) ->
     single wrong match would otherwise spoil two good tracks. ``sizes`` are the numbers of the keypoints of the images.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
-    ends = np.concatenate([np.zeros((0, 2), np.int64)] + [m.pairs.numpy() + first[[i, j]] for i, j, m in matches])
+    ends = np.concatenate(
+        [np.zeros((0, 2), np.int64)] + [m.pairs.numpy() + first[[i, j]] for i, j, m in matches]
+    )
     ambiguity = np.concatenate([np.zeros(0)] + [m.ambiguity.numpy() for _, _, m in matches])
     parent = list(range(first[-1]))
     images = [{image} for image, size in enumerate(sizes) for _ in range(size)]

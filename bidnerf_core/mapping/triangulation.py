@@ -81,7 +81,9 @@ def _normal_equations(
     weight = front / (1 + residual.square().sum(-1) / scale**2)
     x, y, zero = local[:, 0] / z, local[:, 1] / z, torch.zeros_like(z)
     inverse = sightings.focal / z
-    rows = torch.stack([inverse, zero, -x * inverse, zero, inverse, -y * inverse], dim=-1).unflatten(-1, (2, 3))
+    rows = torch.stack([inverse, zero, -x * inverse, zero, inverse, -y * inverse], dim=-1).unflatten(
+        -1, (2, 3)
+    )
     jacobian = rows @ sightings.rotation
     weighted = jacobian.mT * weight[:, None, None]
     matrix = _summed(weighted @ jacobian, sightings.point, len(points))

@@ -14,6 +14,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping.features import Features, Keypoints
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.resection import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 
@@ -37,7 +38,9 @@ def query_images(views: Sequence[View], features: Features) -> list[QueryImage]:
     """Detect the keypoints of ``views``, whose poses are known in any common frame; the last one is the rig's frame."""
     T_rig_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
     return [
-        query_image(view.frame, (T_rig_ref @ view.T_ref_camera.to("cpu", torch.float64)).normalized(), features)
+        query_image(
+            view.frame, (T_rig_ref @ view.T_ref_camera.to("cpu", torch.float64)).normalized(), features
+        )
         for view in views
     ]
 
@@ -62,7 +65,9 @@ class Correspondences:
         return len(self.view)
 
     def __getitem__(self, index: Tensor) -> Correspondences:
-        return Correspondences(self.view[index], self.keypoint[index], self.landmark[index], self.ambiguity[index])
+        return Correspondences(
+            self.view[index], self.keypoint[index], self.landmark[index], self.ambiguity[index]
+        )
 
     @staticmethod
     def cat(parts: Sequence[Correspondences]) -> Correspondences:
@@ -70,46 +75,14 @@ class Correspondences:
         return Correspondences(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """Correspondences with the numbers that a pose is computed from. Float64."""
-
-    points: Float[Tensor, "m 3"]  # metres, world
-    deviations: Float[Tensor, "m 2"]  # metres, of the points, across and along ``directions``
-    directions: Float[Tensor, "m 3"]  # unit, world
-    image: Float[Tensor, "m 2"]  # observed, on the plane z = 1 of the camera
-    focal: Float[Tensor, "m"]  # pixels
-    depth: Float[Tensor, "m"]  # metres, 0 where none was measured
-    rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
-    translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def __getitem__(self, index: Tensor) -> Measured:
-        return Measured(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
-        """The points in the frame of the camera that shows them."""
-        rig = T_world_rig.inverse().apply(self.points)
-        return (self.rotation @ rig[..., None])[..., 0] + self.translation
-
-    def residuals(self, T_world_rig: SE3) -> Float[Tensor, "m 2"]:
-        """Projection less observation, pixels; infinite for points behind the camera."""
-        local = self.in_camera(T_world_rig)
-        z = local[:, 2:]
-        off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
-        return torch.where(z > 0, off, torch.inf)
-
-
-def measured(
+def observed_points(
     images: Sequence[QueryImage], landmarks: LandmarkMap, found: Correspondences
-) -> Measured:
+) -> ObservedPoints:
     """Look up what the correspondences refer to."""
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
     number = first[found.view] + found.keypoint
     T_camera_rig = SE3.stack([image.T_rig_camera.inverse() for image in images])
-    return Measured(
+    return ObservedPoints(
         landmarks.positions[found.landmark].double(),
         landmarks.deviations[found.landmark].double(),
         landmarks.directions[found.landmark].double(),

@@ -16,17 +16,18 @@ from bidnerf_core.frames import View
 from bidnerf_core.localization.search.correspondences import (
     Correspondences,
     QueryImage,
-    measured,
+    observed_points,
     query_images,
 )
 from bidnerf_core.localization.search.guided import guided_matches
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
-from bidnerf_core.localization.search.reprojection import ReprojectionFit, fit
 from bidnerf_core.mapping.features import Features, Sift, paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.resection import ObservedPoints, ReprojectionFit, fit
 from bidnerf_core.se3 import SE3
 
+SIFT = Sift()
 NEIGHBOURS = 4
 """Landmarks that are looked up for each keypoint: the next best one elsewhere tells how ambiguous the best one is."""
 SAME_PLACE = 2.0
@@ -54,18 +55,25 @@ class LandmarkPose:
     """A pose found by landmarks, and what speaks for it."""
 
     T_world_camera: SE3  # of the last view, float64
-    covariance: Float[Tensor, "6 6"]  # of the right update, translation (metres) first; random errors only
+    covariance: Float[
+        Tensor, "6 6"
+    ]  # of the right update, translation (metres) first; of keypoints and landmarks
+    map_covariance: Float[Tensor, "6 6"]  # the same, with how the poses of the map's own images scatter
     noise: float  # pixels: standard deviation of the reprojection errors along each axis, robustly
     correspondences: Correspondences  # those that the pose was refined on
     residuals: Float[Tensor, "m 2"]  # pixels, of the correspondences
     pixels: Float[Tensor, "m 2"]  # where the correspondences were observed, as the image has them
     matches: int  # by descriptors alone, before there was a pose
     agreeing: int  # of those, how many agree with the pose
-    log10_nfa: float  # logarithm of the number of as good agreements expected by chance (Moisan and Stival 2004)
+    log10_nfa: (
+        float  # logarithm of the number of as good agreements expected by chance (Moisan and Stival 2004)
+    )
     chance: float  # correspondences that guided matching would find at a wrong pose
     spread: float  # 0 to 1: share of the image that the correspondences lie in
     focal_factor: float  # true focal length as a multiple of the given one; 1 where it was not sought
-    depth_scale: float | None  # by which measured depth has to be multiplied; none where too little was measured
+    depth_scale: (
+        float | None
+    )  # by which measured depth has to be multiplied; none where too little was measured
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
     @property
@@ -77,7 +85,7 @@ class LandmarkPose:
 def propose(
     matcher: LandmarkMatcher,
     views: Sequence[View],
-    features: Features = Sift(),
+    features: Features = SIFT,
     seed: int = 0,
     unknown_focal: bool = False,
 ) -> LandmarkPose | None:
@@ -120,7 +128,7 @@ def unguided_matches(images: Sequence[QueryImage], matcher: LandmarkMatcher) -> 
         parts.append(part)
     found = Correspondences.cat(parts)
     found = found[found.ambiguity.argsort(stable=True)]
-    return found[: max(LEAST_MATCHES, int((found.ambiguity <= AMBIGUITY).sum()))]
+    return found[torch.arange(len(found)) < max(LEAST_MATCHES, int((found.ambiguity <= AMBIGUITY).sum()))]
 
 
 def _ambiguity(
@@ -145,7 +153,7 @@ def _first_pose(
     seed: int,
     unknown_focal: bool,
 ) -> Hypothesis | None:
-    data = measured(images, landmarks, matches)
+    data = observed_points(images, landmarks, matches)
     threshold = _pixels(images, THRESHOLD)
     if unknown_focal:
         found = focal_consensus(data, threshold, seed)
@@ -174,21 +182,29 @@ def _refined(
     inliers = matches[found.inliers]
     most = _usual_distance(images, landmarks, inliers)
     best = fit(
-        measured(images, landmarks, inliers), found.T_world_rig, threshold / 2, unknown_focal, found.focal_factor
+        observed_points(images, landmarks, inliers),
+        found.T_world_rig,
+        threshold / 2,
+        unknown_focal,
+        found.focal_factor,
     )
     correspondences = inliers
     for radius in (*RADII[:-1], *[RADII[-1]] * ROUNDS):
         guided = guided_matches(
             images, landmarks, best.T_world_rig, 1.5 * radius * threshold, most, best.focal_factor
         )
-        data = measured(images, landmarks, guided)
+        data = observed_points(images, landmarks, guided)
         guided = guided[_depth_agrees(data, best.T_world_rig)]
         if len(guided) < LEAST_INLIERS:
             break
         unchanged = _same(guided, correspondences)
         correspondences = guided
         best = fit(
-            measured(images, landmarks, guided), best.T_world_rig, best.noise, unknown_focal, best.focal_factor
+            observed_points(images, landmarks, guided),
+            best.T_world_rig,
+            best.noise,
+            unknown_focal,
+            best.focal_factor,
         )
         if unchanged:
             break
@@ -200,9 +216,7 @@ def _same(a: Correspondences, b: Correspondences) -> bool:
     return len(a) == len(b) and torch.equal(a.landmark, b.landmark) and torch.equal(a.keypoint, b.keypoint)
 
 
-def _usual_distance(
-    images: Sequence[QueryImage], landmarks: LandmarkMap, inliers: Correspondences
-) -> float:
+def _usual_distance(images: Sequence[QueryImage], landmarks: LandmarkMap, inliers: Correspondences) -> float:
     """Squared distance of descriptors up to which guided matches are taken."""
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
     descriptors = torch.cat([image.keypoints.descriptors for image in images])
@@ -211,7 +225,7 @@ def _usual_distance(
     return LOOSE**2 * float(distance.quantile(0.9))
 
 
-def _depth_agrees(data, T_world_rig: SE3) -> Bool[Tensor, "m"]:
+def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
     """Correspondences at whose keypoint no depth was measured, or one that fits the landmark."""
     z = data.in_camera(T_world_rig)[:, 2]
     known = data.depth > 0
@@ -241,20 +255,25 @@ def _described(
     chance: float,
     seconds: dict[str, float],
 ) -> LandmarkPose:
-    data = measured(images, landmarks, correspondences)
+    data = observed_points(images, landmarks, correspondences)
     threshold = _pixels(images, THRESHOLD)
-    off = _scaled(measured(images, landmarks, matches), best.focal_factor).residuals(best.T_world_rig)
+    off = (
+        observed_points(images, landmarks, matches).with_focal(best.focal_factor).residuals(best.T_world_rig)
+    )
     agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= threshold).sum())
     known = data.depth > 0
     ratio = data.in_camera(best.T_world_rig)[known, 2] / data.depth[known]
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
-    pixels = torch.cat([i.keypoints.pixels for i in images])[first[correspondences.view] + correspondences.keypoint]
+    pixels = torch.cat([i.keypoints.pixels for i in images])[
+        first[correspondences.view] + correspondences.keypoint
+    ]
     return LandmarkPose(
         T_world_camera=best.T_world_rig,
         covariance=best.covariance[:6, :6],
+        map_covariance=best.covariance[:6, :6] + landmarks.pose_covariance,
         noise=best.noise,
         correspondences=correspondences,
-        residuals=_scaled(data, best.focal_factor).residuals(best.T_world_rig),
+        residuals=data.with_focal(best.focal_factor).residuals(best.T_world_rig),
         pixels=pixels,
         matches=len(matches),
         agreeing=agreeing,
@@ -302,13 +321,6 @@ def _spread(images: Sequence[QueryImage], found: Correspondences, pixels: Float[
         cell = (pixels[found.view == number] / size * 8).long().clamp(0, 7)
         shares.append(len(cell.unique(dim=0)) / 64)
     return sum(shares) / len(shares)
-
-
-def _scaled(data, factor: float):
-    """Data of a camera with another focal length: pixels stay, rays change."""
-    from dataclasses import replace
-
-    return replace(data, image=data.image / factor, focal=data.focal * factor)
 
 
 class _Clock:

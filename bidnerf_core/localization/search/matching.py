@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -81,11 +82,13 @@ class _Cells:
         index = torch.zeros(distances.shape, dtype=torch.long)
         values = descriptors.float()
         bounds = torch.searchsorted(cell, torch.arange(len(self._centres) + 1)).tolist()
-        for number, (begin, end) in enumerate(zip(bounds, bounds[1:], strict=False)):
+        for number, (begin, end) in enumerate(pairwise(bounds)):
             first, last = self._last[number - 1] if number else 0, self._last[number]
             if begin == end or first == last:
                 continue
-            found = _smallest(squared_distances(values[query[begin:end]], self._descriptors[first:last]), count)
+            found = _smallest(
+                squared_distances(values[query[begin:end]], self._descriptors[first:last]), count
+            )
             width = found[0].shape[1]
             distances[order[begin:end], :width] = found[0]
             index[order[begin:end], :width] = found[1] + first
@@ -93,7 +96,9 @@ class _Cells:
         return best.values, self._order[index.view(queries, -1).gather(1, best.indices)]
 
 
-def _k_means(descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator) -> Float[Tensor, "c d"]:
+def _k_means(
+    descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
+) -> Float[Tensor, "c d"]:
     """Centres of cells (Lloyd 1982), from a sample; a centre that loses all of its members stays where it is."""
     sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLE * count]
     values = descriptors[sample].float()
@@ -116,7 +121,9 @@ def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor
     if columns <= 4 * BLOCK * count:
         found = distances.topk(min(count, columns), dim=1, largest=False)
         return found.values, found.indices
-    blocks = torch.nn.functional.pad(distances, (0, -columns % BLOCK), value=torch.inf).unflatten(1, (-1, BLOCK))
+    blocks = torch.nn.functional.pad(distances, (0, -columns % BLOCK), value=torch.inf).unflatten(
+        1, (-1, BLOCK)
+    )
     block = blocks.amin(-1).topk(count, dim=1, largest=False).indices
     candidates = blocks.gather(1, block[..., None].expand(-1, -1, BLOCK)).flatten(1)
     best = candidates.topk(count, dim=1, largest=False)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.localization.search.correspondences import Measured
+from bidnerf_core.mapping.resection import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 SUCCESS = 0.9999
@@ -38,7 +38,9 @@ class Hypothesis:
     focal_factor: float = 1.0
 
 
-def sample_consensus(data: Measured, view: Int[Tensor, "m"], threshold: float, seed: int) -> Hypothesis | None:
+def sample_consensus(
+    data: ObservedPoints, view: Int[Tensor, "m"], threshold: float, seed: int
+) -> Hypothesis | None:
     """The pose that the most correspondences agree with, within ``threshold`` pixels; they are in the order of trust.
 
     A rig also tries each of its cameras alone: the generalized solver is unstable where the cameras are all but in one
@@ -52,7 +54,7 @@ def sample_consensus(data: Measured, view: Int[Tensor, "m"], threshold: float, s
     return max(hypotheses, key=lambda h: int(h.inliers.sum()), default=None)
 
 
-def _judged(data: Measured, T: SE3, threshold: float, draws: int) -> Hypothesis:
+def _judged(data: ObservedPoints, T: SE3, threshold: float, draws: int) -> Hypothesis:
     within = torch.linalg.vector_norm(data.residuals(T), dim=-1) <= threshold
     return Hypothesis(T, within, draws)
 
@@ -69,7 +71,7 @@ def _camera(focal: float) -> dict[str, object]:
     return {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
 
 
-def _single(data: Measured, index: Tensor, threshold: float, seed: int) -> tuple[SE3, int] | None:
+def _single(data: ObservedPoints, index: Tensor, threshold: float, seed: int) -> tuple[SE3, int] | None:
     if len(index) < 4:
         return None
     part, focal = data[index], float(data.focal[index[0]])
@@ -81,7 +83,9 @@ def _single(data: Measured, index: Tensor, threshold: float, seed: int) -> tuple
     return (T.inverse() @ T_camera_rig, int(info["iterations"])) if _sound(T) else None
 
 
-def _generalized(data: Measured, parts: list[Tensor], threshold: float, seed: int) -> tuple[SE3, int] | None:
+def _generalized(
+    data: ObservedPoints, parts: list[Tensor], threshold: float, seed: int
+) -> tuple[SE3, int] | None:
     pixels = [(data.image[index] * data.focal[index, None]).numpy() for index in parts]
     points = [data.points[index].numpy() for index in parts]
     cameras = [_camera(float(data.focal[index[0]])) for index in parts]
@@ -94,7 +98,7 @@ def _generalized(data: Measured, parts: list[Tensor], threshold: float, seed: in
     return (T_rig_world.inverse(), int(info["iterations"])) if _sound(T_rig_world) else None
 
 
-def focal_consensus(data: Measured, threshold: float, seed: int) -> Hypothesis | None:
+def focal_consensus(data: ObservedPoints, threshold: float, seed: int) -> Hypothesis | None:
     """The pose and focal length of one camera that the most correspondences agree with; those are in the order of trust.
 
     Its focal length is sought within ``FOCAL_RANGE`` of the given one; the principal point is known.

@@ -1,14 +1,13 @@
-"""The pose that fits correspondences best: robust Levenberg-Marquardt on reprojection errors in pixels."""
+"""Resection: the pose of a camera or a rig from points that it sees, by robust Levenberg-Marquardt in pixels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.localization.search.correspondences import Measured
 from bidnerf_core.se3 import SE3, skew
 
 STEPS = 20
@@ -24,17 +23,55 @@ SCALE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
+class ObservedPoints:
+    """Points of the world and where the cameras of a rig saw them. Float64."""
+
+    points: Float[Tensor, "m 3"]  # metres, world
+    deviations: Float[Tensor, "m 2"]  # metres, of the points, across and along ``directions``
+    directions: Float[Tensor, "m 3"]  # unit, world
+    image: Float[Tensor, "m 2"]  # observed, on the plane z = 1 of the camera
+    focal: Float[Tensor, "m"]  # pixels
+    depth: Float[Tensor, "m"]  # metres, 0 where none was measured
+    rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
+    translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: Tensor) -> ObservedPoints:
+        return ObservedPoints(*(getattr(self, name)[index] for name in (f.name for f in fields(self))))
+
+    def with_focal(self, factor: float) -> ObservedPoints:
+        """The same pixels in cameras whose focal lengths are ``factor`` times those that were given."""
+        return replace(self, image=self.image / factor, focal=self.focal * factor)
+
+    def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
+        """The points in the frame of the camera that shows them."""
+        rig = T_world_rig.inverse().apply(self.points)
+        return (self.rotation @ rig[..., None])[..., 0] + self.translation
+
+    def residuals(self, T_world_rig: SE3) -> Float[Tensor, "m 2"]:
+        """Projection less observation, pixels; infinite for points behind the camera."""
+        local = self.in_camera(T_world_rig)
+        z = local[:, 2:]
+        off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
+        return torch.where(z > 0, off, torch.inf)
+
+
+@dataclass(frozen=True, eq=False)
 class ReprojectionFit:
     """A pose (and, where it was sought, a factor of the focal length) with its uncertainty."""
 
     T_world_rig: SE3
     focal_factor: float  # true focal length as a multiple of the given one; 1 where it was not sought
     noise: float  # pixels: standard deviation of a residual along each axis, robustly
-    covariance: Float[Tensor, "p p"]  # of the right update (translation, rotation) and of the logarithm of the factor
+    covariance: Float[
+        Tensor, "p p"
+    ]  # of the right update (translation, rotation) and of the logarithm of the factor
 
 
 def fit(
-    data: Measured, start: SE3, noise: float, free_focal: bool = False, focal_factor: float = 1.0
+    data: ObservedPoints, start: SE3, noise: float, free_focal: bool = False, focal_factor: float = 1.0
 ) -> ReprojectionFit:
     """Minimize Cauchy's loss of the residuals in standard deviations; those of the landmarks count too.
 
@@ -70,11 +107,14 @@ class _System:
     cost: float
     gradient: Float[Tensor, "p"]
     hessian: Float[Tensor, "p p"]
+    curvature: Float[
+        Tensor, "p p"
+    ]  # of the robust cost itself, where the Hessian is that of its reweighted squares
     scatter: Float[Tensor, "p p"]  # of the single gradients
     spread: float  # residuals in standard deviations, robustly: 1 where the noise is right
 
 
-def _linearized(data: Measured, T: SE3, log_factor: Tensor, noise: float, free_focal: bool) -> _System:
+def _linearized(data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, free_focal: bool) -> _System:
     """Residuals and derivatives at ``T``, in standard deviations."""
     local = data.in_camera(T)
     front = local[:, 2] > 1e-9
@@ -91,10 +131,19 @@ def _linearized(data: Measured, T: SE3, log_factor: Tensor, noise: float, free_f
     single = (weighted.mT @ residual[..., None])[..., 0]
     cost = 0.5 * SCALE**2 * torch.log1p(squared / SCALE**2).sum()
     hessian = (weighted.mT @ jacobian).sum(0)
-    return _System(float(cost), single.sum(0), hessian, single.mT @ single, _spread(residual, hessian.shape[0]))
+    # d(w r)/dr = w I - 2 w^2 r r^T / c^2 for w = 1 / (1 + r^2 / c^2).
+    curvature = hessian - 2 / SCALE**2 * (single.mT @ single)
+    return _System(
+        float(cost),
+        single.sum(0),
+        hessian,
+        curvature,
+        single.mT @ single,
+        _spread(residual, hessian.shape[0]),
+    )
 
 
-def _landmark_variance(data: Measured, T: SE3) -> Tensor:
+def _landmark_variance(data: ObservedPoints, T: SE3) -> Tensor:
     """Variance (square metres) of the points across the line of sight, the mean of both axes.
 
     Along the axis that is across the line of sight and ``directions``, it is that across; along the other one it has
@@ -107,15 +156,19 @@ def _landmark_variance(data: Measured, T: SE3) -> Tensor:
     return (across * (1 + seen) + along * (1 - seen)) / 2
 
 
-def _centres(data: Measured) -> Tensor:
+def _centres(data: ObservedPoints) -> Tensor:
     """Centres of the cameras in the frame of the rig."""
     return -(data.rotation.mT @ data.translation[..., None])[..., 0]
 
 
-def _jacobian(data: Measured, T: SE3, local: Tensor, z: Tensor, focal: Tensor, free_focal: bool) -> Tensor:
+def _jacobian(
+    data: ObservedPoints, T: SE3, local: Tensor, z: Tensor, focal: Tensor, free_focal: bool
+) -> Tensor:
     """Derivative of the projection (pixels) by the right update of ``T`` and the logarithm of the focal length."""
     x, y, zero, inverse = local[:, 0] / z, local[:, 1] / z, torch.zeros_like(z), focal / z
-    rows = torch.stack([inverse, zero, -x * inverse, zero, inverse, -y * inverse], dim=-1).unflatten(-1, (2, 3))
+    rows = torch.stack([inverse, zero, -x * inverse, zero, inverse, -y * inverse], dim=-1).unflatten(
+        -1, (2, 3)
+    )
     rig = T.inverse().apply(data.points)
     # A point of the rig's frame moves by -rho + [p]x phi under T exp(rho, phi).
     moved = torch.cat([-torch.eye(3, dtype=z.dtype).expand(len(z), 3, 3), skew(rig)], dim=-1)
@@ -137,7 +190,9 @@ def _solved(hessian: Tensor, damping: float, gradient: Tensor) -> Tensor:
 
 
 def _sandwich(system: _System) -> Float[Tensor, "p p"]:
-    """Covariance of an M-estimator (Huber 1981): ``H^-1 S H^-1``, where S is the scatter of the single gradients."""
-    inverse = torch.linalg.pinv(system.hessian, hermitian=True)
-    unknowns = len(system.gradient)
-    return inverse @ system.scatter @ inverse * 1.0 if unknowns else inverse
+    """Covariance of an M-estimator (Huber 1981, section 6.3): ``A^-1 S A^-1`` of curvature A and scatter S."""
+    # Few or evil residuals can make the curvature indefinite; it is never far below the Hessian of good ones.
+    values, vectors = torch.linalg.eigh(system.curvature)
+    least = 0.2 * torch.linalg.eigvalsh(system.hessian)
+    inverse = vectors @ torch.diag(1 / values.maximum(least).clamp(min=1e-12)) @ vectors.mT
+    return inverse @ system.scatter @ inverse
