@@ -37,6 +37,7 @@ class CameraSource:
 
     intrinsics: Intrinsics
     description: str
+    approximate: bool = False  # whether the focal length is a nominal one, as in EXIF
 
 
 @dataclass(frozen=True)

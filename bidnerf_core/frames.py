@@ -39,6 +39,9 @@ class Frame:
     camera_source: str | None = None
     """A line that says where the intrinsics come from, of frames that ``open`` made."""
 
+    focal_is_approximate: bool = False
+    """Whether the focal length is a nominal one, such as that in EXIF, which may be off by several percent."""
+
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[-1] != 3:
             raise InputError(
@@ -96,7 +99,9 @@ class Frame:
         if photo.remark is not None:
             warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=2)
         source = photo.camera
-        return Frame(path.stem, photo.rgb, source.intrinsics, photo.depth, photo.alpha, source.description)
+        return Frame(
+            path.stem, photo.rgb, source.intrinsics, photo.depth, photo.alpha, source.description, source.approximate
+        )
 
     @staticmethod
     def from_numpy(

@@ -16,6 +16,7 @@ from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.localization.search.landmarks import LandmarkPose
 from bidnerf_core.mapping.casting import trace
 from bidnerf_core.se3 import SE3
 
@@ -81,6 +82,30 @@ def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDia
     near, alike = judge.inliers(judge.correspondences(T[None]))
     violations = free_space_violations(judge, T)
     return SurfaceDiagnostics(float(near.mean()), float((near * alike).mean()), violations, margin)
+
+
+@dataclass(frozen=True)
+class LandmarkThresholds:
+    """What a pose by landmarks must show. No threshold has a unit: they hold for every scene and every image."""
+
+    log10_nfa: float = -12.0  # logarithm of the number of such agreements expected by chance, at most
+    inliers: int = 15  # correspondences within three standard deviations, at least
+    above_chance: float = 3.0  # times as many as at a wrong pose, at least
+    spread: float = 0.06  # share of the image's cells that hold one, at least
+
+
+def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = LandmarkThresholds()) -> Verdict:
+    """Judge a pose by how many landmarks agree with it, beyond what chance would give, and over how much of the image."""
+    share = f"{found.inliers} landmarks agree"
+    if found.log10_nfa > thresholds.log10_nfa or found.inliers < thresholds.inliers:
+        return Verdict(Outcome.TOO_FEW_MATCHES, f"only {share} ({found.agreeing} of {found.matches} matches)")
+    if found.inliers < thresholds.above_chance * found.chance:
+        return Verdict(Outcome.AMBIGUOUS, f"{share}, about {found.chance:.0f} would by chance")
+    if found.spread < thresholds.spread:
+        return Verdict(Outcome.UNDETERMINED, f"{share}, all in {found.spread:.0%} of the image")
+    if not bool(found.covariance.isfinite().all()):
+        return Verdict(Outcome.UNDETERMINED, f"{share}, but do not determine the pose")
+    return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px")
 
 
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:

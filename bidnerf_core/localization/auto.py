@@ -1,6 +1,7 @@
 """Method ``auto``: find the pose with a start or without one, by whatever was measured, and say whether to trust it.
 
-What it does is decided here and nowhere else. Where enough depth was measured and the map has a surface, measured points are
+What it does is decided here and nowhere else. Where the map has landmarks, they propose first, and what they find is fused
+with measured depth and rendered rays. Where they do not convince, the surface searches: where enough depth was measured and the map has a surface, measured points are
 aligned with it; images without depth are compared with renderings of the surface; a map without a surface needs a start, and
 ``auto`` then descends as ``bid`` does.
 """
@@ -15,7 +16,11 @@ import torch
 from torch import Generator
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
+from bidnerf_core.localization.acceptance import (
+    SurfaceDiagnostics,
+    landmark_verdict,
+    surface_diagnostics,
+)
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.by_colour import (
     ByColourConfig,
@@ -23,6 +28,7 @@ from bidnerf_core.localization.by_colour import (
     localization_of,
     refine_by_colour,
 )
+from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import surface_covariance
@@ -60,6 +66,7 @@ class AutoConfig(Settings):
     rounds: Annotated[int, Range(1, 100)] = 3  # of search with fresh hypotheses, until an answer is accepted
     refine_steps: Annotated[int, Range(0, 1000)] = 2  # on rendered rays, of an answer by depth; 0: none
     refine_rays: Annotated[int, Range(64, 10**6)] = 512
+    landmarks: bool = True  # match image features with the map's landmarks first, where it has some
     by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
 
 
@@ -68,6 +75,13 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
 
     Raises ``InputError`` where a start is needed, for want of a baked surface, and there is none.
     """
+    began, answer = time.perf_counter(), None
+    if problem.matcher is not None and config.landmarks:
+        answer = answer_by_landmarks(problem, problem.matcher, config.refine_rays if config.refine_steps else 0, seed)
+    if answer is not None and landmark_verdict(answer.found).accepted:
+        return localization_by_landmarks(problem, answer, began)
+    if answer is not None and problem.start is None:
+        problem = replace(problem, start=answer.T)  # one more place to look
     if problem.surface is None:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
     if _measured_points(problem) >= LEAST_POINTS:

@@ -1,9 +1,8 @@
-"""Poses by landmarks: image features matched with the map's, fused with measured depth and with what the field renders."""
+"""Poses by landmarks: features of the query matched with the map's, fused with measured depth and with rendered rays."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,9 +11,9 @@ from torch import Generator, Tensor
 
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.costs.prior import GaussianPrior
-from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
+from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.covariance import FINEST
+from bidnerf_core.localization.covariance import FINEST, INDEPENDENT, LEAST_VARIANCE
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
@@ -22,35 +21,144 @@ from bidnerf_core.localization.method_settings import (
     RefinementStage,
 )
 from bidnerf_core.localization.normal_equations import Cost, Scaled, Sum
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.result import Localization, Verdict
+from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.landmarks import LandmarkPose, propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
-from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
 POINTS = 2000
-"""Measured points that are fused with the landmarks, at most."""
-STEPS = 8
+"""Measured points that are fused, at most."""
+SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 100.0, 300.0
+"""How many independent measurements the points on the surface and the rendered rays of a view count for beside landmarks."""
+STEPS = 6
+"""Second-order steps on the sum of all terms."""
+SHARPEST = 0.06
+"""Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
+DEPTH_SCALE_PRIOR = 0.02
+"""Standard deviation of a depth sensor's scale."""
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """A cost with the variance of its residuals, so that terms of different units can be added."""
+
+    cost: Cost
+    variance: float
+    measurements: float  # independent ones that it counts for
+
+    @property
+    def scaled(self) -> Cost:
+        return Scaled(self.cost, self.measurements / self.variance)
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkAnswer:
-    """A pose by landmarks, fused with what else was measured, and the judgement of it."""
+    """What landmarks found, and the pose after it was fused with what else was measured."""
 
     found: LandmarkPose
     T: SE3
     covariance: Float[Tensor, "6 6"]
-    verdict: Verdict
+    terms: tuple[str, ...]  # what was fused with the landmarks
 
 
-def localize_by_landmarks(
-    problem: Problem, matcher: LandmarkMatcher, seed: int
+def answer_by_landmarks(
+    problem: Problem, matcher: LandmarkMatcher, rays: int, seed: int
 ) -> LandmarkAnswer | None:
-    """Find the pose by landmarks. Returns None where too few features match for any pose."""
-    found = propose(matcher, problem.views, seed=seed)
+    """Find the pose by landmarks and refine it on all terms at once. Returns None where too few features match.
+
+    ``rays``: rendered for the refinement; 0: none.
+    """
+    unknown_focal = len(problem.views) == 1 and problem.views[0].frame.focal_is_approximate
+    found = propose(matcher, problem.views, seed=seed, unknown_focal=unknown_focal)
     if found is None:
         return None
-    return LandmarkAnswer(found, found.T_world_camera, found.covariance, landmark_verdict(found))
+    problem = replace(problem, start=found.T_world_camera)
+    about, terms = pivot("scene", problem), dict[str, Term]()
+    generator = Generator().manual_seed(seed)
+    if abs(found.focal_factor - 1) < 1e-3:  # other terms would need the corrected camera
+        if problem.surface is not None and problem.has_depth:
+            terms["depth"] = _surface_term(problem, found, generator)
+        if rays and matcher.landmarks is not None and _is_sharp(problem):
+            terms["rendering"] = _rendered_term(problem, rays, about, generator)
+    return _fused(found, terms, about)
+
+
+def _is_sharp(problem: Problem) -> bool:
+    return problem.colour_noise is None or problem.colour_noise <= SHARPEST
+
+
+def _surface_term(problem: Problem, found: LandmarkPose, generator: Generator) -> Term:
+    """Return the term of measured points on the surface, at the depth scale that landmarks and prior agree on."""
+    assert problem.surface is not None
+    cloud = PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator)
+    cloud = replace(cloud, points=cloud.origins + _depth_scale(found) * (cloud.points - cloud.origins))
+    scales = PointScales(FINEST * problem.surface.cell)
+    cost = SurfaceCost(problem.surface, cloud, scales)
+    variance = max(float(cost.residual_variance(found.T_world_camera[None])[0]), LEAST_VARIANCE)
+    return Term(cost, variance, SURFACE_MEASUREMENTS * len(problem.views))
+
+
+def _depth_scale(found: LandmarkPose) -> float:
+    """Return the factor on measured depth: the landmarks' where they tell it, drawn to 1 by the prior."""
+    if found.depth_scale is None:
+        return 1.0
+    # The median of the ratios of a few landmarks' depths is about this certain.
+    variance = 0.01**2
+    weight = DEPTH_SCALE_PRIOR**2 / (DEPTH_SCALE_PRIOR**2 + variance)
+    return 1 + weight * (found.depth_scale - 1)
+
+
+def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator) -> Term:
+    """Return the term of what the field renders against what was photographed."""
+    cell = 0.01 if problem.surface is None else problem.surface.cell
+    stage = RefinementStage(STEPS, rays, depth_scale=6 * cell)
+    depth = DepthSettings() if problem.has_depth else None
+    settings = RenderedCostSettings(ColourSettings(), depth, RefinementSettings(exposure=problem.exposure_varies))
+    cost = settings.drawn(problem, stage, about, generator)
+    assert problem.start is not None
+    variance = max(float(cost.cost(problem.start[None])[0]), LEAST_VARIANCE)
+    return Term(cost, variance, RENDERED_MEASUREMENTS * len(problem.views))
+
+
+def _fused(found: LandmarkPose, terms: dict[str, Term], about: Pivot) -> LandmarkAnswer:
+    """Take steps on the sum of the terms.
+
+    The covariance counts the additional terms as ``INDEPENDENT`` measurements only: their errors are alike over large parts
+    of an image, and are not those of the steps' residuals.
+    """
+    if not terms:
+        return LandmarkAnswer(found, found.T_world_camera, found.map_covariance, ())
+    prior = GaussianPrior(found.T_world_camera, found.map_covariance, about)
+    cost = Sum((prior, *(term.scaled for term in terms.values())))
+    done = descend(cost, found.T_world_camera[None], STEPS, about.moved)
+    T = done.T[0].normalized()
+    information = prior(T[None]).hessian[0]
+    for term in terms.values():
+        information = information + term.cost(T[None]).hessian[0] * (INDEPENDENT / term.variance)
+    covariance = about.at_camera(T, torch.linalg.inv(information))
+    return LandmarkAnswer(found, T, (covariance + covariance.mT) / 2, tuple(terms))
+
+
+def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
+    """Return an answer as a localization of method ``auto``."""
+    found, verdict = answer.found, landmark_verdict(answer.found)
+    poses = [found.T_world_camera, answer.T]
+    if problem.start is not None:
+        poses = [problem.start, *poses]
+    fused = f", fused with {' and '.join(answer.terms)}" if answer.terms else ""
+    return Localization(
+        T_world_camera=answer.T,
+        outcome=verdict.outcome,
+        reason=verdict.reason + fused,
+        steps=len(poses) - 1,
+        seconds=time.perf_counter() - began,
+        loss=found.noise,
+        method="auto",
+        poses=SE3.stack(poses),
+        losses=torch.full((len(poses) - 1,), found.noise, dtype=torch.float64),
+        covariance=answer.covariance,
+        focal_factor=found.focal_factor,
+    )

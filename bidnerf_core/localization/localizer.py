@@ -16,6 +16,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.methods import METHODS, Method, find_method
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import render
 from bidnerf_core.se3 import SE3
@@ -57,6 +58,8 @@ class Localizer:
         self.method = method
         self.map: SceneMap = map if device is None else _on_device(map, torch.device(device))
         self.config = _checked_config(find_method(method), method, config)
+        landmarks = getattr(self.map, "landmarks", None)
+        self._matcher = None if landmarks is None or method != "auto" else LandmarkMatcher(landmarks)
         if warm_up:
             self._warm_up()
 
@@ -75,7 +78,7 @@ class Localizer:
         ``InputError`` for a query that cannot be localized at all; a pose that is merely doubtful is returned, with an
         ``outcome`` other than ``CONVERGED``.
         """
-        problem = rig(self.map, _views(query), None if start is None else _pose(start), depth_rays)
+        problem = rig(self.map, _views(query), None if start is None else _pose(start), depth_rays, self._matcher)
         return METHODS[self.method].run(problem, self.config, seed)
 
     @torch.no_grad()

@@ -11,6 +11,7 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import View
+from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
@@ -45,6 +46,9 @@ class Problem:
     start: SE3 | None  # T_world_K; None where nothing is known of it
     depth_rays: Observations | None = None  # of a lidar or the like, in the frame of the last camera
     surface: SurfaceMap | None = None  # baked from the field
+    matcher: LandmarkMatcher | None = None  # of the map's landmarks
+    # Root mean square difference of the field's colours from its own training images; None where unknown.
+    colour_noise: float | None = None
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -82,6 +86,11 @@ class Problem:
             raise InputError(f"level is {number}, expected 0 (coarsest) to {len(offered) - 1}")
         return offered[number]
 
+    @property
+    def exposure_varies(self) -> bool:
+        """Whether images may be exposed otherwise than the map: those of cameras, not those rendered over a background."""
+        return all(view.frame.alpha is None for view in self.views)
+
     def without_depth(self) -> Problem:
         """Return the problem with colours alone."""
         views = tuple(replace(view, frame=replace(view.frame, depth=None)) for view in self.views)
@@ -89,7 +98,11 @@ class Problem:
 
 
 def rig(
-    scene: SceneMap, views: Sequence[View], start: SE3 | None, depth_rays: Observations | None = None
+    scene: SceneMap,
+    views: Sequence[View],
+    start: SE3 | None,
+    depth_rays: Observations | None = None,
+    matcher: LandmarkMatcher | None = None,
 ) -> Problem:
     """Return the problem of ``views`` whose poses are known in any common frame.
 
@@ -102,7 +115,8 @@ def rig(
         View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views
     )
     start = None if start is None else start.to("cpu", torch.float64)
-    return Problem(scene.field, scene.bounds, relative, start, depth_rays, scene.surface)
+    noise = getattr(scene, "colour_noise", None)
+    return Problem(scene.field, scene.bounds, relative, start, depth_rays, scene.surface, matcher, noise)
 
 
 def window(sequence: Sequence[Item], last: int, size: int, stride: int = 1) -> tuple[Item, ...]:

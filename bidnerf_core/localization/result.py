@@ -58,6 +58,7 @@ class Localization:
     losses: Float[Tensor, "s"]  # at the start and before each further step
     # Of a right update at the camera: translation in metres first, then rotation in radians. None where unknown.
     covariance: Float[Tensor, "6 6"] | None = None
+    focal_factor: float = 1.0  # true focal length over the given one, where it was estimated along
 
     @property
     def converged(self) -> bool:
@@ -77,6 +78,7 @@ class Localization:
             "covariance": None if self.covariance is None else self.covariance.tolist(),
             "loss": self.loss if self.loss == self.loss and abs(self.loss) != float("inf") else None,
             "method": self.method,
+            "focal_factor": self.focal_factor,
         }
 
     def save(self, path: str | Path) -> None:
