@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bidnerf_core.camera import Intrinsics, same_aspect
@@ -94,7 +94,7 @@ def find_camera(
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     if camera is None:
-        return camera_from_exif(where, raster, exif)
+        return replace(camera_from_exif(where, raster, exif), approximate=True)
     given, origin = (
         (camera, "camera as given")
         if isinstance(camera, Intrinsics)
