@@ -18,13 +18,14 @@ import torch
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.bench import InThisProcess, Plan, planned, run_trials, share
+from bidnerf_core.evaluation.bench import InThisProcess, Plan, planned, run_trials, shard_of
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.provenance import read_runs
-from bidnerf_core.evaluation.results import ResultsFile, as_line, read_results
+from bidnerf_core.evaluation.results import ResultsFile, read_results, result_line
 from bidnerf_core.evaluation.sequences import mean_up, seen_middle, sequence, turned_about
-from bidnerf_core.evaluation.trials import Trial, TrialResult, run_trial
+from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.localization import METHODS
 from bidnerf_core.scenes.trajectories import look_at, orbit
 
@@ -78,13 +79,13 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
 @pytest.mark.parametrize("shards", [1, 2, 3, 7, 100])
 def test_shards_share_all_trials_between_them(shards: int) -> None:
     trials = planned(Plan(BLOBS, BLOBS))
-    parts = [share(trials, number, shards) for number in range(shards)]
+    parts = [shard_of(trials, number, shards) for number in range(shards)]
     assert sorted(t.seed * 100 + t.size[0] for p in parts for t in p) == sorted(
         t.seed * 100 + t.size[0] for t in trials
     )
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
     with pytest.raises(InputError, match="shard is"):
-        share(trials, shards, shards)
+        shard_of(trials, shards, shards)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +143,7 @@ def test_a_turned_camera_sees_its_middle_in_the_same_place() -> None:
 
 @pytest.fixture
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.evaluation.closed_form_data.CAMERA", tiny.CAMERA)
+    monkeypatch.setattr("bidnerf_core.evaluation.closed_form_data.DEMO_CAMERA", tiny.CAMERA)
 
 
 @pytest.mark.usefixtures("small_images")
@@ -218,7 +219,7 @@ def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(
 
 def _written(path: Path, *seeds: int) -> list[TrialResult]:
     results = [run_trial(blob_trial(seed)) for seed in seeds]
-    path.write_bytes(b"".join(map(as_line, results)))
+    path.write_bytes(b"".join(map(result_line, results)))
     return results
 
 
@@ -227,12 +228,12 @@ def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, ke
     path = tmp_path / "r.jsonl"
     first, second = _written(path, 0, 1)
     whole = path.read_bytes()
-    half = as_line(second)
-    path.write_bytes(as_line(first) + half[: max(1, int(kept * len(half)) - 1)])
+    half = result_line(second)
+    path.write_bytes(result_line(first) + half[: max(1, int(kept * len(half)) - 1)])
     assert read_results([path]) == [first]
     with ResultsFile(path) as file:
         assert list(file.results.values()) == [first]
-        assert path.read_bytes() == as_line(first)
+        assert path.read_bytes() == result_line(first)
         file.add(second)
     assert path.read_bytes() == whole
 
@@ -289,7 +290,7 @@ def test_more_trials_and_other_methods_go_into_the_same_file(tmp_path: Path, eva
     before = (tmp_path / "r.jsonl").read_bytes()
     status, err = evaluate("--trials", 3, "--size", 0.3)
     assert status == 0
-    assert "2 of 3 trials are there already" in err
+    assert "2 of 3 trials are already there" in err
     assert (tmp_path / "r.jsonl").read_bytes().startswith(before)
     assert evaluate("--trials", 2, "--method", "inerf", "--protocol", "inerf")[0] == 0
     assert [r.method for r in read_results([tmp_path / "r.jsonl"])] == ["bid"] * 3 + ["inerf"] * 2

@@ -176,7 +176,6 @@ def test_convergence_plot_of_nothing(tmp_path: Path) -> None:
 def test_convergence_plot_without_matplotlib_tells_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(InputError, match=r"pip install 'bidnerf\[plots\]'"):
         convergence_plot(tmp_path / "plot.png", {"0001": errors(1, 0.1)})
