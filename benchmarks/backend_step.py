@@ -3,8 +3,8 @@
     python benchmarks/backend_step.py DATA MAP... --name backend_step_lego
 
 All maps render the same 2048 rays of a test frame from the same pose, 0.1 m from the truth, at the level that ``bid`` uses,
-with the gradient to the pose (forward and backward). They take turns, so that whatever else the machine does disturbs all
-alike; medians. Where a level's sampler only leaves out samples of another one (the vanilla field does that by its grid of
+with the gradient to the pose (forward and backward). They take turns, so that a change of the machine's load affects all
+alike, and medians are reported. Where a level's sampler only leaves out samples of another one (the vanilla field does that by its grid of
 free space), the step without skipping is timed as well, as ``MAP dense``.
 """
 
@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from record import write_record
 
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.comparison import labels, map_bytes
+from bidnerf_core.evaluation.comparison import map_bytes, map_labels
 from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.field import FieldValues, RadianceField, RaySampler
 from bidnerf_core.localization import BidConfig, Problem, single
 from bidnerf_core.pixels import draw, uniform
@@ -30,12 +30,14 @@ from bidnerf_core.rendering import render
 from bidnerf_core.residuals import objective
 from bidnerf_core.storage import load_map
 
+RESULTS = Path(__file__).parent / "results"
+
 SETTINGS = BidConfig()
 
 
 @dataclass(frozen=True, eq=False)
 class Everywhere:
-    """A level that is asked wherever ``sampler`` says."""
+    """A level whose samples another sampler places."""
 
     level: RadianceField
     sampler: RaySampler
@@ -46,7 +48,7 @@ class Everywhere:
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """What is timed, and what is told of it."""
+    """A map and a level to time, and facts about them for the record."""
 
     problem: Problem
     level: RadianceField
@@ -55,7 +57,7 @@ class Variant:
 
 def variants(folders: list[Path], data: Path) -> dict[str, Variant]:
     found: dict[str, Variant] = {}
-    for name, folder in zip(labels([str(f) for f in folders]), folders, strict=True):
+    for name, folder in zip(map_labels([str(f) for f in folders]), folders, strict=True):
         stored = load_map(folder)
         dataset = open_dataset(data, stored.bounds.background)
         (view,) = dataset.views("test", dataset.frame_names("test")[:1])
@@ -75,7 +77,7 @@ def variants(folders: list[Path], data: Path) -> dict[str, Variant]:
 
 
 def step(variant: Variant, seed: int) -> tuple[float, float]:
-    """Seconds, and samples a ray."""
+    """Return the seconds of one step, and its samples a ray."""
     problem = variant.problem
     began = time.perf_counter()
     pixels = draw(problem.views, SETTINGS.rays, uniform, torch.Generator().manual_seed(seed))
@@ -87,7 +89,7 @@ def step(variant: Variant, seed: int) -> tuple[float, float]:
 
 
 def measured(found: dict[str, Variant], repeats: int) -> dict[str, Any]:
-    """In turns; the first round warms up."""
+    """Time all variants in turn; the first round warms up."""
     times: dict[str, list[float]] = {name: [] for name in found}
     samples: dict[str, list[float]] = {name: [] for name in found}
     for seed in range(repeats + 1):
@@ -112,7 +114,7 @@ def measured(found: dict[str, Variant], repeats: int) -> dict[str, Any]:
 
 
 def faster(mine: list[float], others: list[float]) -> float:
-    """Median over the turns."""
+    """Return the median ratio over the rounds."""
     return statistics.median(b / a for a, b in zip(mine, others, strict=True))
 
 
@@ -127,7 +129,13 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     found = measured(variants(given.maps, given.data), given.repeats)
-    print(write_record(given.name, {"rays": SETTINGS.rays, "level": SETTINGS.level, "steps": found}, seed=0))
+    print(
+        write_record(
+            RESULTS / f"{given.name}.json",
+            {"rays": SETTINGS.rays, "level": SETTINGS.level, "steps": found},
+            seed=0,
+        )
+    )
     for name, row in found.items():
         than = ", ".join(
             f"{ratio:.2f} times as fast as {other}" for other, ratio in row["times_faster_than"].items()

@@ -16,17 +16,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from record import write_record
 from torch.profiler import ProfilerActivity, profile
 
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.field import RadianceField
 from bidnerf_core.localization import Problem, single
 from bidnerf_core.pixels import draw, uniform
 from bidnerf_core.rendering import render
 from bidnerf_core.residuals import objective
 from bidnerf_core.storage import load_map
+
+RESULTS = Path(__file__).parent / "results"
 
 RAYS = 2048
 KINDS = {
@@ -36,7 +38,7 @@ KINDS = {
 
 
 def step(problem: Problem, field: RadianceField, seed: int) -> tuple[float, int]:
-    """Loss, with its gradient to the pose computed; and the number of queried samples."""
+    """Compute the loss and its gradient to the pose; return the loss and the number of queried samples."""
     pixels = draw(problem.views, RAYS, uniform, torch.Generator().manual_seed(seed))
     delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     rendering = render(
@@ -48,7 +50,7 @@ def step(problem: Problem, field: RadianceField, seed: int) -> tuple[float, int]
 
 
 def shares(problem: Problem, field: RadianceField) -> dict[str, float]:
-    """Share of the time spent in the operators of each kind; ``overhead`` is time outside of any operator."""
+    """Return the share of time spent in operators of each kind; ``overhead`` is time outside of any operator."""
     with profile(activities=[ProfilerActivity.CPU]) as trace:
         began = time.perf_counter()
         for seed in range(5):
@@ -87,12 +89,12 @@ def main() -> None:
         results[name] = compare(
             problem, with_grid.field.levels[level], without.field.levels[level], given.repeats
         )
-    print(write_record(given.name, results, seed=0))
+    print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
     print(results)
 
 
 def compare(problem: Problem, sparse: RadianceField, dense: RadianceField, repeats: int) -> dict[str, Any]:
-    """Alternating times of both, their losses on the same pixels, and the profile of the sparse one."""
+    """Return alternating times of both, their losses on the same pixels, and the profile of the sparse one."""
     times: dict[str, list[float]] = {"sparse": [], "dense": []}
     losses: dict[str, list[float]] = {"sparse": [], "dense": []}
     samples = {}

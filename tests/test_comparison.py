@@ -125,6 +125,19 @@ def test_a_median_error_counts_lost_poses_as_worst(maps: list[Path]) -> None:
     assert map_row("a", str(maps[0]), [Measured(good, 1.0)] + [Measured(gone, 1.0)] * 2).translation is None
 
 
+def test_without_a_start_there_is_no_share_of_its_error(maps: list[Path], tmp_path: Path) -> None:
+    free = replace(result(1.0, [0.04, 0.01]), start_error=None)
+    row = map_row("short", str(maps[0]), [Measured(free, 1.0)])
+    assert row.success["10%"] is None
+    absolute = row.success["5deg 0.05"]
+    assert absolute is not None
+    assert (absolute.rate.successes, absolute.steps) == (1, 0)
+    found = Comparison("d", "test", "none", (), "auto", {}, 0, 1, (row,), ((free,),))
+    comparison_figure([tmp_path / "a.svg"], found)
+    assert "<svg" in (tmp_path / "a.svg").read_text()
+    assert from_plain(Comparison, json.loads(json.dumps(to_plain(found))), "again") == found
+
+
 def test_maps_have_the_shortest_names_that_tell_them_apart() -> None:
     assert map_labels(["/x/a", "/x/b"]) == ["a", "b"]
     assert map_labels(["/x/a", "/y/a", "/y/b"]) == ["x/a", "y/a", "y/b"]

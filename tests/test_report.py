@@ -17,12 +17,12 @@ from scipy.stats import mannwhitneyu
 
 from bidnerf_core.cli import main
 from bidnerf_core.evaluation.errors import success_rate
-from bidnerf_core.evaluation.groups import grouped, situations
+from bidnerf_core.evaluation.groups import grouped, situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.provenance import note_run, provenance
 from bidnerf_core.evaluation.results import result_line
 from bidnerf_core.evaluation.significance import compare_pair, pairwise_tests
-from bidnerf_core.evaluation.summary import NEVER, steps_of, summarize
+from bidnerf_core.evaluation.summary import NEVER, median, steps_of, summarize
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 
 STEPS = 10
@@ -224,6 +224,75 @@ def test_a_report_replaces_a_report_and_nothing_else(
         assert error.count("\n") == 1
         assert f"{other}: holds something that is no report" in error
         assert [path.read_text() for path in other.iterdir()] == ["<html>mine</html>"]
+
+
+def test_an_interrupted_report_is_written_again(
+    tmp_path: Path, results: list[TrialResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, out = write(tmp_path / "r.jsonl", *results), tmp_path / "out"
+
+    def interrupt(self: Figures) -> Path:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Figures, "steps", interrupt)
+        assert main(["report", str(file), "--out", str(out)]) == 130
+    assert (out / "rates.png").exists()
+    assert main(["report", str(file), "--out", str(out)]) == 0
+    assert read(out).fetched == []
+    written = (out / "index.html").read_bytes()
+    with monkeypatch.context() as patch:  # the page of before stays until the new one is whole
+        patch.setattr(Figures, "steps", interrupt)
+        assert main(["report", str(file), "--out", str(out)]) == 130
+    assert (out / "index.html").read_bytes() == written
+
+
+def test_datasets_and_maps_are_named_where_they_differ() -> None:
+    first = result(0, 2, protocol="none")
+    other = dataclasses.replace(first, trial=dataclasses.replace(first.trial, data="scans", split="val"))
+    retrained = dataclasses.replace(first, weights="weights-2.safetensors")
+    moved = dataclasses.replace(first, trial=dataclasses.replace(first.trial, map="garden"))
+
+    def titles(*found: TrialResult) -> list[str]:
+        return list(situation_titles(situations(grouped(found))).values())
+
+    assert titles(first) == ["no start"]
+    assert titles(first, other) == ["photos/test: no start", "scans/val: no start"]
+    assert titles(first, moved) == ["house: no start", "garden: no start"]
+    assert titles(first, retrained) == ["house (weights-1): no start", "house (weights-2): no start"]
+    assert titles(
+        first, dataclasses.replace(other, trial=dataclasses.replace(other.trial, map="garden"))
+    ) == [
+        "house on photos/test: no start",
+        "garden on scans/val: no start",
+    ]
+
+
+def test_a_report_without_starts_uses_no_share_of_their_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    free = [result(seed, 2 + seed, protocol="none") for seed in range(3)]
+    file, out = write(tmp_path / "r.jsonl", *free), tmp_path / "out"
+    assert main(["report", str(file), "--out", str(out)]) == 0
+    assert "Steps to success (under 5° and 0.05 units)" in read(out).text
+    assert "(translation error at most 10 %" not in read(out).text
+    capsys.readouterr()
+    assert main(["report", str(file), "--out", str(out), "--criterion", "10%"]) == 2
+    err = capsys.readouterr().err
+    assert "no trial had a start" in err
+    assert err.count("\n") == 1
+    mixed = write(tmp_path / "m.jsonl", *free, result(0, 2), result(1, 3))
+    assert main(["report", str(mixed), "--out", str(out), "--criterion", "10%"]) == 0
+    assert "Trials without a start are not shown" in read(out).text
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"), [([1, 4], 2.5), ([3, 1, 2], 2), ([1, None], None), ([1, 2, None], 2), ([], None)]
+)
+def test_a_median_counts_what_is_unknown_as_infinite(
+    values: list[float | None], expected: float | None
+) -> None:
+    assert median(values) == expected
 
 
 def test_a_damaged_side_file_is_named(
