@@ -23,16 +23,19 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.comparison import map_bytes, map_labels
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.field import FieldValues, RadianceField, RaySampler
-from bidnerf_core.localization import BidConfig, Problem, single
+from bidnerf_core.field import FieldValues, RadianceField, RaySampler, SceneBounds, levels
+from bidnerf_core.frames import View
+from bidnerf_core.localization import BidConfig
+from bidnerf_core.localization.method_settings import objective_of
 from bidnerf_core.pixels import draw, uniform
 from bidnerf_core.rendering import render
-from bidnerf_core.residuals import objective
+from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
 
 RESULTS = Path(__file__).parent / "results"
 
 SETTINGS = BidConfig()
+OBJECTIVE = objective_of(SETTINGS.colour, SETTINGS.depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,9 @@ class Everywhere:
 class Variant:
     """A map and a level to time, and facts about them for the record."""
 
-    problem: Problem
+    view: View  # in the frame of its own camera
+    start: SE3  # T_world_camera
+    bounds: SceneBounds
     level: RadianceField
     about: dict[str, Any]
 
@@ -62,30 +67,30 @@ def variants(folders: list[Path], data: Path) -> dict[str, Variant]:
         dataset = open_dataset(data, stored.bounds.background)
         (view,) = dataset.views("test", dataset.frame_names("test")[:1])
         start = perturb(view.T_ref_camera, 0.1, 2.0, seed=0)
-        problem = single(stored.field, stored.bounds, view.frame, start)
-        level = problem.level(SETTINGS.level)
+        level = levels(stored.field)[SETTINGS.descent.level or 0]
+        own = View(view.frame, SE3.identity())
         about = {
             "backend": stored.info.backend,
             "map_MiB": map_bytes(folder) / 2**20,
             "config": stored.info.config,
         }
-        found[name] = Variant(problem, level, about)
+        found[name] = Variant(own, start, stored.bounds, level, about)
         inner = getattr(level.sampler, "sampler", None)
         if isinstance(inner, RaySampler):
-            found[f"{name} dense"] = Variant(problem, Everywhere(level, inner), about)
+            found[f"{name} dense"] = Variant(own, start, stored.bounds, Everywhere(level, inner), about)
     return found
 
 
 def step(variant: Variant, seed: int) -> tuple[float, float]:
     """Return the seconds of one step, and its samples a ray."""
-    problem = variant.problem
     began = time.perf_counter()
-    pixels = draw(problem.views, SETTINGS.rays, uniform, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    pixels = draw([variant.view], SETTINGS.descent.rays, uniform, generator)
     delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    rays = pixels.rays(problem.start.retract(delta), problem.bounds)
-    rendering = render(variant.level, rays, problem.bounds.background)
-    objective(rendering, pixels, SETTINGS.colour_scale, SETTINGS.depth_weight).backward()
-    return time.perf_counter() - began, float(rendering.samples.valid.sum()) / SETTINGS.rays
+    rays = pixels.rays(variant.start.retract(delta), variant.bounds)
+    rendering = render(variant.level, rays, variant.bounds.background)
+    OBJECTIVE.loss(rendering, pixels).backward()
+    return time.perf_counter() - began, float(rendering.samples.valid.sum()) / SETTINGS.descent.rays
 
 
 def measured(found: dict[str, Variant], repeats: int) -> dict[str, Any]:
@@ -132,7 +137,7 @@ def main() -> None:
     print(
         write_record(
             RESULTS / f"{given.name}.json",
-            {"rays": SETTINGS.rays, "level": SETTINGS.level, "steps": found},
+            {"rays": SETTINGS.descent.rays, "level": SETTINGS.descent.level, "steps": found},
             seed=0,
         )
     )

@@ -54,7 +54,7 @@ from bidnerf_core.evaluation.protocols import bid_start
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.frames import View
-from bidnerf_core.localization import localize, rig
+from bidnerf_core.localization import Localizer
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.storage import Map
@@ -68,9 +68,9 @@ Registration = Callable[[View, int], Matrix]
 """Returns T_world_camera of a view from its seed; the view's own pose serves only to make a start from it."""
 
 
-def auto(stored: Map, view: View, start: SE3 | None, seed: int) -> Matrix:
-    problem = rig(stored.field, stored.bounds, [view], start, surface=stored.surface)
-    return localize(problem, "auto", seed=seed).T_world_camera.matrix().numpy()
+def auto(localizer: Localizer, view: View, start: SE3 | None, seed: int) -> Matrix:
+    """Return the answer of method ``auto``."""
+    return localizer(view, start, seed=seed).T_world_camera.matrix().numpy()
 
 
 def start_of(truth: SE3, off: float, seed: int) -> Matrix:
@@ -87,7 +87,8 @@ def tuning(stored: Map, views: Sequence[View], voxel: float, off: float, kept: R
         chosen = {name: from_plain(OPEN3D[name], plain[name], name) for name in OPEN3D}
     if find_spec("small_gicp"):
         given = [start_of(case.truth, off, i) for i, case in enumerate(tries)]
-        found = [auto(stored, views[i % len(views)], None, i) for i in range(len(tries))]
+        localizer = Localizer(stored)
+        found = [auto(localizer, views[i % len(views)], None, i) for i in range(len(tries))]
         for name, starts in {"gicp": given, "auto + gicp": found}.items():
             plain = kept.get(
                 ["tuned", name], partial(gicp_settings, points, tries, starts, voxel, name != "gicp")
@@ -112,11 +113,11 @@ def gicp_settings(
 
 def registrations(stored: Map, chosen: dict[str, Any], off: float) -> dict[str, Registration]:
     """Return the registrations by name, with everything computed from the map in advance."""
-    points = map_points(stored.surface)
+    points, localizer = map_points(stored.surface), Localizer(stored)
     result: dict[str, Registration] = {
-        "auto": lambda view, seed: auto(stored, view, None, seed),
+        "auto": lambda view, seed: auto(localizer, view, None, seed),
         "auto from start": lambda view, seed: auto(
-            stored, view, as_pose(start_of(view.T_ref_camera, off, seed)), seed
+            localizer, view, as_pose(start_of(view.T_ref_camera, off, seed)), seed
         ),
     }
     if "ransac" in chosen:
@@ -135,7 +136,7 @@ def registrations(stored: Map, chosen: dict[str, Any], off: float) -> dict[str, 
             measured_points(view.frame), start_of(view.T_ref_camera, off, seed), chosen["gicp"]
         )
         result["auto + gicp"] = lambda view, seed: gicp.refine(
-            measured_points(view.frame), auto(stored, view, None, seed), chosen["auto + gicp"]
+            measured_points(view.frame), auto(localizer, view, None, seed), chosen["auto + gicp"]
         )
     return result
 

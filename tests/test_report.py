@@ -191,7 +191,7 @@ def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResul
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(None, "cannot be read"), (b"", "no finished trial"), (b"hello\n", "line 1: not JSON")],
+    [(None, "no such file"), (b"", "no finished trial"), (b"hello\n", "line 1: not JSON")],
 )
 def test_a_file_without_results_is_told_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes | None, said: str

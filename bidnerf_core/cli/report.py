@@ -43,7 +43,7 @@ def report(
     from bidnerf_core.evaluation.plot_style import require_matplotlib
     from bidnerf_core.evaluation.provenance import read_runs
     from bidnerf_core.evaluation.results import read_results
-    from bidnerf_core.storage import write_file
+    from bidnerf_core.files import write_file
 
     if not results:
         raise UsageError("no file of results, expected at least one that 'bidnerf evaluate' wrote")

@@ -30,7 +30,9 @@ from bidnerf_core.evaluation.trials import (
     trial_views,
 )
 from bidnerf_core.localization import find_method
+from bidnerf_core.localization.methods import RENAMED
 from bidnerf_core.serialization import to_plain
+from bidnerf_core.settings import to_flat
 
 CHANGED = {
     "views": "images, depth or cameras than {trial.data} has now",
@@ -98,7 +100,7 @@ def planned(plan: Plan) -> list[Trial]:
 
 def changed_settings(method: str, settings: Any) -> str:
     """Return the JSON of the settings that differ from the method's defaults."""
-    usual, given = to_plain(find_method(method).config_type()), to_plain(settings)
+    usual, given = to_flat(find_method(method).config_type()), to_flat(settings)
     return json.dumps({k: v for k, v in given.items() if v != usual[k]}, sort_keys=True)
 
 
@@ -219,10 +221,7 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
                 f"{file.path}: holds results of another training of map {trial.map} "
                 f"({known.weights}, expected {stored.info.weights}); {advice}"
             )
-        for name, value in to_plain(settings_of(trial.method, trial.config)).items():
-            if known.settings.get(name) != value:
-                found = known.settings.get(name)
-                raise InputError(f"{file.path}: was made with {name} {found}, expected {value}; {advice}")
+        _check_settings(trial, known, f"{file.path}: was made with {{}} {{}}, expected {{}}; {advice}")
         if known.inputs is None:  # an earlier version did not record it
             continue
         read = trial.frames, trial.depth, trial.depth_points
@@ -234,6 +233,16 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
                 raise InputError(
                     f"{file.path}: holds results of frame {trial.frame} made with other {what}; {advice}"
                 )
+
+
+def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
+    """Raise ``InputError`` where a result was made with other settings; what an earlier version lacked had its default."""
+    usual = to_flat(find_method(trial.method).config_type())
+    found = {RENAMED.get(name, name): value for name, value in known.settings.items()}
+    for name, value in to_flat(settings_of(trial.method, trial.config)).items():
+        before = found.get(name, usual[name])
+        if before != value:
+            raise InputError(message.format(name, before, value))
 
 
 def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...]]:

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import IO, Any
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.storage import write_file
+from bidnerf_core.files import open_binary, write_file
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,8 @@ class LineFormat:
 
     def read(self, path: Path) -> list[tuple[str, Any]]:
         """Return the place and the object of each whole line of ``path``. Raises ``InputError`` where it cannot be read."""
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be read ({error.strerror}), expected {self.expected}"
-            ) from error
+        with open_binary(path, self.expected) as file:
+            content = file.read()
         return self.parse(path, content)[0]
 
 
@@ -120,6 +116,8 @@ class JsonLinesFile:
 
     def _locked(self) -> IO[bytes]:
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists():
+            open_binary(self.path, self._kind.expected).close()  # not a pipe, which would wait for a reader
         try:
             file = self.path.open("a+b")
         except OSError as error:

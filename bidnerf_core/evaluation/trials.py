@@ -87,6 +87,10 @@ def settings_of(method: str, config: str) -> Any:
         plain = json.loads(config)
     except (ValueError, RecursionError) as error:
         raise InputError(f"config: not JSON ({error}), expected an object of settings of {method}") from error
+    if not isinstance(plain, dict):
+        raise InputError(
+            f"config: found a {type(plain).__name__}, expected an object of settings of {method}"
+        )
     return checked_settings(method, plain)
 
 
