@@ -37,9 +37,9 @@ from bidnerf_core.evaluation.protocols import MOST_TRIALS, PROTOCOLS, Size, find
 from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trial_process import Measured
+from bidnerf_core.files import write_file
 from bidnerf_core.localization import METHODS
 from bidnerf_core.serialization import to_plain
-from bidnerf_core.files import write_file
 from bidnerf_core.storage import load_info
 
 Folders = Annotated[

@@ -25,8 +25,8 @@ from bidnerf_core.evaluation.trials import (
     input_digests,
     opened,
     opened_points,
+    parse_settings,
     run_trial,
-    settings_of,
     trial_views,
 )
 from bidnerf_core.localization import find_method
@@ -67,7 +67,7 @@ def planned(plan: Plan) -> list[Trial]:
     """Return all trials in the order of the results. Raises ``InputError`` for a plan that cannot be carried out."""
     _, dataset = opened(plan.map, plan.data, plan.device)
     protocol = find_protocol(plan.protocol)
-    settings_of(plan.method, plan.config)
+    parse_settings(plan.method, plan.config)
     names = dataset.frame_names(plan.split)
     rigs = _rigs(plan, dataset, names)
     _check_points(plan, rigs)
@@ -239,7 +239,7 @@ def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
     """Raise ``InputError`` where a result was made with other settings; what an earlier version lacked had its default."""
     usual = to_flat(find_method(trial.method).config_type())
     found = {RENAMED.get(name, name): value for name, value in known.settings.items()}
-    for name, value in to_flat(settings_of(trial.method, trial.config)).items():
+    for name, value in to_flat(parse_settings(trial.method, trial.config)).items():
         before = found.get(name, usual[name])
         if before != value:
             raise InputError(message.format(name, before, value))

@@ -22,7 +22,7 @@ TILE = 240  # pixels: smaller images are enlarged to about this, so that caption
 CAPTION, GAP = 22, 6  # pixels
 INK, FRAME, PAPER = (30, 34, 42), (214, 216, 220), (255, 255, 255)
 OBSERVED_EDGES, RENDERED_EDGES = (0, 190, 110), (235, 0, 140)
-NOTHING = (38, 38, 42)  # colour where no depth was measured
+NO_DEPTH = (38, 38, 42)  # colour where no depth was measured
 
 # Turbo colours (Mikhailov 2019): their author's polynomial of degree 5: rows red, green, blue; columns 1, x, x^2 ...
 TURBO = (
@@ -84,12 +84,12 @@ def depth_to_rgb(
         raise InputError(f"depth: expected an image (height, width), got shape {array.shape}")
     measured = np.isfinite(array) & (array > 0)
     if not measured.any():
-        return np.full((*array.shape, 3), NOTHING, dtype=np.uint8)
+        return np.full((*array.shape, 3), NO_DEPTH, dtype=np.uint8)
     low, high = np.percentile(array[measured], (1, 99))
     low, high = low if near is None else near, high if far is None else far
     share = ((np.where(measured, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
     powers = (0.96 - 0.9 * share)[..., None] ** np.arange(6)  # the map's own ends are nearly black
-    return np.where(measured[..., None], as_picture(powers @ np.array(TURBO).T), np.array(NOTHING, np.uint8))
+    return np.where(measured[..., None], as_picture(powers @ np.array(TURBO).T), np.array(NO_DEPTH, np.uint8))
 
 
 def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:

@@ -15,7 +15,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.serialization import to_plain
 
-SIZE = 16  # bytes of a digest: enough that no two inputs share one by chance
+DIGEST_BYTES = 16  # enough that no two inputs share one by chance
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class InputDigests:
 
 def views_digest(views: Sequence[View]) -> str:
     """Return the digest of the images, depth, alpha, intrinsics and poses of ``views``, which their order is part of."""
-    hashed = hashlib.blake2b(digest_size=SIZE)
+    hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
     for view in views:
         frame = view.frame
         camera = json.dumps(to_plain(frame.intrinsics), sort_keys=True)
@@ -45,7 +45,7 @@ def folder_digest(folder: str) -> str:
 
     Raises ``InputError`` where one of them cannot be read.
     """
-    hashed = hashlib.blake2b(digest_size=SIZE)
+    hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
     try:
         for path in sorted(path for path in Path(folder).iterdir() if path.is_file()):
             with path.open("rb") as file:

@@ -18,7 +18,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import parallel_inversion
 from bidnerf_core.se3 import SE3
 
-SMALLEST_SIZE, LARGEST_SIZE = 0.5, 3.4
+SMALLEST_E_T, LARGEST_E_T = 0.5, 3.4
 """The range of e_t in the paper's tables: in units of a scene whose object fills a 2x2x2 cube, in metres in rooms."""
 
 
@@ -59,7 +59,7 @@ def inerf_start(T_true: SE3, seed: int) -> SE3:
 
 def rotation_of_size(size: float, widest: float = math.pi / 4) -> float:
     """Return e_r (rad) for e_t = ``size``, on the line from (0.5, 0.2) to (3.4, ``widest``)."""
-    return 0.2 + (size - SMALLEST_SIZE) / (LARGEST_SIZE - SMALLEST_SIZE) * (widest - 0.2)
+    return 0.2 + (size - SMALLEST_E_T) / (LARGEST_E_T - SMALLEST_E_T) * (widest - 0.2)
 
 
 def random_units(count: int, generator: Generator) -> Float[Tensor, "n 3"]:

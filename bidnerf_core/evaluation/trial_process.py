@@ -15,7 +15,7 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.evaluation.trials import opened, run_trial, settings_of
+from bidnerf_core.evaluation.trials import opened, parse_settings, run_trial
 from bidnerf_core.field import levels
 from bidnerf_core.frames import View
 from bidnerf_core.pixels import draw, uniform
@@ -78,7 +78,7 @@ def samples_per_ray(trial: Trial) -> float:
     """Return the mean number of valid samples on uniformly drawn rays."""
     stored, dataset = opened(trial.map, trial.data)
     (view,) = dataset.views(trial.split, trial.frames[-1:])
-    number = to_flat(settings_of(trial.method, trial.config)).get("level")
+    number = to_flat(parse_settings(trial.method, trial.config)).get("level")
     level = stored.field if number is None else levels(stored.field)[number]
     own = (View(view.frame, SE3.identity()),)
     pixels = draw(own, RAYS, uniform, torch.Generator().manual_seed(trial.seed))

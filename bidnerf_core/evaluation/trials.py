@@ -28,8 +28,7 @@ from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trial, TrialResult
 from bidnerf_core.frames import View
-from bidnerf_core.localization import Localization, Localizer
-from bidnerf_core.localization import settings_of as checked_settings
+from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.settings import to_flat
@@ -42,7 +41,7 @@ def run_trial(trial: Trial) -> TrialResult:
         stored, dataset = opened(trial.map, trial.data, trial.device)
         views = trial_views(trial, dataset)
         truth, start = views[-1].T_ref_camera, start_of(trial, views, dataset)
-        settings = settings_of(trial.method, trial.config)
+        settings = parse_settings(trial.method, trial.config)
         digests = input_digests(trial, stored, views)
         forget_peak_memory()
         found = _localized(trial, stored, views, start, settings)
@@ -81,7 +80,7 @@ def start_of(trial: Trial, views: list[View], dataset: Dataset) -> SE3 | None:
     return protocol.start(views[-1].T_ref_camera, trial.size, trial.seed, frames)
 
 
-def settings_of(method: str, config: str) -> Any:
+def parse_settings(method: str, config: str) -> Any:
     """Return the settings of ``method`` from the JSON of those that differ from its defaults."""
     try:
         plain = json.loads(config)
@@ -91,7 +90,7 @@ def settings_of(method: str, config: str) -> Any:
         raise InputError(
             f"config: found a {type(plain).__name__}, expected an object of settings of {method}"
         )
-    return checked_settings(method, plain)
+    return settings_of(method, plain)
 
 
 @contextmanager
