@@ -3,8 +3,8 @@
     python benchmarks/backend_step.py DATA MAP... --name backend_step_lego
 
 All maps render the same 2048 rays of a test frame from the same pose, 0.1 m from the truth, at the level that ``bid`` uses,
-with the gradient to the pose (forward and backward). They take turns, so that whatever else the machine does disturbs all
-alike; medians. Where a level's sampler only leaves out samples of another one (the vanilla field does that by its grid of
+with the gradient to the pose (forward and backward). They take turns, so that a change of the machine's load affects all
+alike, and medians are reported. Where a level's sampler only leaves out samples of another one (the vanilla field does that by its grid of
 free space), the step without skipping is timed as well, as ``MAP dense``.
 """
 
@@ -18,24 +18,29 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from record import write_record
 
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.comparison import labels, map_bytes
+from bidnerf_core.evaluation.comparison import map_bytes, map_labels
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import FieldValues, RadianceField, RaySampler
-from bidnerf_core.localization import BidConfig, Problem, single
+from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.field import FieldValues, RadianceField, RaySampler, SceneBounds, levels
+from bidnerf_core.frames import View
+from bidnerf_core.localization import BidConfig
+from bidnerf_core.localization.method_settings import objective_of
 from bidnerf_core.pixels import draw, uniform
 from bidnerf_core.rendering import render
-from bidnerf_core.residuals import objective
+from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
 
+RESULTS = Path(__file__).parent / "results"
+
 SETTINGS = BidConfig()
+OBJECTIVE = objective_of(SETTINGS.colour, SETTINGS.depth)
 
 
 @dataclass(frozen=True, eq=False)
 class Everywhere:
-    """A level that is asked wherever ``sampler`` says."""
+    """A level whose samples another sampler places."""
 
     level: RadianceField
     sampler: RaySampler
@@ -46,48 +51,50 @@ class Everywhere:
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """What is timed, and what is told of it."""
+    """A map and a level to time, and facts about them for the record."""
 
-    problem: Problem
+    view: View  # in the frame of its own camera
+    start: SE3  # T_world_camera
+    bounds: SceneBounds
     level: RadianceField
     about: dict[str, Any]
 
 
 def variants(folders: list[Path], data: Path) -> dict[str, Variant]:
     found: dict[str, Variant] = {}
-    for name, folder in zip(labels([str(f) for f in folders]), folders, strict=True):
+    for name, folder in zip(map_labels([str(f) for f in folders]), folders, strict=True):
         stored = load_map(folder)
         dataset = open_dataset(data, stored.bounds.background)
         (view,) = dataset.views("test", dataset.frame_names("test")[:1])
         start = perturb(view.T_ref_camera, 0.1, 2.0, seed=0)
-        problem = single(stored.field, stored.bounds, view.frame, start)
-        level = problem.level(SETTINGS.level)
+        level = levels(stored.field)[SETTINGS.descent.level or 0]
+        own = View(view.frame, SE3.identity())
         about = {
             "backend": stored.info.backend,
             "map_MiB": map_bytes(folder) / 2**20,
             "config": stored.info.config,
         }
-        found[name] = Variant(problem, level, about)
+        found[name] = Variant(own, start, stored.bounds, level, about)
         inner = getattr(level.sampler, "sampler", None)
         if isinstance(inner, RaySampler):
-            found[f"{name} dense"] = Variant(problem, Everywhere(level, inner), about)
+            found[f"{name} dense"] = Variant(own, start, stored.bounds, Everywhere(level, inner), about)
     return found
 
 
 def step(variant: Variant, seed: int) -> tuple[float, float]:
-    """Seconds, and samples a ray."""
-    problem = variant.problem
+    """Return the seconds of one step, and its samples a ray."""
     began = time.perf_counter()
-    pixels = draw(problem.views, SETTINGS.rays, uniform, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    pixels = draw([variant.view], SETTINGS.descent.rays, uniform, generator)
     delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    rays = pixels.rays(problem.start.retract(delta), problem.bounds)
-    rendering = render(variant.level, rays, problem.bounds.background)
-    objective(rendering, pixels, SETTINGS.colour_scale, SETTINGS.depth_weight).backward()
-    return time.perf_counter() - began, float(rendering.samples.valid.sum()) / SETTINGS.rays
+    rays = pixels.rays(variant.start.retract(delta), variant.bounds)
+    rendering = render(variant.level, rays, variant.bounds.background)
+    OBJECTIVE.loss(rendering, pixels).backward()
+    return time.perf_counter() - began, float(rendering.samples.valid.sum()) / SETTINGS.descent.rays
 
 
 def measured(found: dict[str, Variant], repeats: int) -> dict[str, Any]:
-    """In turns; the first round warms up."""
+    """Time all variants in turn; the first round warms up."""
     times: dict[str, list[float]] = {name: [] for name in found}
     samples: dict[str, list[float]] = {name: [] for name in found}
     for seed in range(repeats + 1):
@@ -112,7 +119,7 @@ def measured(found: dict[str, Variant], repeats: int) -> dict[str, Any]:
 
 
 def faster(mine: list[float], others: list[float]) -> float:
-    """Median over the turns."""
+    """Return the median ratio over the rounds."""
     return statistics.median(b / a for a, b in zip(mine, others, strict=True))
 
 
@@ -127,7 +134,13 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     found = measured(variants(given.maps, given.data), given.repeats)
-    print(write_record(given.name, {"rays": SETTINGS.rays, "level": SETTINGS.level, "steps": found}, seed=0))
+    print(
+        write_record(
+            RESULTS / f"{given.name}.json",
+            {"rays": SETTINGS.descent.rays, "level": SETTINGS.descent.level, "steps": found},
+            seed=0,
+        )
+    )
     for name, row in found.items():
         than = ", ".join(
             f"{ratio:.2f} times as fast as {other}" for other, ratio in row["times_faster_than"].items()

@@ -2,8 +2,8 @@
 
     python benchmarks/bake_cost.py --map MAP [MAP ...] [--data DATA] [--name bake_cost]
 
-Each map is copied, loses the surface that it may have, and is baked by ``bidnerf bake`` in a process of its own, one
-thread. ``--data``: as there; measured depth is taken where there is some.
+Each map is copied without its surface and baked by ``bidnerf bake`` in a process of its own, on one thread. ``--data`` is
+passed on to that command, which uses the measured depth where there is any.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from record import write_record
-
+from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.storage import load_info, load_map
 
-# The child tells of itself: what a parent hears of a child's peak includes its own.
+# The child measures itself: a parent's figure for the peak of a child includes the parent's own.
 MAIN = """
 import json, sys, time
 from bidnerf_core.cli import main
 from bidnerf_core.evaluation.memory import peak_memory_bytes
+
+RESULTS = Path(__file__).parent / "results"
 status = main(sys.argv[1:])
 print(json.dumps([time.process_time(), peak_memory_bytes()]))
 sys.exit(status)
@@ -75,7 +76,7 @@ def main() -> None:
         raise SystemExit("--map: two folders have one name, expected different ones")
     with TemporaryDirectory() as folder:
         results = {source.name: baked(source, given.data, Path(folder)) for source in given.map}
-    print(write_record(given.name, {"maps": results}, 0))
+    print(write_record(RESULTS / f"{given.name}.json", {"maps": results}, 0))
     print(json.dumps(results, indent=1))
 
 

@@ -12,47 +12,60 @@ import argparse
 import statistics
 import time
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from record import write_record
 from torch.profiler import ProfilerActivity, profile
 
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import RadianceField
-from bidnerf_core.localization import Problem, single
+from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.frames import View
+from bidnerf_core.localization import BidConfig
+from bidnerf_core.localization.method_settings import objective_of
 from bidnerf_core.pixels import draw, uniform
 from bidnerf_core.rendering import render
-from bidnerf_core.residuals import objective
+from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
 
-RAYS = 2048
+RESULTS = Path(__file__).parent / "results"
+
+SETTINGS = BidConfig()
+RAYS, OBJECTIVE = SETTINGS.descent.rays, objective_of(SETTINGS.colour, SETTINGS.depth)
 KINDS = {
     "gathers": ("index_select", "gather", "index", "take", "nonzero", "masked"),
     "matrix products": ("mm", "addmm", "bmm", "linear"),
 }
 
 
-def step(problem: Problem, field: RadianceField, seed: int) -> tuple[float, int]:
-    """Loss, with its gradient to the pose computed; and the number of queried samples."""
-    pixels = draw(problem.views, RAYS, uniform, torch.Generator().manual_seed(seed))
+@dataclass(frozen=True, eq=False)
+class Query:
+    """What one step localizes."""
+
+    view: View  # in the frame of its own camera
+    start: SE3  # T_world_camera
+    bounds: SceneBounds
+
+
+def step(query: Query, field: RadianceField, seed: int) -> tuple[float, int]:
+    """Compute the loss and its gradient to the pose; return the loss and the number of queried samples."""
+    pixels = draw([query.view], RAYS, uniform, torch.Generator().manual_seed(seed))
     delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    rendering = render(
-        field, pixels.rays(problem.start.retract(delta), problem.bounds), problem.bounds.background
-    )
-    loss = objective(rendering, pixels, 0.1, 1.0)
+    rendering = render(field, pixels.rays(query.start.retract(delta), query.bounds), query.bounds.background)
+    loss = OBJECTIVE.loss(rendering, pixels)
     loss.backward()
     return float(loss.detach()), int(rendering.samples.valid.sum())
 
 
-def shares(problem: Problem, field: RadianceField) -> dict[str, float]:
-    """Share of the time spent in the operators of each kind; ``overhead`` is time outside of any operator."""
+def shares(query: Query, field: RadianceField) -> dict[str, float]:
+    """Return the share of time spent in operators of each kind; ``overhead`` is time outside of any operator."""
     with profile(activities=[ProfilerActivity.CPU]) as trace:
         began = time.perf_counter()
         for seed in range(5):
-            step(problem, field, seed)
+            step(query, field, seed)
         wall = (time.perf_counter() - began) * 1e6
     spent: Counter[str] = Counter()
     for event in trace.key_averages():
@@ -76,30 +89,29 @@ def main() -> None:
     with_grid, without = load_map(given.map), load_map(given.map)
     dataset = open_dataset(given.data, with_grid.bounds.background)
     (view,) = dataset.views("test", [dataset.frame_names("test")[0]])
-    problem = single(
-        with_grid.field, with_grid.bounds, view.frame, perturb(view.T_ref_camera, 0.1, 2.0, seed=0)
-    )
+    start = perturb(view.T_ref_camera, 0.1, 2.0, seed=0)
+    query = Query(View(view.frame, SE3.identity()), start, with_grid.bounds)
     for sampler in (without.field.sampler, without.field.coarse_sampler):
         sampler.occupied.fill_(True)
         sampler.near_occupied.fill_(True)
     results: dict[str, Any] = {"rays": RAYS}
     for name, level in (("fine", 1), ("coarse", 0)):
         results[name] = compare(
-            problem, with_grid.field.levels[level], without.field.levels[level], given.repeats
+            query, with_grid.field.levels[level], without.field.levels[level], given.repeats
         )
-    print(write_record(given.name, results, seed=0))
+    print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
     print(results)
 
 
-def compare(problem: Problem, sparse: RadianceField, dense: RadianceField, repeats: int) -> dict[str, Any]:
-    """Alternating times of both, their losses on the same pixels, and the profile of the sparse one."""
+def compare(query: Query, sparse: RadianceField, dense: RadianceField, repeats: int) -> dict[str, Any]:
+    """Return alternating times of both, their losses on the same pixels, and the profile of the sparse one."""
     times: dict[str, list[float]] = {"sparse": [], "dense": []}
     losses: dict[str, list[float]] = {"sparse": [], "dense": []}
     samples = {}
     for seed in range(repeats + 1):
         for name, field in (("sparse", sparse), ("dense", dense)):
             began = time.perf_counter()
-            loss, samples[name] = step(problem, field, seed)
+            loss, samples[name] = step(query, field, seed)
             if seed:  # the first warms up
                 times[name].append(time.perf_counter() - began)
                 losses[name].append(loss)
@@ -117,7 +129,7 @@ def compare(problem: Problem, sparse: RadianceField, dense: RadianceField, repea
         "loss_spread_between_draws": statistics.stdev(losses["sparse"]),
         "rays_per_second": RAYS / seconds["sparse"],
         "samples_per_second": samples["sparse"] / seconds["sparse"],
-        "share_of_time_with_grid": shares(problem, sparse),
+        "share_of_time_with_grid": shares(query, sparse),
     }
 
 

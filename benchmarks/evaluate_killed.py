@@ -1,9 +1,9 @@
-"""An evaluation that is killed at random moments and resumed, beside one that nobody disturbs, and one on two dask workers.
+"""Compare an evaluation that is killed at random moments and resumed with an undisturbed one and one on two dask workers.
 
     python benchmarks/evaluate_killed.py [--kills 10] [--trials 40] [--name evaluate_killed]
 
-All on a closed-form scene, by the command line. The three files must be the same but for the times and memory that each
-line tells: no trial lost, none twice.
+All run on a closed-form scene by the command line. The three files must be equal except for the time and memory of each
+line: no trial is lost, and none is there twice.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from distributed import LocalCluster
-from record import write_record
 
+from bidnerf_core.evaluation.provenance import write_record
+
+RESULTS = Path(__file__).parent / "results"
 SCENE = "demo:blobs"
 MAIN = "import sys; from bidnerf_core.cli import main; sys.exit(main())"
 VARIES = ("seconds", "peak_memory_bytes")
 LONGEST = 15.0
-"""Seconds that a process lives before it is killed, at most: it needs some five before its first trial."""
+"""The longest time (s) before a process is killed; it needs some five seconds before its first trial."""
 
 
 def command(out: Path, trials: int, *more: str) -> list[str]:
@@ -40,7 +42,7 @@ def undisturbed(out: Path, trials: int, *more: str) -> None:
 
 
 def killed(out: Path, trials: int, kills: int, chance: random.Random) -> list[int]:
-    """Lines that were there after each kill; then one last run to the end."""
+    """Kill and resume an evaluation, then run it to the end; return the number of lines after each kill."""
     known = []
     while len(known) < kills:
         process = subprocess.Popen(
@@ -64,7 +66,7 @@ def on_dask(out: Path, trials: int) -> None:
 
 
 def lines(path: Path) -> list[dict[str, Any]]:
-    """Results that are whole, without what varies from run to run."""
+    """Return the results of whole lines without what varies from run to run."""
     whole = path.read_text().split("\n")[:-1] if path.exists() else []
     found = [json.loads(line) for line in whole]
     return [{name: value for name, value in line.items() if name not in VARIES} for line in found]
@@ -92,7 +94,7 @@ def main() -> None:
             "resumed equals undisturbed": lines(resumed) == lines(alone),
             "two dask workers equal one process": lines(together) == lines(alone),
         }
-    print(write_record(given.name, results, given.seed))
+    print(write_record(RESULTS / f"{given.name}.json", results, given.seed))
     print(json.dumps(results, indent=1))
 
 

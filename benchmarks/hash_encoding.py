@@ -12,12 +12,15 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import torch
-from record import write_record
 from torch import Tensor, nn
 
+from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
+
+RESULTS = Path(__file__).parent / "results"
 
 SEED = 0
 MODES = {  # name: (gradient to the tables, gradient to the points)
@@ -151,7 +154,7 @@ def main() -> None:
         print(
             f"{mode:26} plain {row['plain_ms']:7.1f} ms   ours {row['ours_ms']:6.1f} ms   {row['ratio']:.1f}x"
         )
-    print("written:", write_record("hash_encoding", results, SEED).name)
+    print("written:", write_record(RESULTS / "hash_encoding.json", results, SEED).name)
 
 
 if __name__ == "__main__":

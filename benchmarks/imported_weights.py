@@ -1,4 +1,4 @@
-"""Weights that others trained, against real images: how well they are seen, and whether poses are found in them.
+"""Weights that others trained: how well they render real images, and how often poses are found in them.
 
     pip install ./plugins/bidnerf-nerf-pytorch
     python benchmarks/imported_weights.py CHECKPOINT DATA --name imported_weights_lego
@@ -6,18 +6,18 @@
 The checkpoint is imported twice with the plugin's own command: as its README has it, for the PSNR of both levels on test
 images averaged over 2 x 2 pixels; and with ``--box`` and fewer samples a ray, for poses found by ``bid`` from starts of
 protocol ``bid``, in every combination of coarse and fine level with RGB and RGB-D, from the same starts. An RGB image
-has no depth at all, so that its pivot comes from the scene's box. One thread; what is finished is kept in a ``.jsonl``
-beside the record, so that an interrupted run goes on where it stopped.
+has no depth at all, so that its pivot comes from the scene's box. One thread runs everything; finished rows are kept in
+``.jsonl`` files beside the record, so that an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import statistics
 import tempfile
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,64 +25,58 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 from kornia.metrics import psnr
-from record import RESULTS, write_record
 from scipy.stats import binomtest
 
 from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.evaluation import protocols
-from bidnerf_core.evaluation.errors import CRITERIA, PoseError, pose_error, steps_to_success, success_rate
+from bidnerf_core.evaluation.errors import CRITERIA
 from bidnerf_core.evaluation.figures import depth_to_rgb, tile
+from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.evaluation.results import ResultsFile, key_of
+from bidnerf_core.evaluation.summary import NEVER, steps_of, summarize
+from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.field import levels
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import BidConfig, localize, single
 from bidnerf_core.rendering import render_image
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import Map, load_map
 from bidnerf_nerf_pytorch.command import main as import_command
 
+RESULTS = Path(__file__).parent / "results"
+
 LEVELS = {"coarse": 0, "fine": 1}
+Cell = tuple[str, str]
 CELLS = [(level, sensor) for level in LEVELS for sensor in ("RGB-D", "RGB")]
-DESCENT = BidConfig(rays=1024)  # half as many as usual: what one thread affords
+DESCENT = {"rays": 1024}  # half of the default, which suits one thread
 SHRINK = 2  # of images, for their PSNR
 
 
+def quick_name(given: argparse.Namespace) -> str:
+    """Return a folder's name that differs where checkpoint, box or samples do: trials are known by it."""
+    asked = json.dumps([given.checkpoint.name, given.box, given.samples])
+    return f"quick-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
+
+
 def imported(given: argparse.Namespace, folder: Path) -> tuple[Map, Map]:
-    """As the README has it; and within the object's box, with few samples."""
+    """Return the map as the README imports it, and one within the object's box with few samples a ray."""
     box = ["--box", *(str(edge) for edge in given.box)]
     quick = [*box, "--coarse-samples", str(given.samples[0]), "--fine-samples", str(given.samples[1])]
-    for name, options in (("plain", []), ("quick", quick)):
+    names = "plain", quick_name(given)
+    for name, options in zip(names, ([], quick), strict=True):
         if import_command([str(given.checkpoint), "--out", str(folder / name), *options]):
             raise SystemExit(1)
-    return load_map(folder / "plain"), load_map(folder / "quick")
+    return load_map(folder / names[0]), load_map(folder / names[1])
 
 
 def shrunk(frame: Frame) -> Frame:
-    """Colours averaged; depth is left out, since the mean of two surfaces lies on neither."""
+    """Return the frame with averaged colours, without depth, since the mean of two surfaces lies on neither."""
     rgb = torch.nn.functional.avg_pool2d(frame.rgb.movedim(-1, 0), SHRINK).movedim(0, -1)
     return Frame(frame.name, rgb, frame.intrinsics.scaled(1 / SHRINK))
 
 
-class Kept:
-    """Results by key, in a file of one line each."""
-
-    def __init__(self, path: Path) -> None:
-        lines = path.read_text().splitlines() if path.exists() else []
-        self.path = path
-        self.rows = {
-            line["key"]: line["row"] for line in map(json.loads, (x for x in lines if x.endswith("}")))
-        }
-
-    def get(self, key: list[Any], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        text = json.dumps(key)
-        if text not in self.rows:
-            self.rows[text] = make()
-            with self.path.open("a") as file:
-                file.write(json.dumps({"key": text, "row": self.rows[text]}) + "\n")
-        return self.rows[text]
-
-
 def seen(stored: Map, view: View, picture: Path | None) -> dict[str, float]:
-    """PSNR of each level; drawn where a file is named."""
+    """Return the PSNR of each level, and draw the images where a file is named."""
     frame = shrunk(view.frame)
     images = [
         render_image(level, frame.intrinsics, view.T_ref_camera, stored.bounds)
@@ -99,8 +93,8 @@ def seen(stored: Map, view: View, picture: Path | None) -> dict[str, float]:
     return found
 
 
-def image_quality(stored: Map, dataset: Dataset, given: argparse.Namespace, kept: Kept) -> dict[str, Any]:
-    """Of frames spread evenly over the test split; the first is drawn."""
+def image_quality(stored: Map, dataset: Dataset, given: argparse.Namespace, kept: RowStore) -> dict[str, Any]:
+    """Return the PSNR of frames spread evenly over the test split; the first one is drawn."""
     names = dataset.frame_names("test")
     rows = []
     for number, name in enumerate(names[:: max(1, len(names) // given.frames)][: given.frames]):
@@ -114,73 +108,58 @@ def image_quality(stored: Map, dataset: Dataset, given: argparse.Namespace, kept
     }
 
 
-def trial(stored: Map, view: View, level: str, sensor: str, seed: int, size: float) -> dict[str, Any]:
-    """One line of results."""
-    start = protocols.bid(view.T_ref_camera, size, seed)
+def cell_trial(folder: Path, given: argparse.Namespace, cell: Cell, frame: str, seed: int) -> Trial:
+    """Return the trial of one level and sensor. Without depth, frames have none and the pivot is the middle of the box."""
+    level, sensor = cell
     blind = sensor == "RGB"
-    frame = replace(view.frame, depth=None) if blind else view.frame
-    config = replace(DESCENT, level=LEVELS[level], depth_weight=0.0 if blind else 1.0)
-    found = localize(single(stored.field, stored.bounds, frame, start), "bid", config, seed)
-    errors = pose_error(found.poses, view.T_ref_camera)
-    return {
-        "level": level, "sensor": sensor, "frame": frame.name, "seed": seed, "converged": found.converged,
-        "steps": found.steps, "seconds": found.seconds, "loss": found.loss,
-        "translation": errors.translation.tolist(), "rotation_deg": errors.rotation_deg.tolist(),
-    }  # fmt: skip
+    settings = DESCENT | {"level": LEVELS[level], "depth_weight": 0.0 if blind else 1.0}
+    return Trial(
+        str(folder), str(given.data), (frame,), "bid", (given.size,), "bid", json.dumps(settings, sort_keys=True),
+        seed, depth=not blind,
+    )  # fmt: skip
 
 
-def all_trials(stored: Map, dataset: Dataset, given: argparse.Namespace, kept: Kept) -> list[dict[str, Any]]:
-    """Start by start, so that an interrupted run has the same starts in every cell; fine ones, which cost five times as
-    much, from the first few only.
+def all_trials(folder: Path, dataset: Dataset, given: argparse.Namespace) -> dict[Cell, list[TrialResult]]:
+    """Return the results of each cell.
+
+    Trials run start by start, so that an interrupted run has the same starts in every cell. Fine levels, which cost five
+    times as much, are tried from the first few starts only.
     """
-    names = [n for i, n in enumerate(dataset.frame_names("test")) if i % 5 != 1]  # those were tuned on
-    rows = []
-    for number in range(given.trials):
-        seed, name = given.seed + number, names[number % len(names)]
-        (view,) = dataset.views("test", [name])
-        for level, sensor in CELLS if number < given.fine_trials else CELLS[:2]:
-            key = [given.checkpoint.name, name, seed, level, sensor, to_plain(DESCENT), given.box]
-            rows.append(
-                kept.get(
-                    [*key, given.samples, given.size],
-                    lambda v=view, lv=level, sn=sensor, sd=seed: trial(stored, v, lv, sn, sd, given.size),
-                )
-            )
-            print(f"{number + 1}/{given.trials} {told(rows[-1])}", flush=True)
-    return rows
+    names = [
+        n for i, n in enumerate(dataset.frame_names("test")) if i % 5 != 1
+    ]  # settings were tuned on the others
+    cells: dict[Cell, list[TrialResult]] = {cell: [] for cell in CELLS}
+    with ResultsFile(RESULTS / f"{given.name}.partial.jsonl") as file:
+        for number in range(given.trials):
+            for cell in CELLS if number < given.fine_trials else CELLS[:2]:
+                trial = cell_trial(folder, given, cell, names[number % len(names)], given.seed + number)
+                if key_of(trial) not in file.results:
+                    file.add(run_trial(trial))
+                cells[cell].append(file.results[key_of(trial)])
+                print(f"{number + 1}/{given.trials} {row_text(cell, cells[cell][-1])}", flush=True)
+    return cells
 
 
-def told(row: dict[str, Any]) -> str:
-    errors = f"{row['translation'][-1]:.3f} units, {row['rotation_deg'][-1]:.2f} deg"
-    return f"{row['frame']} {row['level']} {row['sensor']}: {errors}, {row['seconds']:.0f} s"
+def row_text(cell: Cell, row: TrialResult) -> str:
+    """Return a trial as a line for the terminal."""
+    error = row.error
+    errors = f"{error.translation:.3f} units, {error.rotation_deg:.2f} deg" if error else "not finite"
+    return f"{row.frame} {' '.join(cell)}: {errors}, {row.seconds:.0f} s"
 
 
-def successes(rows: list[dict[str, Any]], name: str) -> list[bool]:
-    return [bool(CRITERIA[name](trace(row)[-1], trace(row)[0])) for row in rows]
+def final(cell: Cell, row: TrialResult) -> dict[str, Any]:
+    """Return a trial without its trace."""
+    kept = ("frame", "seed", "converged", "steps", "seconds", "loss")
+    error = {"translation": None, "rotation_deg": None} if row.error is None else asdict(row.error)
+    return {"level": cell[0], "sensor": cell[1], **{name: getattr(row, name) for name in kept}, **error}
 
 
-def trace(row: dict[str, Any]) -> PoseError:
-    return PoseError(torch.tensor(row["translation"]), torch.tensor(row["rotation_deg"]))
-
-
-def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of one cell: rates with Wilson intervals, errors, steps and time."""
-    result: dict[str, Any] = {"trials": len(rows)}
-    for name, criterion in CRITERIA.items():
-        result[name] = asdict(success_rate(sum(successes(rows, name)), len(rows)))
-        reached = [s for row in rows if (s := steps_to_success(trace(row), criterion)) is not None]
-        result[name]["median_steps_to_success"] = statistics.median(reached) if reached else None
-    result["median_translation"] = statistics.median(row["translation"][-1] for row in rows)
-    result["median_rotation_deg"] = statistics.median(row["rotation_deg"][-1] for row in rows)
-    result["seconds_per_step"] = statistics.median(row["seconds"] / row["steps"] for row in rows)
-    return result
-
-
-def difference(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> dict[str, Any]:
-    """Starts from which only one of two cells succeeded; exact McNemar test, two-sided."""
+def difference(first: list[TrialResult], second: list[TrialResult]) -> dict[str, Any]:
+    """Return the numbers of starts from which only one of two cells succeeded, and McNemar's exact two-sided p value."""
     result: dict[str, Any] = {}
     for name in CRITERIA:
-        pairs = list(zip(successes(first, name), successes(second, name), strict=False))  # starts of both
+        good = [[steps < NEVER for steps in steps_of(rows, name)] for rows in (first, second)]
+        pairs = list(zip(*good, strict=False))  # starts that both were tried from
         only = (sum(a and not b for a, b in pairs), sum(b and not a for a, b in pairs))
         p = binomtest(only[0], sum(only)).pvalue if sum(only) else 1.0
         result[name] = {
@@ -211,13 +190,12 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="file for a real image beside what the map shows")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
+    quality_rows = RESULTS / f"{given.name}.partial.rows.jsonl"
+    with tempfile.TemporaryDirectory() as folder, RowStore(quality_rows) as kept:
         plain, quick = imported(given, Path(folder))
-    dataset = open_dataset(given.data, plain.bounds.background)
-    kept = Kept(RESULTS / f"{given.name}.partial.jsonl")
-    rows = all_trials(quick, dataset, given, kept)
-    quality = image_quality(plain, dataset, given, kept)
-    cells = {cell: [r for r in rows if (r["level"], r["sensor"]) == cell] for cell in CELLS}
+        dataset = open_dataset(given.data, plain.bounds.background)
+        cells = all_trials(Path(folder) / quick_name(given), dataset, given)
+        quality = image_quality(plain, dataset, given, kept)
     differences = {
         f"{' '.join(a)} against {' '.join(b)}": difference(cells[a], cells[b])
         for i, a in enumerate(CELLS)
@@ -226,14 +204,15 @@ def main() -> None:
     results = {
         "checkpoint": f"{given.checkpoint.parent.name}/{given.checkpoint.name}", "data": given.data.name,
         "image_quality": {"size": f"1/{SHRINK} of the images", "map": to_plain(plain.info), **quality},
-        "start": f"bid:{given.size}", "localization_map": to_plain(quick.info), "settings": to_plain(DESCENT),
-        "cells": {" ".join(cell): summary(found) for cell, found in cells.items()},
+        "start": f"bid:{given.size}", "localization_map": to_plain(quick.info), "settings": DESCENT,
+        "cells": {" ".join(cell): asdict(summarize(found)) for cell, found in cells.items() if found},
         "differences": differences,
-        "rows": [{k: (v[-1] if isinstance(v, list) else v) for k, v in row.items()} for row in rows],
+        "rows": [final(cell, row) for cell, found in cells.items() for row in found],
     }  # fmt: skip
-    print(write_record(given.name, results, given.seed))
+    print(write_record(RESULTS / f"{given.name}.json", results, given.seed))
     print(json.dumps({"quality": quality, **results["cells"]}, indent=1))
-    kept.path.unlink()
+    for partial in (quality_rows, RESULTS / f"{given.name}.partial.jsonl"):
+        partial.unlink()
 
 
 if __name__ == "__main__":

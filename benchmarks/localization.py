@@ -4,10 +4,10 @@
     python benchmarks/localization.py MAP DATA --start none --method auto --all-frames --name no_start_lego
 
 ``--start`` is a protocol, with a size where it has sizes: ``bid:SIZE``, ``perturb:METRES:DEGREES``, ``inerf``, ``none``; one
-record may hold several. Frames whose place in the test split is 1 modulo 5 are left out by default: settings were tuned
-on them. Without ``--trials`` each frame is tried once. Trials run in processes of one thread; finished ones are kept in a
-``.jsonl`` beside the record, so that an interrupted run goes on where it stopped. ``bidnerf evaluate`` is the same for
-other purposes.
+record may hold several. Frames whose index in the test split is 1 modulo 5 are left out by default, since settings were
+tuned on them. Without ``--trials`` each frame is tried once. Trials run in processes of one thread; finished trials are
+kept in a ``.jsonl`` beside the record, so that an interrupted run goes on where it stopped. ``bidnerf evaluate`` is the
+command for other purposes.
 
 Where a method gives a covariance, ``consistent`` counts the answers whose normalised squared error lies inside the 95 %
 bound of chi-squared with 6 degrees of freedom.
@@ -18,66 +18,44 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import statistics
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
-from record import RESULTS, write_record
 from scipy.stats import chi2
 
 from bidnerf_core.evaluation.bench import Plan, left_to_do, local_processes, planned, run_trials
-from bidnerf_core.evaluation.errors import (
-    CRITERIA,
-    normalized_error_squared,
-    steps_to_success,
-    success_rate,
-)
+from bidnerf_core.evaluation.errors import normalized_error_squared, success_rate
+from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.summary import applies
-from bidnerf_core.evaluation.trials import Trial, TrialResult, opened
+from bidnerf_core.evaluation.summary import median, summarize
+from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import to_plain
+
+RESULTS = Path(__file__).parent / "results"
 
 BOUND = float(chi2(6).ppf(0.95))
 
 
 def summary(rows: list[TrialResult], truth: dict[str, SE3]) -> dict[str, Any]:
-    """Rates by each criterion with Wilson intervals, steps, time, and how honest ``converged`` and covariance were."""
-    traces = [row.errors.as_error() for row in rows]
-    result: dict[str, Any] = {"trials": len(rows)}
-    for name, criterion in CRITERIA.items():
-        if not applies(name, rows):
-            continue
-        good = [bool(criterion(trace[-1], trace[0])) for trace in traces]
-        result[name] = asdict(success_rate(sum(good), len(rows)))
-        reached = [s for trace in traces if (s := steps_to_success(trace, criterion)) is not None]
-        result[name]["median_steps_to_success"] = statistics.median(reached) if reached else None
-    right = [bool(CRITERIA["5deg 0.05"](trace[-1], trace[0])) for trace in traces]
-    said = [row.converged for row in rows]
-    result["converged"] = sum(said)
-    result["converged_but_wrong"] = sum(s and not r for s, r in zip(said, right, strict=True))
-    result["right_but_not_converged"] = sum(r and not s for s, r in zip(said, right, strict=True))
+    """Return the common statistics of trials, and how consistent their covariances are."""
+    result = asdict(summarize(rows))
     normalized = [value for row in rows if (value := nees(row, truth)) is not None]
     if normalized:
         inside = sum(value <= BOUND for value in normalized)
         result["consistent"] = asdict(success_rate(inside, len(normalized)))
-        middle = statistics.median(normalized)
-        result["median_normalized_error_squared"] = middle if math.isfinite(middle) else None
-    result["median_translation"] = statistics.median(float(t.translation[-1]) for t in traces)
-    result["median_rotation_deg"] = statistics.median(float(t.rotation_deg[-1]) for t in traces)
-    if all(row.start_error is not None for row in rows):
-        result["median_start_rotation_deg"] = statistics.median(float(t.rotation_deg[0]) for t in traces)
-    result["median_seconds"] = statistics.median(row.seconds for row in rows)
+        result["median_normalized_error_squared"] = median(normalized)
+    starts = [row.start_error for row in rows]
+    result["median_start_rotation_deg"] = median(e.rotation_deg if e else None for e in starts)
     result["slowest_seconds"] = max(row.seconds for row in rows)
-    result["seconds_per_step"] = statistics.median(row.seconds / max(1, row.steps) for row in rows)
-    result["peak_resident_GiB"] = max(row.peak_memory_bytes for row in rows) / 2**30
     return result
 
 
 def nees(row: TrialResult, truth: dict[str, SE3]) -> float | None:
-    """Normalised (estimation) error squared, infinite where the covariance is of no use; none where there is none."""
+    """Return the normalised (estimation) error squared, infinite for a singular covariance, none without one."""
     if row.covariance is None or row.T_world_camera is None:
         return None
     found = SE3.from_matrix(torch.tensor(row.T_world_camera, dtype=torch.float64))
@@ -87,7 +65,7 @@ def nees(row: TrialResult, truth: dict[str, SE3]) -> float | None:
 
 
 def final(row: TrialResult, truth: dict[str, SE3]) -> dict[str, Any]:
-    """A trial without its trace."""
+    """Return a trial without its trace."""
     error = None if row.error is None else to_plain(row.error)
     value = nees(row, truth)
     kept = ("frame", "seed", "converged", "reason", "steps", "seconds", "loss")
@@ -99,6 +77,7 @@ def final(row: TrialResult, truth: dict[str, SE3]) -> dict[str, Any]:
 
 
 def trials(given: argparse.Namespace, start: str) -> list[Trial]:
+    """Return the trials from one kind of start."""
     protocol, *size = start.split(":")
     _, dataset = opened(str(given.map), str(given.data))
     names = dataset.frame_names("test")
@@ -151,7 +130,7 @@ def main() -> None:
             for start, part in rows.items()
         },
     }
-    print(write_record(given.name, record, given.seed))
+    print(write_record(RESULTS / f"{given.name}.json", record, given.seed))
     print(json.dumps({start: part["summary"] for start, part in record["starts"].items()}, indent=1))
     partial.unlink()
 

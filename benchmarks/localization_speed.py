@@ -1,82 +1,66 @@
-r"""Methods and maps compared in one run: the same starts, one after the other.
+r"""Compare methods on maps in one run, from the same starts, one after the other.
 
     python benchmarks/localization_speed.py DATA --map MAP [MAP ...] --start bid:0.5 --methods bid bid-lm auto --trials 20 \
         --name speed_lego
 
 ``--start`` is a protocol, with a size where it has sizes: ``bid:SIZE``, ``perturb:METRES:DEGREES``, ``inerf``, ``none``.
-The first method is the one that the others are compared with, on each map. Frames whose place in the test split is 1
-modulo 5 are left out, since settings were tuned on them; ``--tuning-frames`` takes those alone. One process of one thread;
-finished trials are kept in a ``.jsonl`` beside the record, so that an interrupted run goes on where it stopped.
+The other methods are compared with the first one, on each map. Frames whose index in the test split is 1 modulo 5 are
+left out, since settings were tuned on them; ``--tuning-frames`` takes those only. One process of one thread runs all
+trials. Finished trials are kept in a ``.jsonl`` beside the record, so that an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import statistics
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
-from record import RESULTS, write_record
 
 from bidnerf_core.evaluation.bench import Plan, planned
-from bidnerf_core.evaluation.errors import CRITERIA, steps_to_success, success_rate
+from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.summary import applies
-from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, run_trial
+from bidnerf_core.evaluation.summary import Summary, summarize
+from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.evaluation.trials import opened, run_trial
+
+RESULTS = Path(__file__).parent / "results"
 
 
-def summary(rows: list[TrialResult]) -> dict[str, Any]:
-    """Success by each criterion with steps and seconds to it, cost, final errors, and honesty."""
-    traces = [row.errors.as_error() for row in rows]
-    result: dict[str, Any] = {"trials": len(rows)}
-    for name, criterion in CRITERIA.items():
-        if not applies(name, rows):
-            continue
-        steps = [steps_to_success(trace, criterion) for trace in traces]
-        good = [(row, s) for row, s in zip(rows, steps, strict=True) if s is not None]
-        seconds = [row.seconds * s / max(1, row.steps) for row, s in good]
-        result[name] = asdict(success_rate(len(good), len(rows))) | {
-            "median_steps_to_success": statistics.median(s for _, s in good) if good else None,
-            "median_seconds_to_success": statistics.median(seconds) if good else None,
-        }
-    right = [bool(CRITERIA["5deg 0.05"](trace[-1], trace[0])) for trace in traces]
-    said = [row.converged for row in rows]
-    return result | {
-        "median_steps": statistics.median(row.steps for row in rows),
-        "median_seconds": statistics.median(row.seconds for row in rows),
-        "median_translation": statistics.median(float(t.translation[-1]) for t in traces),
-        "median_rotation_deg": statistics.median(float(t.rotation_deg[-1]) for t in traces),
-        "converged_but_wrong": sum(s and not r for s, r in zip(said, right, strict=True)),
-        "right_but_not_converged": sum(r and not s for s, r in zip(said, right, strict=True)),
+def ratios(base: Summary, other: Summary) -> dict[str, float | None]:
+    """Return how many times fewer steps and less time ``other`` takes than ``base``: in all, and to success."""
+    found: dict[str, float | None] = {
+        "steps": base.steps / other.steps,
+        "seconds": base.seconds / other.seconds,
     }
-
-
-def ratios(base: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
-    """How many times fewer steps and less time ``other`` takes: in all, and to success."""
-    found = {name: base[name] / other[name] for name in ("median_steps", "median_seconds")}
-    for criterion in (name for name in CRITERIA if name in base):
-        for what in ("median_steps_to_success", "median_seconds_to_success"):
-            one, two = base[criterion][what], other[criterion][what]
-            found[f"{criterion}: {what}"] = None if one is None or not two else one / two
+    for name, one in base.criteria.items():
+        two = other.criteria[name]
+        if one is not None and two is not None:
+            found[f"{name}: steps to success"] = _ratio(one.steps, two.steps)
+            found[f"{name}: time to success"] = _ratio(one.milliseconds, two.milliseconds)
     return found
 
 
+def _ratio(one: float | None, two: float | None) -> float | None:
+    return None if one is None or not two else one / two
+
+
 def of_map(rows: dict[str, list[TrialResult]]) -> dict[str, Any]:
-    """What each method came to on one map, and how the others compare with the first."""
-    summaries = {method: summary(found) for method, found in rows.items()}
+    """Return the statistics of each method on one map, and how the others compare with the first."""
+    summaries = {method: summarize(found) for method, found in rows.items()}
     first, *others = summaries
     return {
         "backend": rows[first][0].backend,
-        "methods": summaries,
+        "methods": {method: asdict(found) for method, found in summaries.items()},
         f"times less than {first}": {name: ratios(summaries[first], summaries[name]) for name in others},
         "settings": {method: found[0].settings for method, found in rows.items()},
     }
 
 
 def trials(given: argparse.Namespace, folder: Path, method: str) -> list[Trial]:
+    """Return the trials of one method on one map."""
     protocol, *size = given.start.split(":")
     _, dataset = opened(str(folder), str(given.data))
     names = dataset.frame_names("test")
@@ -117,7 +101,13 @@ def main() -> None:
         print()
         rows = {which: [file.results[key_of(t)] for t in listed] for which, listed in wanted.items()}
     maps = {m.name: of_map({x: rows[m, x] for x in given.methods}) for m in given.map}
-    print(write_record(given.name, {"data": given.data.name, "start": given.start, "maps": maps}, given.seed))
+    print(
+        write_record(
+            RESULTS / f"{given.name}.json",
+            {"data": given.data.name, "start": given.start, "maps": maps},
+            given.seed,
+        )
+    )
     print(json.dumps({name: found["methods"] for name, found in maps.items()}, indent=1))
     partial.unlink()
 

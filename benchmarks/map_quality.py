@@ -1,4 +1,4 @@
-"""Train a map as a user would, and judge it on frames that training never saw.
+"""Train a map as a user would, and measure it on frames that training never saw.
 
     python benchmarks/map_quality.py DATA --out MAP --name map_lego [-- OPTIONS OF bidnerf train]
 
@@ -20,13 +20,15 @@ from typing import Any
 
 import torch
 from kornia.metrics import psnr, ssim
-from record import write_record
 
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render_image
 from bidnerf_core.storage import load_map
+
+RESULTS = Path(__file__).parent / "results"
 
 
 def train(data: Path, out: Path, options: list[str]) -> dict[str, float]:
@@ -78,7 +80,7 @@ def samples_per_ray(field: RadianceField, bounds: SceneBounds, views: list[View]
 
 
 def beside_dense(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, Any] | None:
-    """The field and its ``dense`` twin on the same frames, fewer of them: the twin is slow."""
+    """Return the quality of the field and of its ``dense`` counterpart, which is slow, on every fifth frame."""
     dense = getattr(field, "dense", None)
     if dense is None:
         return None
@@ -109,7 +111,7 @@ def main() -> None:
     }
     if compared := beside_dense(stored.field, stored.bounds, views):
         results["beside_dense"] = compared
-    print(write_record(given.name, results, seed=stored.info.config.get("seed", 0)))
+    print(write_record(RESULTS / f"{given.name}.json", results, seed=stored.info.config.get("seed", 0)))
     print({k: v for k, v in results.items() if k != "config"})
 
 

@@ -7,10 +7,10 @@
 - ``table2``: 1 image, 8 images 15 degrees apart, 8 and wide sampling, at e_t 0.9, 1.7 and 3.4;
 - ``inerf``: ``bid`` and ``inerf`` from iNeRF's starts.
 
-All cells of a part share the frames, the starts, the number of rays and of steps, and settings of their method but those
-compared. The rays are fewer than the paper's 2048. In ``table1`` cells without depth are given frames that have none, so
-that nothing profits from it: ``bid`` then turns about the middle of the map, and not of what was measured. Frames whose
-place in the test split is 1 modulo 5 are not sought: settings were tuned on them.
+All cells of a part share the frames, the starts, the numbers of rays and steps, and all settings but those compared. The
+rays are fewer than the paper's 2048. In ``table1``, the frames of cells without depth have none, so that nothing profits
+from it: ``bid`` then turns about the middle of the map instead of the middle of the measured points. Frames whose index in
+the test split is 1 modulo 5 are left out, since settings were tuned on them.
 
 Each part and map has a file of results in FOLDER, safe against any kill: the same command goes on where it stopped. When
 a part is complete, its record is written beside it; ``bidnerf report FOLDER/table1_*.jsonl`` draws it.
@@ -25,15 +25,17 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from record import RESULTS, write_record
-
 from bidnerf_core.cli.trial_progress import TrialProgress
 from bidnerf_core.evaluation.bench import Plan, left_to_do, local_processes, planned, run_trials
 from bidnerf_core.evaluation.groups import Group, grouped
-from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
+from bidnerf_core.evaluation.provenance import note_run, provenance, script_command, write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.summary import comparisons, summarize
-from bidnerf_core.evaluation.trials import Trial, opened
+from bidnerf_core.evaluation.significance import pairwise_tests
+from bidnerf_core.evaluation.summary import summarize
+from bidnerf_core.evaluation.trial import Trial
+from bidnerf_core.evaluation.trials import opened
+
+RESULTS = Path(__file__).parent / "results"
 
 Settings = dict[str, Any]
 
@@ -50,7 +52,7 @@ PAPER = {
 
 
 def table1(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
-    """``trials`` of all three sizes together."""
+    """Return the cells of table 1; ``trials`` is the number over all three sizes."""
     each = -(-(trials or 24) // 3)
     plan = replace(base, protocol="bid", sizes=((0.5,), (0.8,), (1.2,)), trials=each)
     return [
@@ -61,7 +63,7 @@ def table1(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
 
 
 def depth_weight(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
-    """The cells of ``table1`` with depth, from the same starts, with a tenth of its weight."""
+    """Return the cells of ``table1`` that have depth, from the same starts, with a tenth of its weight."""
     return [
         replace(plan, config=_json(json.loads(plan.config) | {"depth_weight": 0.1}))
         for plan in table1(base, common, trials)
@@ -70,6 +72,7 @@ def depth_weight(base: Plan, common: Settings, trials: int | None) -> list[Plan]
 
 
 def table2(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
+    """Return the cells of table 2."""
     plan = replace(base, protocol="bid", sizes=((0.9,), (1.7,), (3.4,)), trials=trials or 16)
     ending = sequence_ends(plan)  # one image is the last of the eight: the same frames for all
     return [
@@ -80,6 +83,7 @@ def table2(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
 
 
 def inerf(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
+    """Return ``bid`` and ``inerf`` from the starts of iNeRF."""
     plan = replace(base, protocol="inerf", trials=trials or 25)
     return [replace(plan, method=method, config=_json(common)) for method in ("bid", "inerf")]
 
@@ -93,18 +97,19 @@ PARTS: dict[str, Callable[[Plan, Settings, int | None], list[Plan]]] = {
 
 
 def untuned(map_folder: str, data: str) -> tuple[str, ...]:
+    """Return the test frames that settings were not tuned on."""
     _, dataset = opened(map_folder, data)
     return tuple(name for place, name in enumerate(dataset.frame_names("test")) if place % 5 != 1)
 
 
 def sequence_ends(plan: Plan) -> tuple[str, ...]:
-    """Frames that a sequence of eight ends with."""
+    """Return the frames that end a sequence of eight."""
     every = planned(replace(plan, images=8, trials=10_000, sizes=((0.9,),)))
     return tuple(dict.fromkeys(trial.frame for trial in every))
 
 
 def run_part(trials: Sequence[Trial], path: Path, workers: int) -> list[Group]:
-    """Groups of the results, when all are there."""
+    """Run what is missing and return the groups of all results."""
     with ResultsFile(path) as file:
         todo = left_to_do(trials, file)
         if todo:
@@ -118,7 +123,7 @@ def run_part(trials: Sequence[Trial], path: Path, workers: int) -> list[Group]:
 
 
 def as_record(groups: Sequence[Group]) -> dict[str, Any]:
-    """Rates by each criterion, costs, and p values of each pair, by size and over all of them."""
+    """Return rates by each criterion, costs, and p values of each pair, for each size and over all sizes."""
     cells = [
         {
             "map": group.situation.map,
@@ -128,7 +133,9 @@ def as_record(groups: Sequence[Group]) -> dict[str, Any]:
         }
         for group in groups
     ]
-    pairs = [asdict(pair) | {"criterion": c} for c in ("10%", "5deg 0.05") for pair in comparisons(groups, c)]
+    pairs = [
+        asdict(pair) | {"criterion": c} for c in ("10%", "5deg 0.05") for pair in pairwise_tests(groups, c)
+    ]
     return {"cells": cells, "settings": [g.results[0].settings for g in groups], "pairs": pairs}
 
 
@@ -160,7 +167,7 @@ def main() -> None:
             name = f"{part}_{trials[0].portable.map.replace(':', '_')}"
             groups = run_part(trials, given.out / f"{name}.jsonl", given.workers)
             results = {"paper_percent": PAPER.get(part), "common_settings": common, **as_record(groups)}
-            print(write_record(name, results, given.seed, given.out))
+            print(write_record(given.out / f"{name}.json", results, given.seed))
 
 
 def _json(settings: Settings) -> str:

@@ -1,4 +1,4 @@
-"""What a user would take without a radiance field, beside method ``auto``, on the same map and the same frames.
+"""Compare method ``auto`` with registration of point clouds, which needs no radiance field, on the same map and frames.
 
     python benchmarks/registration_baselines.py MAP DATA --name registration_lego
 
@@ -11,16 +11,17 @@ Compared, alternately, each on one thread, on every frame of the test split:
 - ``auto from start``: ours from the same starts;
 - ``auto + gicp``: GICP from the answer of ``auto``, which had no start.
 
-The map (``bidnerf bake`` must have been there) gives its surfels to the others; a frame gives every pixel with a depth.
-``--voxel`` is where tuning begins: 5 cm in rooms, or 2 % of what is seen. Voxels, distances and stages are chosen for each
-scene on frames whose place in the split is 1 modulo 5, and those do not count. Times begin with the frame in memory and
-the map's points, features and trees made.
+The other methods register every pixel with a depth with the surfels of the map, which ``bidnerf bake`` makes. ``--voxel``
+is where tuning begins: 5 cm in rooms, or 2 % of the extent of an object. Voxels, distances and stages are chosen for each
+scene on frames whose index in the split is 1 modulo 5, which do not count. Times begin with the frame in memory and the
+map's points, features and trees made.
 
 small_gicp comes with ``pip install '.[eval]'``. Open3D is large and is wanted nowhere else: give it its own environment,
 
     python3.11 -m venv .venv-open3d && .venv-open3d/bin/pip install -c constraints.txt '.[eval]' open3d
 
-What is not installed is skipped. What is finished is kept in a ``.jsonl`` beside the record: an interrupted run goes on.
+Libraries that are not installed are skipped. Finished rows are kept in a ``.jsonl`` beside the record, so that an
+interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -42,40 +43,42 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from kept import Kept
-from record import RESULTS, write_record
 from registration_clouds import Points, map_points, measured_points
 from registration_methods import Gicp, Matrix, Open3d, Ransac, Refine, SmallGicp
 from registration_tuning import Case, as_pose, cases, tuned_gicp, tuned_open3d
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import CRITERIA, pose_error, success_rate
-from bidnerf_core.evaluation.protocols import bid
+from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation.protocols import bid_start
+from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.frames import View
-from bidnerf_core.localization import localize, rig
+from bidnerf_core.localization import Localizer
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.storage import Map
 
+RESULTS = Path(__file__).parent / "results"
+
 OPEN3D: dict[str, type] = {"ransac": Ransac, "icp": Refine, "coloured icp": Refine}
-"""Settings by name, and of which kind they are."""
+"""The type of the settings, by their name."""
 
 Registration = Callable[[View, int], Matrix]
-"""T_world_camera of a view, whose own pose is for making a start from it only."""
+"""Returns T_world_camera of a view from its seed; the view's own pose serves only to make a start from it."""
 
 
-def auto(stored: Map, view: View, start: SE3 | None, seed: int) -> Matrix:
-    problem = rig(stored.field, stored.bounds, [view], start, surface=stored.surface)
-    return localize(problem, "auto", seed=seed).T_world_camera.matrix().numpy()
+def auto(localizer: Localizer, view: View, start: SE3 | None, seed: int) -> Matrix:
+    """Return the answer of method ``auto``."""
+    return localizer(view, start, seed=seed).T_world_camera.matrix().numpy()
 
 
 def start_of(truth: SE3, off: float, seed: int) -> Matrix:
-    return bid(truth, off, seed).matrix().numpy()
+    return bid_start(truth, off, seed).matrix().numpy()
 
 
-def tuning(stored: Map, views: Sequence[View], voxel: float, off: float, kept: Kept) -> dict[str, Any]:
-    """Settings by name, of what is installed."""
+def tuning(stored: Map, views: Sequence[View], voxel: float, off: float, kept: RowStore) -> dict[str, Any]:
+    """Return the chosen settings of each library that is installed, by name."""
     points = map_points(stored.surface)
     tries = cases([(measured_points(view.frame), view.T_ref_camera) for view in views])
     chosen: dict[str, Any] = {}
@@ -84,7 +87,8 @@ def tuning(stored: Map, views: Sequence[View], voxel: float, off: float, kept: K
         chosen = {name: from_plain(OPEN3D[name], plain[name], name) for name in OPEN3D}
     if find_spec("small_gicp"):
         given = [start_of(case.truth, off, i) for i, case in enumerate(tries)]
-        found = [auto(stored, views[i % len(views)], None, i) for i in range(len(tries))]
+        localizer = Localizer(stored)
+        found = [auto(localizer, views[i % len(views)], None, i) for i in range(len(tries))]
         for name, starts in {"gicp": given, "auto + gicp": found}.items():
             plain = kept.get(
                 ["tuned", name], partial(gicp_settings, points, tries, starts, voxel, name != "gicp")
@@ -108,12 +112,12 @@ def gicp_settings(
 
 
 def registrations(stored: Map, chosen: dict[str, Any], off: float) -> dict[str, Registration]:
-    """By name, with all made of the map that can be made beforehand."""
-    points = map_points(stored.surface)
+    """Return the registrations by name, with everything computed from the map in advance."""
+    points, localizer = map_points(stored.surface), Localizer(stored)
     result: dict[str, Registration] = {
-        "auto": lambda view, seed: auto(stored, view, None, seed),
+        "auto": lambda view, seed: auto(localizer, view, None, seed),
         "auto from start": lambda view, seed: auto(
-            stored, view, as_pose(start_of(view.T_ref_camera, off, seed)), seed
+            localizer, view, as_pose(start_of(view.T_ref_camera, off, seed)), seed
         ),
     }
     if "ransac" in chosen:
@@ -132,7 +136,7 @@ def registrations(stored: Map, chosen: dict[str, Any], off: float) -> dict[str, 
             measured_points(view.frame), start_of(view.T_ref_camera, off, seed), chosen["gicp"]
         )
         result["auto + gicp"] = lambda view, seed: gicp.refine(
-            measured_points(view.frame), auto(stored, view, None, seed), chosen["auto + gicp"]
+            measured_points(view.frame), auto(localizer, view, None, seed), chosen["auto + gicp"]
         )
     return result
 
@@ -165,7 +169,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def times_slower(rows: dict[str, list[dict[str, Any]]], name: str, clock: str) -> float:
-    """Than ``auto``, median over frames: both had the machine in the same state."""
+    """Return how many times slower than ``auto`` a method is: the median over frames, on which both ran in turn."""
     pairs = zip(rows[name], rows["auto"], strict=True)
     return statistics.median(row[clock] / ours[clock] for row, ours in pairs)
 
@@ -181,10 +185,10 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def compared(runs: dict[str, Registration], views: Sequence[View], kept: Kept) -> dict[str, Any]:
-    """Rows by method, of the frames that settings were not tuned on."""
+def compared(runs: dict[str, Registration], views: Sequence[View], kept: RowStore) -> dict[str, Any]:
+    """Return the rows of each method on the frames that settings were not tuned on."""
     names = list(runs)
-    for run in runs.values():  # what is done once only is not timed
+    for run in runs.values():  # work that is done only once is not timed
         run(views[1], 0)
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for place, view in enumerate(views):
@@ -216,11 +220,11 @@ def main() -> None:
     if stored.surface is None:
         raise InputError(f"{given.map}: no baked surface, expected one as 'bidnerf bake' makes it")
     views = dataset.views("test")
-    kept = Kept(RESULTS / f"{given.name}.partial.jsonl")
-    chosen = tuning(stored, views[1::5], given.voxel, given.off, kept)
-    runs = registrations(stored, chosen, given.off)
-    wanted = given.methods or list(runs)
-    rows = compared({name: run for name, run in runs.items() if name in wanted}, views, kept)
+    with RowStore(RESULTS / f"{given.name}.partial.jsonl") as kept:
+        chosen = tuning(stored, views[1::5], given.voxel, given.off, kept)
+        runs = registrations(stored, chosen, given.off)
+        wanted = given.methods or list(runs)
+        rows = compared({name: run for name, run in runs.items() if name in wanted}, views, kept)
     methods = {
         name: summary(found)
         | {f"{clock}_against_auto": times_slower(rows, name, clock) for clock in ("seconds", "cpu_seconds")}
@@ -235,7 +239,7 @@ def main() -> None:
         "methods": methods,
         "rows": rows,
     }
-    print(write_record(given.name, results, 0))
+    print(write_record(RESULTS / f"{given.name}.json", results, 0))
     print(json.dumps(methods, indent=1))
     kept.path.unlink()
 

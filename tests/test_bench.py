@@ -6,27 +6,32 @@ import itertools
 import json
 import os
 import random
+import shutil
 import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import pytest
 import torch
 
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.bench import InThisProcess, Plan, planned, run_trials, share
+from bidnerf_core.evaluation.bench import InThisProcess, Plan, planned, run_trials, shard_of
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map
 from bidnerf_core.evaluation.errors import pose_error
-from bidnerf_core.evaluation.provenance import read_runs
-from bidnerf_core.evaluation.results import ResultsFile, as_line, read_results
+from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation.provenance import read_runs, write_record
+from bidnerf_core.evaluation.results import ResultsFile, read_results, result_line
 from bidnerf_core.evaluation.sequences import mean_up, seen_middle, sequence, turned_about
-from bidnerf_core.evaluation.trials import Trial, TrialResult, run_trial
+from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.localization import METHODS
 from bidnerf_core.scenes.trajectories import look_at, orbit
+from bidnerf_core.settings import to_flat
 
 QUICK = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--workers", "1"]
 BLOBS = "demo:blobs"
@@ -78,13 +83,13 @@ def test_a_plan_is_its_protocol_for_each_size() -> None:
 @pytest.mark.parametrize("shards", [1, 2, 3, 7, 100])
 def test_shards_share_all_trials_between_them(shards: int) -> None:
     trials = planned(Plan(BLOBS, BLOBS))
-    parts = [share(trials, number, shards) for number in range(shards)]
+    parts = [shard_of(trials, number, shards) for number in range(shards)]
     assert sorted(t.seed * 100 + t.size[0] for p in parts for t in p) == sorted(
         t.seed * 100 + t.size[0] for t in trials
     )
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
     with pytest.raises(InputError, match="shard is"):
-        share(trials, shards, shards)
+        shard_of(trials, shards, shards)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +147,7 @@ def test_a_turned_camera_sees_its_middle_in_the_same_place() -> None:
 
 @pytest.fixture
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.evaluation.closed_form_data.CAMERA", tiny.CAMERA)
+    monkeypatch.setattr("bidnerf_core.evaluation.closed_form_data.DEMO_CAMERA", tiny.CAMERA)
 
 
 @pytest.mark.usefixtures("small_images")
@@ -218,7 +223,7 @@ def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(
 
 def _written(path: Path, *seeds: int) -> list[TrialResult]:
     results = [run_trial(blob_trial(seed)) for seed in seeds]
-    path.write_bytes(b"".join(map(as_line, results)))
+    path.write_bytes(b"".join(map(result_line, results)))
     return results
 
 
@@ -227,12 +232,12 @@ def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, ke
     path = tmp_path / "r.jsonl"
     first, second = _written(path, 0, 1)
     whole = path.read_bytes()
-    half = as_line(second)
-    path.write_bytes(as_line(first) + half[: max(1, int(kept * len(half)) - 1)])
+    half = result_line(second)
+    path.write_bytes(result_line(first) + half[: max(1, int(kept * len(half)) - 1)])
     assert read_results([path]) == [first]
     with ResultsFile(path) as file:
         assert list(file.results.values()) == [first]
-        assert path.read_bytes() == as_line(first)
+        assert path.read_bytes() == result_line(first)
         file.add(second)
     assert path.read_bytes() == whole
 
@@ -289,7 +294,7 @@ def test_more_trials_and_other_methods_go_into_the_same_file(tmp_path: Path, eva
     before = (tmp_path / "r.jsonl").read_bytes()
     status, err = evaluate("--trials", 3, "--size", 0.3)
     assert status == 0
-    assert "2 of 3 trials are there already" in err
+    assert "2 of 3 trials are already there" in err
     assert (tmp_path / "r.jsonl").read_bytes().startswith(before)
     assert evaluate("--trials", 2, "--method", "inerf", "--protocol", "inerf")[0] == 0
     assert [r.method for r in read_results([tmp_path / "r.jsonl"])] == ["bid"] * 3 + ["inerf"] * 2
@@ -308,6 +313,151 @@ def test_another_training_of_the_map_is_not_mixed_in(tmp_path: Path, evaluate: E
     assert "another training of map demo:blobs (other, expected exact)" in err
     path.write_text(content.replace('"depth_weight": 1.0', '"depth_weight": 0.5'))
     assert "was made with depth_weight 0.5, expected 1.0" in evaluate("--trials", 1, "--size", 0.3)[1]
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    return tiny.write_dataset(tmp_path / "photos")
+
+
+def test_results_of_other_images_are_refused(
+    tmp_path: Path, photos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Folders are known by name, so the content decides: a moved copy is the same data, a changed one is not."""
+
+    def run(data: Path) -> tuple[int, str]:
+        words = ["evaluate", BLOBS, str(data), "--out", str(tmp_path / "r.jsonl"), *QUICK, "--size", "0.3"]
+        status = main([*words, "--trials", "3"])
+        return status, capsys.readouterr().err
+
+    assert run(photos)[0] == 0
+    before = (tmp_path / "r.jsonl").read_bytes()
+    status, err = run(Path(shutil.copytree(photos, tmp_path / "moved" / "photos")))
+    assert (status, "3 of 3 trials are already there" in err) == (0, True)
+    for what in ("images", "depth", "transforms.json"):
+        changed = Path(shutil.copytree(photos, tmp_path / what / "photos"))
+        if what == "transforms.json":
+            about = json.loads((changed / what).read_text())
+            for frame in about["frames"]:
+                frame["transform_matrix"][0][3] += 0.25
+            (changed / what).write_text(json.dumps(about))
+        else:
+            for image in (changed / what).glob("t_*.png"):
+                iio.imwrite(image, iio.imread(image)[::-1])
+        status, err = run(changed)
+        assert (status, err.count("\n")) == (1, 1), err
+        assert "made with other images, depth or cameras" in err
+    assert (tmp_path / "r.jsonl").read_bytes() == before
+
+
+def test_results_of_an_earlier_version_are_resumed_and_reported(
+    tmp_path: Path, evaluate: Evaluate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "r.jsonl"
+    here = Path(__file__).parent
+    path.write_bytes((here / "earlier_results.jsonl").read_bytes())
+    (tmp_path / "r.meta.json").write_bytes((here / "earlier_results.meta.json").read_bytes())
+    assert [r.inputs for r in read_results([path])] == [None, None]
+    status, err = evaluate("--trials", 3, "--size", 0.3)
+    assert status == 0
+    assert "2 results of an earlier version do not record their images" in err
+    assert "2 of 3 trials are already there" in err
+    assert [r.inputs is None for r in read_results([path])] == [True, True, False]
+    assert main(["report", str(path), "--out", str(tmp_path / "report")]) == 0
+    assert "3 trials" in (tmp_path / "report" / "index.html").read_text()
+
+
+def test_repeated_frames_are_announced(evaluate: Evaluate) -> None:
+    assert "distinct" not in evaluate("--trials", 2, "--size", 0.3)[1]
+    err = evaluate("--frame", "0000", "0001", "--trials", 5, "--size", 0.3, 0.4)[1]
+    assert (
+        "2 distinct frames of split 'test', each tried 2 to 3 times of each size with different seeds" in err
+    )
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced: bool) -> None:
+    path = tmp_path / "r.jsonl"
+    results = [run_trial(blob_trial(seed)) for seed in range(2)]
+    with ResultsFile(path) as file:
+        file.add(results[0])
+        path.unlink()
+        if replaced:
+            path.write_text("")
+        with pytest.raises(InputError, match="was removed or replaced while it was written"):
+            file.add(results[1])
+        with pytest.raises(InputError, match="was removed or replaced"):
+            file.put_in_order([blob_trial(0)])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"steps": 2', '"steps": 1' + "0" * 400, "steps is larger than any"),
+        (
+            '"errors": {"translation": [',
+            '"errors": {"translation": [1.0, ',
+            "4 translation and 3 rotation errors",
+        ),
+        ('"reason": "', '"reason": "\\ud800', "line 1: not JSON"),
+    ],
+)
+def test_numbers_and_text_that_nothing_can_hold_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+) -> None:
+    line = result_line(run_trial(blob_trial(0))).decode()
+    assert old in line
+    path = tmp_path / "r.jsonl"
+    path.write_text(line.replace(old, new))
+    assert main(["report", str(path), "--out", str(tmp_path / "report")]) == 1
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+
+
+# Rows of scripts.
+
+
+def test_a_script_goes_on_where_it_was_killed(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    with RowStore(path) as store:
+        assert [store.get(["a", n], lambda n=n: {"value": n}) for n in (1, 2)] == [{"value": 1}, {"value": 2}]
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-5])  # a kill in the middle of the second row
+    made: list[int] = []
+
+    def make() -> dict[str, int]:
+        made.append(2)
+        return {"value": 2}
+
+    with RowStore(path) as store:
+        assert store.get(["a", 1], make) == {"value": 1}
+        assert made == []
+        assert store.get(["a", 2], make) == store.get(["a", 2], make) == {"value": 2}
+        with pytest.raises(InputError, match="another process"), RowStore(path):
+            pass
+    assert made == [2]
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize("content", ["notes\n", '{"a": 1}\n', "[1]\n"])
+def test_rows_of_something_else_are_left_alone(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "rows.jsonl"
+    path.write_text(content)
+    with pytest.raises(InputError, match="expected lines as a benchmark keeps"), RowStore(path):
+        pass
+    assert path.read_text() == content
+
+
+def test_a_record_holds_its_results_and_how_they_were_made(tmp_path: Path) -> None:
+    path = write_record(tmp_path / "new" / "speed.json", {"rate": 0.5}, seed=3)
+    record = json.loads(path.read_text())
+    assert (record["benchmark"], record["seed"], record["results"]) == ("speed", 3, {"rate": 0.5})
+    assert record["command"].startswith("python ")
+    assert {"commit", "dirty", "cpu", "date", "versions", "workers"} <= record.keys()
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_record(path, {"rate": float("nan")}, seed=3)
+    assert json.loads(path.read_text()) == record
 
 
 def test_shards_joined_are_the_whole(tmp_path: Path, evaluate: Evaluate) -> None:
@@ -357,6 +507,7 @@ def test_ctrl_c_keeps_what_is_finished(
         (["--size", "half"], 2, "--size is half, expected numbers"),
         (["--size", "-1"], 2, "size is -1, expected e_t"),
         (["--trials", "0"], 2, "--trials is 0"),
+        (["--trials", "999999999"], 2, "--trials is 999999999, expected 1 to"),
         (["--shards", "2", "--shard", "2"], 2, "--shard is 2"),
         (["--protocol", "none"], 1, "needs a start"),
         (["--protocol", "prallel"], 2, "did you mean 'parallel'"),
@@ -374,7 +525,9 @@ def test_every_method_has_its_settings_on_the_command_line(
     method: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", "--method", method, "--help"]) == 0
-    assert f"Settings of method ``{method}``" in capsys.readouterr().out
+    page = capsys.readouterr().out
+    names = [f"--{name.replace('_', '-')}" for name in to_flat(METHODS[method].config_type())]
+    assert sum(f"{name} " in page for name in names) > 3
 
 
 def _circle(count: int) -> list[tuple[float, float]]:

@@ -14,17 +14,17 @@ from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.comparison import (
     Comparison,
-    compare,
-    labels,
+    compare_maps,
     map_bytes,
-    plan,
-    reached,
-    row,
-    seconds_to_success,
+    map_labels,
+    map_row,
+    plan_comparison,
 )
 from bidnerf_core.evaluation.comparison_figure import comparison_figure
+from bidnerf_core.evaluation.summary import seconds_to_success, success_of
+from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trial_process import Measured, TrialProcess, samples_per_ray
-from bidnerf_core.evaluation.trials import Off, Trace, Trial, TrialResult, run_trial
+from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.serialization import from_plain, to_plain
 
 QUICK = json.dumps({"rays": 32, "max_steps": 3})
@@ -52,7 +52,9 @@ def usual(data: Path) -> Trial:
 
 @pytest.fixture(scope="module")
 def compared(maps: list[Path], usual: Trial) -> Comparison:
-    return compare(plan(usual, [str(m) for m in maps], [], 2), lambda done, total, measured: None)
+    return compare_maps(
+        plan_comparison(usual, [str(m) for m in maps], [], 2), lambda done, total, measured: None
+    )
 
 
 def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResult:
@@ -60,8 +62,8 @@ def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResul
     distances = tuple(times * x for x in trace)
     errors = Trace(distances, tuple(0.0 for _ in trace))
     return TrialResult(
-        None, True, len(trace) - 1, seconds, None, 0.0, "fog", "bid", Off(distances[-1], 0.0), "r_0", 0,
-        Off(distances[0], 0.0), errors, "", 1000, {}, "w", Trial("m", "d", ("r_0",)),
+        None, True, len(trace) - 1, seconds, None, 0.0, "fog", "bid", ScalarPoseError(distances[-1], 0.0), "r_0", 0,
+        ScalarPoseError(distances[0], 0.0), errors, "", 1000, {}, "w", Trial("m", "d", ("r_0",)),
     )  # fmt: skip
 
 
@@ -79,7 +81,7 @@ def test_every_map_is_tried_on_the_same_frames_from_the_same_starts(compared: Co
 def test_a_process_elsewhere_finds_what_this_one_finds(
     compared: Comparison, maps: list[Path], usual: Trial
 ) -> None:
-    planned = plan(usual, [str(m) for m in maps], [], 2)
+    planned = plan_comparison(usual, [str(m) for m in maps], [], 2)
     for trial, found in ((planned[0][0], compared.results[0][0]), (planned[1][1], compared.results[1][1])):
         again = run_trial(trial)
         assert replace(again, seconds=0.0, peak_memory_bytes=0) == replace(
@@ -107,25 +109,38 @@ def test_samples_are_those_of_the_level_that_the_method_uses(maps: list[Path], u
 def test_speed_is_that_of_the_trials_that_succeeded() -> None:
     quick, slow = result(1.0, [1.0, 0.05, 0.05], 0.2), result(1.0, [1.0, 0.5, 0.5, 0.05, 0.05], 2.0)
     lost = result(1.0, [1.0, 0.05, 0.9], 50.0)  # met it on the way only
-    found = reached([quick, slow, lost], "10%")
+    found = success_of([quick, slow, lost], "10%")
     assert (found.rate.successes, found.rate.trials) == (2, 3)
     assert found.steps == 2  # of 1 and 3
     assert found.milliseconds == pytest.approx((100 + 1500) / 2)
     assert seconds_to_success([slow, quick, lost], "10%") == pytest.approx([0.1, 1.5])
-    assert reached([lost], "10%").milliseconds is None
+    assert success_of([lost], "10%").milliseconds is None
 
 
 def test_a_median_error_counts_lost_poses_as_worst(maps: list[Path]) -> None:
     good, gone = result(0.1, [1.0, 0.1]), replace(result(0.1, [1.0, 0.1]), error=None)
-    assert row(
+    assert map_row(
         "a", str(maps[0]), [Measured(good, 1.0)] * 2 + [Measured(gone, 1.0)]
     ).translation == pytest.approx(0.01)
-    assert row("a", str(maps[0]), [Measured(good, 1.0)] + [Measured(gone, 1.0)] * 2).translation is None
+    assert map_row("a", str(maps[0]), [Measured(good, 1.0)] + [Measured(gone, 1.0)] * 2).translation is None
+
+
+def test_without_a_start_there_is_no_share_of_its_error(maps: list[Path], tmp_path: Path) -> None:
+    free = replace(result(1.0, [0.04, 0.01]), start_error=None)
+    row = map_row("short", str(maps[0]), [Measured(free, 1.0)])
+    assert row.success["10%"] is None
+    absolute = row.success["5deg 0.05"]
+    assert absolute is not None
+    assert (absolute.rate.successes, absolute.steps) == (1, 0)
+    found = Comparison("d", "test", "none", (), "auto", {}, 0, 1, (row,), ((free,),))
+    comparison_figure([tmp_path / "a.svg"], found)
+    assert "<svg" in (tmp_path / "a.svg").read_text()
+    assert from_plain(Comparison, json.loads(json.dumps(to_plain(found))), "again") == found
 
 
 def test_maps_have_the_shortest_names_that_tell_them_apart() -> None:
-    assert labels(["/x/a", "/x/b"]) == ["a", "b"]
-    assert labels(["/x/a", "/y/a", "/y/b"]) == ["x/a", "y/a", "y/b"]
+    assert map_labels(["/x/a", "/x/b"]) == ["a", "b"]
+    assert map_labels(["/x/a", "/y/a", "/y/b"]) == ["x/a", "y/a", "y/b"]
 
 
 def test_a_comparison_survives_json(compared: Comparison) -> None:
@@ -134,14 +149,14 @@ def test_a_comparison_survives_json(compared: Comparison) -> None:
 
 
 def test_the_plan_is_the_protocols(usual: Trial) -> None:
-    planned = plan(usual, ["a", "b"], [], 4)
+    planned = plan_comparison(usual, ["a", "b"], [], 4)
     assert [len(trials) for trials in planned] == [2] * 4
     assert all(a.map == "a" and b == replace(a, map="b") for a, b in planned)
     assert {a.frames for a, _ in planned[:3]} == {("t_0000",), ("t_0001",), ("t_0002",)}
     with pytest.raises(InputError, match="named twice"):
-        plan(usual, ["a", "./a"], [], 1)
+        plan_comparison(usual, ["a", "./a"], [], 1)
     with pytest.raises(InputError, match="size is"):
-        plan(replace(usual, size=(1.0, 2.0)), ["a"], [], 1)
+        plan_comparison(replace(usual, size=(1.0, 2.0)), ["a"], [], 1)
 
 
 def test_a_trial_that_cannot_be_is_told_in_one_line(maps: list[Path], usual: Trial) -> None:

@@ -25,7 +25,13 @@ from bidnerf_core.evaluation.errors import (
     steps_to_success,
     success_rate,
 )
-from bidnerf_core.evaluation.protocols import bid, bid_hard, perturb, random_units, rotation_of_size
+from bidnerf_core.evaluation.protocols import (
+    bid_hard_start,
+    bid_start,
+    perturb,
+    random_units,
+    rotation_of_size,
+)
 from bidnerf_core.se3 import SE3
 
 tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(
@@ -175,11 +181,11 @@ def test_perturb_is_wrong_by_exactly_what_was_asked(
     assert float(error.rotation_deg) == pytest.approx(rotation, abs=1e-6)
 
 
-@pytest.mark.parametrize("start", [bid, bid_hard])
+@pytest.mark.parametrize("start", [bid_start, bid_hard_start])
 @pytest.mark.parametrize("size", [0.5, 0.8, 1.2, 0.9, 1.7, 3.4])
 def test_bid_has_the_lengths_of_its_tangent(start, size: float) -> None:
     true = SE3.exp(torch.tensor([0.3, 1.0, -2.0, 0.5, -0.2, 0.9], dtype=torch.float64))
-    widest = math.pi / 4 if start is bid else 1.4
+    widest = math.pi / 4 if start is bid_start else 1.4
     tangents = torch.stack([(true.inverse() @ start(true, size, seed)).log() for seed in range(200)])
     assert tangents[:, :3].norm(dim=-1).tolist() == pytest.approx([size] * 200)
     assert tangents[:, 3:].norm(dim=-1).tolist() == pytest.approx([rotation_of_size(size, widest)] * 200)
@@ -199,19 +205,19 @@ def test_rotation_grows_linearly_between_the_ends_of_the_paper() -> None:
 
 def test_starts_depend_on_the_seed_alone() -> None:
     true = SE3.identity()
-    for start in (lambda seed: bid(true, 0.8, seed), lambda seed: perturb(true, 0.8, 10, seed)):
+    for start in (lambda seed: bid_start(true, 0.8, seed), lambda seed: perturb(true, 0.8, 10, seed)):
         first = start(7).matrix()
         torch.manual_seed(99)
         assert torch.equal(first, start(7).matrix())
         assert (first - start(8).matrix()).abs().max() > 1e-3
-    assert bool(bid(SE3.identity(torch.float32), 0.8, 0).is_rigid(1e-12))
+    assert bool(bid_start(SE3.identity(torch.float32), 0.8, 0).is_rigid(1e-12))
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
 def test_impossible_lengths_are_refused(value: float) -> None:
     true = SE3.identity()
     for start in (
-        lambda: bid(true, value, 0),
+        lambda: bid_start(true, value, 0),
         lambda: perturb(true, value, 1, 0),
         lambda: perturb(true, 1, value, 0),
     ):

@@ -13,7 +13,7 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import PoseError
 from bidnerf_core.evaluation.figures import (
-    NOTHING,
+    NO_DEPTH,
     as_picture,
     blend,
     chequered,
@@ -109,12 +109,12 @@ def test_depth_goes_from_red_to_blue_and_marks_what_is_missing() -> None:
     depth[0, 5], depth[1, 5], depth[2, 5], depth[3, 5] = 0, float("nan"), float("inf"), -1
     picture = depth_to_rgb(depth)
     assert picture.dtype == np.uint8
-    assert all(tuple(picture[row, 5]) == NOTHING for row in range(4))
+    assert all(tuple(picture[row, 5]) == NO_DEPTH for row in range(4))
     near, far = picture[0, 0].astype(int), picture[-1, -1].astype(int)
     assert near[0] > near[2] + 50
     assert far[2] > far[0] + 50
     for nothing in (torch.zeros(3, 4), torch.full((3, 4), float("nan"))):
-        assert (depth_to_rgb(nothing) == NOTHING).all()
+        assert (depth_to_rgb(nothing) == NO_DEPTH).all()
     flat = depth_to_rgb(torch.ones(3, 4))
     assert (flat == flat[0, 0]).all()
     for wrong in (torch.zeros(0, 4), torch.zeros(4), torch.zeros(2, 3, 3)):
@@ -176,7 +176,6 @@ def test_convergence_plot_of_nothing(tmp_path: Path) -> None:
 def test_convergence_plot_without_matplotlib_tells_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(InputError, match=r"pip install 'bidnerf\[plots\]'"):
         convergence_plot(tmp_path / "plot.png", {"0001": errors(1, 0.1)})

@@ -13,7 +13,7 @@ from scipy.stats import kstest
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import parallel_inversion
 from bidnerf_core.evaluation.errors import pose_error
-from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol, inerf
+from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol, inerf_start
 from bidnerf_core.se3 import SE3
 
 TRUE = SE3.exp(torch.tensor([0.3, 1.0, -2.0, 0.5, -0.2, 0.9], dtype=torch.float64))
@@ -60,7 +60,7 @@ def test_frames_take_turns() -> None:
 
 
 def test_inerf_fills_its_ranges_evenly() -> None:
-    starts = [TRUE.inverse() @ inerf(TRUE, seed) for seed in range(600)]
+    starts = [TRUE.inverse() @ inerf_start(TRUE, seed) for seed in range(600)]
     moves = torch.stack([start.translation for start in starts])
     angles = torch.stack([pose_error(start, SE3.identity()).rotation_deg for start in starts])
     for axis in range(3):
@@ -75,7 +75,7 @@ def test_parallel_draws_what_the_global_generator_of_numpy_does(frames: int) -> 
     np.random.seed(1234)
     chosen = np.random.choice(frames, 5)
     angles, moves = np.random.uniform(-15, 15, (5, 5, 3)), np.random.uniform(-0.25, 0.25, (5, 5, 3))
-    for ours, theirs in zip(parallel_inversion.draw(frames), (chosen, angles, moves), strict=True):
+    for ours, theirs in zip(parallel_inversion.draw_starts(frames), (chosen, angles, moves), strict=True):
         assert np.array_equal(ours, theirs)
     cases = PROTOCOLS["parallel"].cases(frames, 25, 1234)
     assert cases == [(chosen[i // 5], 1234 + i) for i in range(25)]
@@ -83,7 +83,7 @@ def test_parallel_draws_what_the_global_generator_of_numpy_does(frames: int) -> 
 
 def test_parallel_turns_about_the_axes_of_the_world() -> None:
     """As scipy has it: extrinsic x, then y the other way round, then z, about the camera's own centre."""
-    _, angles, moves = parallel_inversion.draw(50)
+    _, angles, moves = parallel_inversion.draw_starts(50)
     for i in range(25):
         start = PROTOCOLS["parallel"].start(TRUE, (), 1234 + i, 50)
         assert start is not None
@@ -95,7 +95,7 @@ def test_parallel_turns_about_the_axes_of_the_world() -> None:
 
 def test_parallel_numbers_are_these() -> None:
     """Of the 200 frames of a NeRF-Synthetic test split."""
-    chosen, angles, moves = parallel_inversion.draw(200)
+    chosen, angles, moves = parallel_inversion.draw_starts(200)
     assert chosen.tolist() == [47, 38, 53, 116, 152]
     assert angles[0, 0] == pytest.approx([8.140797565872, 10.820093141331, -10.480891031817], abs=1e-11)
     assert moves[4, 4] == pytest.approx([-0.059440863625, -0.084531898589, -0.119538273259], abs=1e-11)

@@ -17,12 +17,13 @@ from scipy.stats import mannwhitneyu
 
 from bidnerf_core.cli import main
 from bidnerf_core.evaluation.errors import success_rate
-from bidnerf_core.evaluation.groups import grouped, situations
+from bidnerf_core.evaluation.groups import grouped, situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.provenance import note_run, provenance
-from bidnerf_core.evaluation.results import as_line
-from bidnerf_core.evaluation.summary import NEVER, compare, comparisons, steps_of, summarize
-from bidnerf_core.evaluation.trials import Off, Trace, Trial, TrialResult
+from bidnerf_core.evaluation.results import result_line
+from bidnerf_core.evaluation.significance import compare_pair, pairwise_tests
+from bidnerf_core.evaluation.summary import NEVER, median, steps_of, summarize
+from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 
 STEPS = 10
 
@@ -33,17 +34,17 @@ def result(seed: int, reached: int | None, size: float = 0.5, **settings: Any) -
     moved = (*(size for _ in range(far)), *(0.001 for _ in range(STEPS + 1 - far)))
     turned = tuple(12.0 if x == size else 0.1 for x in moved)
     protocol, images = settings.pop("protocol", "bid"), settings.pop("images", 1)
-    start = None if protocol == "none" else Off(moved[0], turned[0])
+    start = None if protocol == "none" else ScalarPoseError(moved[0], turned[0])
     sizes, config = () if protocol == "none" else (size,), json.dumps(settings)
     trial = Trial("house", "photos", ("a",) * images, protocol, sizes, "bid", config, seed)
     return TrialResult(
-        None, reached is not None, STEPS, 2.0, None, 0.1, "fog", "bid", Off(moved[-1], turned[-1]), "a", seed,
+        None, reached is not None, STEPS, 2.0, None, 0.1, "fog", "bid", ScalarPoseError(moved[-1], turned[-1]), "a", seed,
         start, Trace(moved, turned), "done", 2**30, {"rays": 64, "level": 0, **settings}, "weights-1", trial,
     )  # fmt: skip
 
 
 def write(path: Path, *results: TrialResult) -> Path:
-    path.write_bytes(b"".join(map(as_line, results)))
+    path.write_bytes(b"".join(map(result_line, results)))
     return path
 
 
@@ -81,7 +82,7 @@ def test_a_summary_counts(results: list[TrialResult]) -> None:
     assert judged is not None
     assert (judged.rate.successes, judged.rate.trials) == (6, 12)
     assert judged.rate == success_rate(6, 12)
-    assert judged.median_steps == 7
+    assert judged.steps == 7
     assert (slow.milliseconds_per_step, slow.seconds, slow.trials) == (200, 2, 12)
     assert slow.translation == pytest.approx((0.001 + 1.2) / 2)
     assert (slow.converged_but_wrong, slow.right_but_not_converged) == (0, 0)
@@ -96,7 +97,7 @@ def test_without_a_start_there_is_no_share_of_its_error() -> None:
 
 
 def test_comparisons_agree_with_scipy(results: list[TrialResult]) -> None:
-    near, far, both = comparisons(grouped(results), "10%")
+    near, far, both = pairwise_tests(grouped(results), "10%")
     quick, slow = ([float(r.errors.translation.index(0.001)) for r in rows]
                    for rows in (results[6:12], results[12:18]))  # fmt: skip
     test = mannwhitneyu(quick, slow, alternative="two-sided")
@@ -113,9 +114,9 @@ def test_comparisons_agree_with_scipy(results: list[TrialResult]) -> None:
 def test_failures_are_slower_than_any_success_and_equal_among_themselves() -> None:
     (a, b) = grouped([result(0, 3), result(1, None), result(0, None, level=1), result(1, None, level=1)])
     assert steps_of(a.results, "10%") == [3, NEVER]
-    assert compare(a, b, "10%").all_p == pytest.approx(compare(b, a, "10%").all_p)
-    assert compare(b, b, "10%").all_p == 1
-    assert compare(a, a, "10%").all_p == pytest.approx(1)
+    assert compare_pair(a, b, "10%").all_p == pytest.approx(compare_pair(b, a, "10%").all_p)
+    assert compare_pair(b, b, "10%").all_p == 1
+    assert compare_pair(a, a, "10%").all_p == pytest.approx(1)
 
 
 class Page(HTMLParser):
@@ -180,7 +181,7 @@ def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:
     )
     file = write(tmp_path / "r.jsonl", lost)
     assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 0
-    assert "nothing is recorded of how it was made" in read(tmp_path / "out").text
+    assert "no record of how it was made" in read(tmp_path / "out").text
 
 
 def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResult]) -> None:
@@ -190,7 +191,7 @@ def test_figures_are_the_same_each_time(tmp_path: Path, results: list[TrialResul
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(None, "cannot be read"), (b"", "no finished trial"), (b"hello\n", "line 1: not JSON")],
+    [(None, "no such file"), (b"", "no finished trial"), (b"hello\n", "line 1: not JSON")],
 )
 def test_a_file_without_results_is_told_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes | None, said: str
@@ -223,6 +224,75 @@ def test_a_report_replaces_a_report_and_nothing_else(
         assert error.count("\n") == 1
         assert f"{other}: holds something that is no report" in error
         assert [path.read_text() for path in other.iterdir()] == ["<html>mine</html>"]
+
+
+def test_an_interrupted_report_is_written_again(
+    tmp_path: Path, results: list[TrialResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, out = write(tmp_path / "r.jsonl", *results), tmp_path / "out"
+
+    def interrupt(self: Figures) -> Path:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Figures, "steps", interrupt)
+        assert main(["report", str(file), "--out", str(out)]) == 130
+    assert (out / "rates.png").exists()
+    assert main(["report", str(file), "--out", str(out)]) == 0
+    assert read(out).fetched == []
+    written = (out / "index.html").read_bytes()
+    with monkeypatch.context() as patch:  # the page of before stays until the new one is whole
+        patch.setattr(Figures, "steps", interrupt)
+        assert main(["report", str(file), "--out", str(out)]) == 130
+    assert (out / "index.html").read_bytes() == written
+
+
+def test_datasets_and_maps_are_named_where_they_differ() -> None:
+    first = result(0, 2, protocol="none")
+    other = dataclasses.replace(first, trial=dataclasses.replace(first.trial, data="scans", split="val"))
+    retrained = dataclasses.replace(first, weights="weights-2.safetensors")
+    moved = dataclasses.replace(first, trial=dataclasses.replace(first.trial, map="garden"))
+
+    def titles(*found: TrialResult) -> list[str]:
+        return list(situation_titles(situations(grouped(found))).values())
+
+    assert titles(first) == ["no start"]
+    assert titles(first, other) == ["photos/test: no start", "scans/val: no start"]
+    assert titles(first, moved) == ["house: no start", "garden: no start"]
+    assert titles(first, retrained) == ["house (weights-1): no start", "house (weights-2): no start"]
+    assert titles(
+        first, dataclasses.replace(other, trial=dataclasses.replace(other.trial, map="garden"))
+    ) == [
+        "house on photos/test: no start",
+        "garden on scans/val: no start",
+    ]
+
+
+def test_a_report_without_starts_uses_no_share_of_their_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    free = [result(seed, 2 + seed, protocol="none") for seed in range(3)]
+    file, out = write(tmp_path / "r.jsonl", *free), tmp_path / "out"
+    assert main(["report", str(file), "--out", str(out)]) == 0
+    assert "Steps to success (under 5° and 0.05 units)" in read(out).text
+    assert "(translation error at most 10 %" not in read(out).text
+    capsys.readouterr()
+    assert main(["report", str(file), "--out", str(out), "--criterion", "10%"]) == 2
+    err = capsys.readouterr().err
+    assert "no trial had a start" in err
+    assert err.count("\n") == 1
+    mixed = write(tmp_path / "m.jsonl", *free, result(0, 2), result(1, 3))
+    assert main(["report", str(mixed), "--out", str(out), "--criterion", "10%"]) == 0
+    assert "Trials without a start are not shown" in read(out).text
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"), [([1, 4], 2.5), ([3, 1, 2], 2), ([1, None], None), ([1, 2, None], 2), ([], None)]
+)
+def test_a_median_counts_what_is_unknown_as_infinite(
+    values: list[float | None], expected: float | None
+) -> None:
+    assert median(values) == expected
 
 
 def test_a_damaged_side_file_is_named(

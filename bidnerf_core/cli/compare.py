@@ -30,25 +30,27 @@ from bidnerf_core.cli.common import (
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import changed_settings
 from bidnerf_core.evaluation.closed_form_data import is_closed_form
-from bidnerf_core.evaluation.comparison import USUAL, Comparison, MapRow, compare, plan
+from bidnerf_core.evaluation.comparison import Comparison, MapRow, compare_maps, plan_comparison
 from bidnerf_core.evaluation.comparison_figure import comparison_figure
 from bidnerf_core.evaluation.errors import CRITERIA
-from bidnerf_core.evaluation.protocols import PROTOCOLS, Size, find_protocol
+from bidnerf_core.evaluation.protocols import MOST_TRIALS, PROTOCOLS, Size, find_protocol
+from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success
+from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trial_process import Measured
-from bidnerf_core.evaluation.trials import Trial
+from bidnerf_core.files import write_file
 from bidnerf_core.localization import METHODS
 from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import load_info, write_file
+from bidnerf_core.storage import load_info
 
 Folders = Annotated[
     tuple[str, ...],
     tyro.conf.Positional,
-    option("MAP... DATA", "folders of maps, and last that of a dataset of what they show", ""),
+    option("MAP... DATA", "folders of maps, and last the folder of a dataset of the same scene", ""),
 ]
 
 
 def run(arguments: list[str]) -> None:
-    """Parse with the settings of the method that the arguments name."""
+    """Run the command; its options include the settings of the method that the arguments name."""
     kind = chosen_method(arguments, "bid").config_type
 
     def compare(
@@ -56,28 +58,28 @@ def run(arguments: list[str]) -> None:
         out: Annotated[
             Path | None, option("DIR", "write compare.json, compare.png and compare.svg there", "")
         ] = None,
-        split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
-        frame: Annotated[Names, option("NAME...", "names of frames to try", "all of the split")] = (),
-        protocol: Annotated[str, option("NAME", f"of the starts: {', '.join(PROTOCOLS)}")] = "bid",
+        split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+        frame: Annotated[Names, option("NAME...", "try only these frames", "all of the split")] = (),
+        protocol: Annotated[str, option("NAME", f"how starts are chosen: {', '.join(PROTOCOLS)}")] = "bid",
         size: Annotated[
             str | None,
-            option("SIZE", "how far off: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
+            option("SIZE", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's first"),
         ] = None,
-        trials: Annotated[int | None, option("N", "how many starts", "the protocol's")] = None,
+        trials: Annotated[int | None, option("N", "number of starts", "the protocol's")] = None,
         method: Annotated[str, option("NAME", ", ".join(METHODS))] = "bid",
-        seed: Annotated[int | None, option("N", "of the starts and the descents", "the protocol's")] = None,
+        seed: Annotated[int | None, option("N", "seed of every random choice", "the protocol's")] = None,
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
         config: Any = kind(),
     ) -> None:
-        """Find the same frames from the same starts in several maps, and compare success, time and memory.
+        """Localize the same frames from the same starts in several maps, and compare success, time and memory.
 
         Each map has a process of its own, and the maps take turns at each start.
         """
         if len(folders) < 2:
             raise UsageError(
                 f"{len(folders)} folder{'s' if len(folders) != 1 else ''} given, "
-                "expected one of a map or more, then that of a dataset"
+                "expected the folders of one or more maps, then that of a dataset"
             )
         *maps, data = folders
         with wrong_usage():
@@ -109,10 +111,10 @@ def read_size(given: str) -> Size:
 def _compare(
     maps: Sequence[str], usual: Trial, names: Sequence[str], trials: int | None, out: Path | None, overwrite: bool
 ) -> Comparison:  # fmt: skip
-    """Everything that can be judged is judged before the work begins."""
-    require("--trials", 1 if trials is None else trials, 1)
+    """Check all input, then run the comparison and write it to ``out``."""
+    require("--trials", 1 if trials is None else trials, 1, MOST_TRIALS)
     require("--seed", usual.seed, 0, LARGEST_SEED)
-    planned = plan(usual, maps, names, trials)
+    planned = plan_comparison(usual, maps, names, trials)
     for folder in maps:
         if not is_closed_form(folder):
             load_info(Path(folder))
@@ -129,18 +131,16 @@ def _compared(planned: Sequence[Sequence[Trial]]) -> Comparison:
     say(
         f"{starts} start{'s' if starts > 1 else ''} in {maps} map{'s' if maps > 1 else ''}; a process for each begins"
     )
-    return compare(planned, _Progress())
+    return compare_maps(planned, _say_progress)
 
 
-class _Progress:
-    """A line on stderr for each trial."""
-
-    def __call__(self, done: int, total: int, measured: Measured) -> None:
-        result = measured.result
-        error = result.error
-        off = f"{error.translation:.3f} m, {error.rotation_deg:.2f} deg" if error else "not finite"
-        name = Path(result.trial.map).name
-        say(f"{done}/{total}  {result.frame} in {name}: {off}, {result.steps} steps, {result.seconds:.1f} s")
+def _say_progress(done: int, total: int, measured: Measured) -> None:
+    """Write a line on stderr for a finished trial."""
+    result = measured.result
+    error = result.error
+    off = f"{error.translation:.3f} m, {error.rotation_deg:.2f} deg" if error else "not finite"
+    name = Path(result.trial.map).name
+    say(f"{done}/{total}  {result.frame} in {name}: {off}, {result.steps} steps, {result.seconds:.1f} s")
 
 
 def _write(found: Comparison, out: Path) -> None:
@@ -154,21 +154,32 @@ def _write(found: Comparison, out: Path) -> None:
 
 def _print(found: Comparison) -> None:
     size = ":".join(f"{x:g}" for x in found.size)
-    print(
-        f"{found.trials} starts of {found.protocol} {size} on {found.data}/{found.split}, method {found.method}"
-    )
+    trials = f"{found.trials} trials" if found.protocol == "none" else f"{found.trials} starts of"
+    start = "without a start" if found.protocol == "none" else f"{found.protocol} {size}".rstrip()
+    print(f"{trials} {start} on {found.data}/{found.split}, method {found.method}")
     table = Table("", *(row.map for row in found.rows), box=None, pad_edge=False)
     for column in table.columns[1:]:
         column.justify = "right"
     for name, cell in LINES.items():
         table.add_row(name, *map(cell, found.rows))
     print_table(table)
-    print(f"success: how many, and Wilson's 95 % interval; to success: median of the starts that met {USUAL}")
+    usual = RELATIVE if found.rows[0].success[RELATIVE] else ABSOLUTE
+    print(f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual}")
 
 
 def _rate(row: MapRow, criterion: str) -> str:
-    rate = row.success[criterion].rate
+    success = row.success[criterion]
+    if success is None:
+        return "-"
+    rate = success.rate
     return f"{rate.successes}/{rate.trials} ({100 * rate.low:.0f}-{100 * rate.high:.0f} %)"
+
+
+def _usual(row: MapRow) -> Success:
+    """Return the success by the relative criterion, or by the absolute one where there was no start."""
+    success = row.success[RELATIVE] or row.success[ABSOLUTE]
+    assert success is not None  # the absolute criterion always applies
+    return success
 
 
 def _known(value: float | None, digits: int) -> str:
@@ -181,11 +192,11 @@ LINES: dict[str, Callable[[MapRow], str]] = {
     "median error, m": lambda row: _known(row.translation, 4),
     "median error, deg": lambda row: _known(row.rotation_deg, 2),
     "steps": lambda row: f"{row.steps:g}",
-    "steps to success": lambda row: _known(row.success[USUAL].steps, 0),
+    "steps to success": lambda row: _known(_usual(row).steps, 0),
     "ms a step": lambda row: f"{row.ms_per_step:.1f}",
-    "ms to success": lambda row: _known(row.success[USUAL].milliseconds, 0),
+    "ms to success": lambda row: _known(_usual(row).milliseconds, 0),
     "peak memory, MiB": lambda row: f"{row.peak_memory_bytes / 2**20:.0f}",
     "samples a ray": lambda row: f"{row.samples_per_ray:.1f}",
     "map, MiB": lambda row: f"{row.map_bytes / 2**20:.1f}",
 }
-"""The table, line by line; a map has a column."""
+"""The lines of the table by name; each map has a column."""

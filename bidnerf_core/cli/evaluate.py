@@ -33,21 +33,22 @@ from bidnerf_core.evaluation.bench import (
     left_to_do,
     local_processes,
     planned,
+    repeated_frames,
     run_trials,
-    share,
+    shard_of,
 )
 from bidnerf_core.evaluation.cluster import dask_executor
-from bidnerf_core.evaluation.protocols import PROTOCOLS, Size, find_protocol
+from bidnerf_core.evaluation.protocols import MOST_TRIALS, PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.provenance import command_line, note_run, provenance
-from bidnerf_core.evaluation.results import ResultsFile
-from bidnerf_core.evaluation.trials import Trial
+from bidnerf_core.evaluation.results import ResultsFile, key_of
+from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.localization import METHODS
 
 Place = Annotated[str, tyro.conf.Positional]
 
 
 def run(arguments: list[str]) -> None:
-    """Parse with the settings of the method that the arguments name."""
+    """Run the command; its options include the settings of the method that the arguments name."""
     kind = chosen_method(arguments, "auto").config_type
 
     def evaluate(
@@ -59,42 +60,44 @@ def run(arguments: list[str]) -> None:
         ] = None,
         *,
         out: Annotated[
-            Path, option("RESULTS.jsonl", "file of results; what it holds already is not run again")
+            Path, option("RESULTS.jsonl", "file of results; trials that it already holds are not run again")
         ],
-        protocol: Annotated[str, option("NAME", "where to start: " + ", ".join(PROTOCOLS))] = "bid",
+        protocol: Annotated[str, option("NAME", "how starts are chosen: " + ", ".join(PROTOCOLS))] = "bid",
         size: Annotated[
             tuple[str, ...],
-            option("SIZE...", "how far off: e_t, or METRES:DEGREES for perturb", "the protocol's"),
+            option("SIZE...", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's"),
         ] = (),
         method: Annotated[str, option("NAME", ", ".join(METHODS))] = "auto",
-        trials: Annotated[int | None, option("N", "of each size", "the protocol's, 24 or 25")] = None,
-        seed: Annotated[
-            int | None, option("S", "of all that is drawn at random", "the protocol's, 0")
+        trials: Annotated[
+            int | None, option("N", "number of trials of each size", "the protocol's, 24 or 25")
         ] = None,
-        split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
+        seed: Annotated[int | None, option("S", "seed of every random choice", "the protocol's, 0")] = None,
+        split: Annotated[str, option("NAME", "split of the dataset")] = "test",
         frame: Annotated[Names, option("NAME...", "try only these frames", "all of the split")] = (),
-        images: Annotated[int, option("K", "images at once, a sequence around the object")] = 1,
-        angle: Annotated[float, option("DEGREES", "between neighbours of a sequence")] = 15.0,
-        depth: Annotated[bool, option(None, "give the method the measured depth, where there is any")] = True,
+        images: Annotated[int, option("K", "localize a sequence of K images around the object at once")] = 1,
+        angle: Annotated[float, option("DEGREES", "angle between neighbours of a sequence")] = 15.0,
+        depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
         depth_points: Annotated[
             Path | None,
-            option("MODEL", "COLMAP sparse model: give it the points that the frames observe as well", ""),
+            option(
+                "MODEL", "COLMAP sparse model whose points, where frames observe them, are used as depth", ""
+            ),
         ] = None,
-        device: Annotated[str, option("NAME", "what the field computes on: cpu, cuda ...")] = "cpu",
+        device: Annotated[str, option("NAME", "device that the field computes on: cpu, cuda ...")] = "cpu",
         workers: Annotated[
-            int | None, option("N", "processes, of one thread each", "one a core; one on a GPU")
+            int | None, option("N", "number of processes, of one thread each", "one a core; one on a GPU")
         ] = None,
         dask: Annotated[
-            str | None, option("ADDRESS", "of a dask scheduler, to run on its workers", "")
+            str | None, option("ADDRESS", "address of a dask scheduler whose workers run the trials", "")
         ] = None,
-        shards: Annotated[int, option("N", "split the trials into so many parts ...")] = 1,
-        shard: Annotated[int, option("I", "... and run this one, from 0")] = 0,
+        shards: Annotated[int, option("N", "number of parts that the trials are split into")] = 1,
+        shard: Annotated[int, option("I", "the part to run, from 0")] = 0,
         config: Any = kind(),
     ) -> None:
-        """Localize many frames from wrong starts; one JSON line a trial.
+        """Localize many frames from wrong starts, or from none, and write one JSON line a trial.
 
-        What was finished is kept whatever happens: the same command goes on where it stopped. 'bidnerf report' makes
-        tables and figures of the results.
+        Finished trials are kept whatever happens: the same command goes on where it stopped. 'bidnerf report' makes tables
+        and figures of the results.
         """
         _check(trials, seed, images, angle, workers, shards, shard)
         with wrong_usage():
@@ -108,7 +111,10 @@ def run(arguments: list[str]) -> None:
             trials, seed, split, names, images, angle, device, depth,
             None if depth_points is None else str(depth_points),
         )  # fmt: skip
-        mine = share(planned(plan), shard, shards)
+        trials_of_all = planned(plan)
+        if repeated := repeated_frames(trials_of_all):
+            say(repeated)
+        mine = shard_of(trials_of_all, shard, shards)
         _evaluate(mine, out, workers, dask, command_line("bidnerf evaluate", arguments))
 
     evaluate.__annotations__["config"] = kind
@@ -118,14 +124,23 @@ def run(arguments: list[str]) -> None:
 def _evaluate(trials: list[Trial], out: Path, workers: int | None, dask: str | None, command: str) -> None:
     with ResultsFile(out) as file:
         todo = left_to_do(trials, file)
+        _note_unchecked(trials, file, out)
         if len(todo) < len(trials):
-            say(f"{out}: {len(trials) - len(todo)} of {len(trials)} trials are there already")
+            say(f"{out}: {len(trials) - len(todo)} of {len(trials)} trials are already there")
         if todo:
             with _executor(workers, dask, len(todo), todo[0].device == "cpu") as (executor, at_once, what):
                 note_run(out, provenance(command, what))
                 _run(todo, file, executor, at_once)
         file.put_in_order(trials)
     print(f"{len(trials)} trials in {out}; 'bidnerf report {out}' shows them")
+
+
+def _note_unchecked(trials: list[Trial], file: ResultsFile, out: Path) -> None:
+    """Say how many results cannot be compared with the present images, because an earlier version wrote them."""
+    known = [file.results.get(key_of(trial)) for trial in trials]
+    count = sum(result is not None and result.inputs is None for result in known)
+    if count:
+        say(f"{out}: {count} results of an earlier version do not record their images and are kept unchecked")
 
 
 def _run(todo: list[Trial], file: ResultsFile, executor: Executor, at_once: int) -> None:
@@ -146,7 +161,7 @@ def _run(todo: list[Trial], file: ResultsFile, executor: Executor, at_once: int)
 def _executor(
     workers: int | None, dask: str | None, trials: int, on_cpu: bool
 ) -> Iterator[tuple[Executor, int, str]]:
-    """What runs trials, how many it is given at once, and its description."""
+    """Yield an executor, the number of trials to give it at once, and its description."""
     if dask is not None:
         if workers is not None:
             raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
@@ -158,7 +173,7 @@ def _executor(
     try:
         yield executor, count, f"{count} local process{'es' if count > 1 else ''} of one thread"
     except BaseException:
-        for process in multiprocessing.active_children():  # what they are at is lost anyhow
+        for process in multiprocessing.active_children():  # their trials are lost anyway
             process.terminate()
         raise
     finally:
@@ -166,12 +181,12 @@ def _executor(
 
 
 def cores() -> int:
-    """That this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _sizes(given: tuple[str, ...]) -> tuple[Size, ...] | None:
-    """One number as 0.5, or several as 0.2:10."""
+    """Return sizes from numbers as 0.5 or 0.2:10; none where none was given."""
     try:
         return tuple(tuple(float(number) for number in size.split(":")) for size in given) or None
     except ValueError as error:
@@ -180,14 +195,14 @@ def _sizes(given: tuple[str, ...]) -> tuple[Size, ...] | None:
 
 def _own_data(map: str) -> str:
     if not map.startswith("demo:"):
-        raise UsageError(f"no DATA beside map {map}; only closed-form maps bring their own")
+        raise UsageError(f"no DATA after map {map}; only closed-form maps have data of their own")
     return map
 
 
 def _check(
     trials: int | None, seed: int | None, images: int, angle: float, workers: int | None, shards: int, shard: int
 ) -> None:  # fmt: skip
-    require("--trials", 1 if trials is None else trials, 1)
+    require("--trials", 1 if trials is None else trials, 1, MOST_TRIALS)
     require("--seed", seed or 0, 0, LARGEST_SEED)
     require("--images", images, 1, 1000)
     require("--angle", angle, 0.01, 360)

@@ -4,58 +4,83 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
-from rich.table import Table
 
 from bidnerf_core.cli.common import UsageError, console, option, output_folder, parse, print_table
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import CRITERIA
-from bidnerf_core.evaluation.groups import Group, grouped, situations
-from bidnerf_core.evaluation.page import MARK, Figure, page
-from bidnerf_core.evaluation.plots import NAMES, Figures
-from bidnerf_core.evaluation.provenance import read_runs
-from bidnerf_core.evaluation.results import read_results
-from bidnerf_core.evaluation.summary import summarize
-from bidnerf_core.storage import write_file
 
-Bar = Literal["10%", "5deg 0.05", "1deg 0.02"]
+if TYPE_CHECKING:  # the rest is imported when a report is made: help pages do without it
+    from bidnerf_core.evaluation.groups import Group
+    from bidnerf_core.evaluation.page import Figure
+
+CriterionName = Literal["10%", "5deg 0.05", "1deg 0.02"]
 
 
 def run(arguments: list[str]) -> None:
+    """Run the command."""
     parse("report", report, arguments)
 
 
 def report(
     results: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, option("RESULTS...", "files as 'bidnerf evaluate' writes them")
+        tuple[Path, ...], tyro.conf.Positional, option("RESULTS...", "files that 'bidnerf evaluate' wrote")
     ],
-    out: Annotated[Path, option("DIR", "folder for index.html, and the figures as PNG and SVG")] = Path("report"),
-    criterion: Annotated[Bar, option(None, "what steps to success are counted to")] = "10%",
-    title: Annotated[str, option("TEXT", "of the page")] = "Localization results",
+    out: Annotated[Path, option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
+    criterion: Annotated[
+        CriterionName | None,
+        option(None, "what counts as success where one criterion is shown", "10%; 5deg 0.05 if trials had no start"),
+    ] = None,
+    title: Annotated[str, option("TEXT", "title of the page")] = "Localization results",
 ) -> None:  # fmt: skip
-    """Tables, figures and tests of results, as one page that needs no network.
+    """Write tables, figures and statistical tests of results as one page that needs no network.
 
-    Trials are put side by side by map, start, method and settings. A trial that is in several files counts once.
+    Trials are compared by map, data, start, method and settings. A trial that several files hold counts once.
     """
+    from bidnerf_core.evaluation.groups import grouped
+    from bidnerf_core.evaluation.page import UNFINISHED, page
+    from bidnerf_core.evaluation.plot_style import require_matplotlib
+    from bidnerf_core.evaluation.provenance import read_runs
+    from bidnerf_core.evaluation.results import read_results
+    from bidnerf_core.files import write_file
+
     if not results:
-        raise UsageError("no file of results, expected at least one as 'bidnerf evaluate' writes it")
+        raise UsageError("no file of results, expected at least one that 'bidnerf evaluate' wrote")
     found = read_results(results)
     if not found:
         raise InputError(f"{', '.join(map(str, results))}: no finished trial in it, nothing to report")
-    _check_ours(out)
-    runs = [(path.name, read_runs(path)) for path in results]
     groups = grouped(found)
+    chosen = _criterion(criterion, groups)
+    _check_ours(out)
+    require_matplotlib()
+    runs = [(path.name, read_runs(path)) for path in results]
     with output_folder(out, overwrite=True), console.status("drawing"):
-        text = page(title, groups, draw(groups, out, criterion), runs, criterion)
+        if not (out / "index.html").exists():  # so that an interrupted report is known as one
+            write_file(out / "index.html", UNFINISHED.encode())
+        text = page(title, groups, draw_figures(groups, out, chosen), runs, chosen)
         write_file(out / "index.html", text.encode())
     _print(groups)
     print(f"look at {out / 'index.html'}")
 
 
+def _criterion(asked: str | None, groups: Sequence[Group]) -> str:
+    """Return the criterion to show where one is shown. Raises ``UsageError`` for one that no trial can be judged by."""
+    from bidnerf_core.evaluation.summary import applies, usual_criterion
+
+    if asked is None:
+        return usual_criterion([result for group in groups for result in group.results])
+    if not any(applies(asked, group.results) for group in groups):
+        raise UsageError(
+            f"--criterion is {asked}, a share of the start's error, and no trial had a start; expected 5deg 0.05 or 1deg 0.02"
+        )
+    return asked
+
+
 def _check_ours(out: Path) -> None:
-    """A report may be replaced by a newer one; what is something else is left alone."""
+    """Raise ``InputError`` where ``out`` holds something else than a report, which a newer report may replace."""
+    from bidnerf_core.evaluation.page import MARK
+
     try:
         written = MARK in (out / "index.html").read_text(errors="replace")
     except OSError:
@@ -66,39 +91,55 @@ def _check_ours(out: Path) -> None:
         )
 
 
-def draw(groups: Sequence[Group], folder: Path, criterion: str) -> list[Figure]:
-    """All figures of a report, written to ``folder``."""
-    figures, success = Figures(groups, folder, criterion), NAMES[criterion]
+def draw_figures(groups: Sequence[Group], folder: Path, criterion: str) -> list[Figure]:
+    """Write all figures of a report to ``folder`` and return them with their captions."""
+    from bidnerf_core.evaluation.page import Figure
+    from bidnerf_core.evaluation.plot_style import CRITERION_NAMES
+    from bidnerf_core.evaluation.plots import Figures
+    from bidnerf_core.evaluation.summary import applies
+
+    figures, success = Figures(groups, folder, criterion), CRITERION_NAMES[criterion]
+    some = not all(applies(criterion, group.results) for group in groups)
+    omitted = " Trials without a start are not shown." if some else ""
     return [
         Figure(figures.rates(), "Success rates with Wilson's 95 % intervals."),
         Figure(
             figures.steps(),
-            f"Steps to success ({success}): the first step from which on the error stays there. Median, quartiles, "
-            "whiskers to 1.5 times their distance; each point is a trial; above, how many succeeded.",
+            f"Steps to success ({success}): the first step from which on the criterion holds. Boxes show the median and the "
+            "quartiles, whiskers reach to 1.5 times the interquartile range, and each point is a trial; the numbers above "
+            f"count the trials that succeeded.{omitted}",
         ),
-        Figure(figures.share(), f"Share of all trials that have come to success ({success}) by each step, and stay."),
+        Figure(figures.share(), f"Share of all trials that meet the criterion ({success}) from each step on.{omitted}"),
         Figure(
             figures.traces("translation"),
-            "Translation error after each step: median and quartiles of all trials. Dashed: 0.05.",
+            "Translation error after each step: median and quartiles of all trials. The dashed line is 0.05.",
         ),
         Figure(
             figures.traces("rotation_deg"),
-            "Rotation error after each step: median and quartiles of all trials. Dashed: 5 degrees.",
+            "Rotation error after each step: median and quartiles of all trials. The dashed line is 5 degrees.",
         ),
     ]  # fmt: skip
 
 
 def _print(groups: Sequence[Group]) -> None:
+    from rich.table import Table
+
+    from bidnerf_core.evaluation.errors import CRITERIA
+    from bidnerf_core.evaluation.groups import situation_titles
+    from bidnerf_core.evaluation.summary import summarize
+
     table = Table(box=None, pad_edge=False)
     table.add_column("success by")
     for column in ("n", *CRITERIA, "median error"):
         table.add_column(column, justify="right", no_wrap=True)
-    several = len({(s.map, s.weights) for s in situations(groups)}) > 1
-    for situation in situations(groups):
-        table.add_row(f"{situation.map}: {situation.start}" if several else situation.start)
+    for situation, title in situation_titles([group.situation for group in groups]).items():
+        table.add_row(title)
         for group in (g for g in groups if g.situation == situation):
             s = summarize(group.results)
-            rates = ["-" if j is None else f"{100 * j.rate.rate:.0f} %" for j in s.criteria.values()]
-            error = f"{s.translation:.3f} m {s.rotation_deg:6.2f} deg"
+            rates = [
+                "-" if found is None else f"{100 * found.rate.rate:.0f} %" for found in s.criteria.values()
+            ]
+            known = s.translation is not None and s.rotation_deg is not None
+            error = f"{s.translation:.3f} m {s.rotation_deg:6.2f} deg" if known else "-"
             table.add_row(f"  {group.label}", str(s.trials), *rates, error)
     print_table(table)

@@ -1,4 +1,4 @@
-"""Progress of an evaluation on stderr, and Ctrl-C."""
+"""Shows the progress of an evaluation on stderr and handles Ctrl-C."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from rich.progress import (
 
 from bidnerf_core.cli.common import console, say
 from bidnerf_core.cli.progress import LINE_EVERY, StoppableBar
-from bidnerf_core.evaluation.errors import CRITERIA
-from bidnerf_core.evaluation.trials import TrialResult
+from bidnerf_core.evaluation.summary import succeeded
+from bidnerf_core.evaluation.trial import TrialResult
 
 
 class TrialProgress(StoppableBar):
-    """Use as a context: Ctrl-C then waits for the trials under way; a second one does not."""
+    """A progress bar of trials. Use as a context: Ctrl-C waits for the trials under way, a second Ctrl-C does not."""
 
     def __init__(self, total: int, at_once: int) -> None:
         self.total, self.count, self.right = total, 0, 0
@@ -34,9 +34,10 @@ class TrialProgress(StoppableBar):
         self._task = self._bar.add_task("", total=total, numbers="")
 
     def done(self, result: TrialResult) -> None:
+        """Count one more finished trial."""
         self.count += 1
         self.right += succeeded(result)
-        numbers = f"{self.right} within 5 deg and 0.05 m, {shown(self._left())} left"
+        numbers = f"{self.right} within 5 deg and 0.05 m, {duration_text(self._left())} left"
         self._bar.update(self._task, completed=self.count, numbers=numbers)
         now = time.monotonic()
         if not console.is_terminal and (self.count == self.total or now - self._spoke > LINE_EVERY):
@@ -44,7 +45,7 @@ class TrialProgress(StoppableBar):
             say(f"{self.count}/{self.total} trials, {numbers}")
 
     def _left(self) -> float:
-        """Seconds; at first the workers are all still at their first trial, so the last of them counts more."""
+        """Return the remaining seconds at the mean rate so far, which is too low until every worker has finished a trial."""
         each = (time.monotonic() - self._began) / self.count
         return each * (self.total - self.count)
 
@@ -55,13 +56,8 @@ class TrialProgress(StoppableBar):
         console.print(f"waiting for {self._at_once} trials under way (Ctrl-C again: at once)", markup=False)
 
 
-def succeeded(result: TrialResult) -> bool:
-    trace = result.errors.as_error()
-    return result.error is not None and bool(CRITERIA["5deg 0.05"](trace[-1], trace[0]))
-
-
-def shown(seconds: float) -> str:
-    """In words: 50 s, 12 min, 3 h 5 min."""
+def duration_text(seconds: float) -> str:
+    """Return a duration as 50 s, 12 min or 3 h 5 min."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -1,10 +1,11 @@
-"""Many trials: planned from a protocol, run by any executor, each kept as soon as it is done."""
+"""Many trials: planned from a protocol, run by any executor, and each kept as soon as it is done."""
 
 from __future__ import annotations
 
 import json
 import os
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass
@@ -19,14 +20,31 @@ from bidnerf_core.evaluation.closed_form_data import ClosedFormData
 from bidnerf_core.evaluation.protocols import Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.sequences import sequence
-from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, opened_points, run_trial, settings_of
+from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.evaluation.trials import (
+    input_digests,
+    opened,
+    opened_points,
+    parse_settings,
+    run_trial,
+    trial_views,
+)
 from bidnerf_core.localization import find_method
+from bidnerf_core.localization.methods import RENAMED
 from bidnerf_core.serialization import to_plain
+from bidnerf_core.settings import to_flat
+
+CHANGED = {
+    "views": "images, depth or cameras than {trial.data} has now",
+    "points": "depth points than {trial.depth_points} has now",
+    "surface": "surface than map {trial.map} has now, which was baked anew",
+}
+"""What a changed digest of a trial's input means, by the digest's name."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be tried. ``trials`` of each size; none stands for what the protocol does by itself."""
+    """What to try. None stands for the protocol's own sizes, number of trials and seed."""
 
     map: str
     data: str
@@ -34,22 +52,22 @@ class Plan:
     sizes: tuple[Size, ...] | None = None
     method: str = "auto"
     config: str = "{}"  # JSON, see Trial
-    trials: int | None = None
+    trials: int | None = None  # of each size
     seed: int | None = None
     split: str = "test"
-    frames: tuple[str, ...] | None = None  # only these
-    images: int = 1  # of a sequence around the object ...
-    angle: float = 15.0  # ... so many degrees apart
+    frames: tuple[str, ...] | None = None  # try these only
+    images: int = 1  # length of the sequence around the object that is localized at once
+    angle: float = 15.0  # degrees between neighbours of a sequence
     device: str = "cpu"
-    depth: bool = True  # measured depth, where there is any
-    depth_points: str | None = None  # COLMAP model, see Trial
+    depth: bool = True  # whether the method gets the measured depth
+    depth_points: str | None = None  # see Trial
 
 
 def planned(plan: Plan) -> list[Trial]:
-    """All trials, in the order of the results. Raises ``InputError`` for what cannot be tried."""
+    """Return all trials in the order of the results. Raises ``InputError`` for a plan that cannot be carried out."""
     _, dataset = opened(plan.map, plan.data, plan.device)
     protocol = find_protocol(plan.protocol)
-    settings_of(plan.method, plan.config)
+    parse_settings(plan.method, plan.config)
     names = dataset.frame_names(plan.split)
     rigs = _rigs(plan, dataset, names)
     _check_points(plan, rigs)
@@ -81,18 +99,31 @@ def planned(plan: Plan) -> list[Trial]:
 
 
 def changed_settings(method: str, settings: Any) -> str:
-    """JSON of those that differ from the method's defaults."""
-    usual, given = to_plain(find_method(method).config_type()), to_plain(settings)
+    """Return the JSON of the settings that differ from the method's defaults."""
+    usual, given = to_flat(find_method(method).config_type()), to_flat(settings)
     return json.dumps({k: v for k, v in given.items() if v != usual[k]}, sort_keys=True)
 
 
 def left_to_do(trials: Sequence[Trial], file: ResultsFile) -> list[Trial]:
-    """Those that the file does not hold. Raises ``InputError`` where it holds one of another map or other defaults."""
-    for trial in trials:
-        known = file.results.get(key_of(trial))
-        if known is not None:
-            _check_same(trial, known, file)
+    """Return the trials that the file does not hold.
+
+    Raises ``InputError`` where it holds one with another training or surface of the map, other images or other settings.
+    """
+    _check_same([trial for trial in trials if key_of(trial) in file.results], file)
     return [trial for trial in trials if key_of(trial) not in file.results]
+
+
+def repeated_frames(trials: Sequence[Trial]) -> str | None:
+    """Return a sentence about frames that are tried several times from each size, or none where there are none."""
+    times = Counter((trial.size, trial.frames) for trial in trials)
+    if not times or max(times.values()) == 1:
+        return None
+    frames = len({frames for _, frames in times})
+    fewest, most = min(times.values()), max(times.values())
+    often = f"{most}" if fewest == most else f"{fewest} to {most}"
+    a_size = " of each size" if len({size for size, _ in times}) > 1 else ""
+    distinct = f"{frames} distinct frame{'s' if frames > 1 else ''}"
+    return f"{distinct} of split {trials[0].split!r}, each tried {often} times{a_size} with different seeds"
 
 
 def run_trials(
@@ -100,13 +131,13 @@ def run_trials(
     file: ResultsFile,
     executor: Executor,
     at_once: int,
-    told: Callable[[TrialResult], None] = lambda result: None,
+    finished: Callable[[TrialResult], None] = lambda result: None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Run what ``file`` does not hold and keep each result as it comes.
+    """Run the trials that ``file`` does not hold, and keep each result as it comes.
 
-    At most ``at_once`` trials are under way, so that little is lost by a kill. Once ``stopping`` says so, no new one is
-    begun. A trial that fails ends the run with its error, after those under way are kept.
+    At most ``at_once`` trials are under way, so that a kill loses little. No trial begins once ``stopping`` returns true. A
+    trial that fails ends the run with its error, after the results of the trials under way are kept.
     """
     waiting, under_way = iter(left_to_do(trials, file)), set[Future[TrialResult]]()
     failed: BaseException | None = None
@@ -125,26 +156,26 @@ def run_trials(
                 failed = failed or error
                 continue
             file.add(future.result())
-            told(future.result())
+            finished(future.result())
     if failed is not None:
         raise failed
 
 
-def share(trials: Sequence[Trial], number: int, shards: int) -> list[Trial]:
-    """The part of one machine among several: every ``shards``-th trial."""
+def shard_of(trials: Sequence[Trial], number: int, shards: int) -> list[Trial]:
+    """Return part ``number`` of ``shards``, for one machine among several: every ``shards``-th trial."""
     if not 0 <= number < shards:
         raise InputError(f"shard is {number}, expected 0 to {shards - 1}")
     return list(trials[number::shards])
 
 
 def run_in_worker(trial: Trial) -> TrialResult:
-    """In a process that does nothing else: one thread for good."""
+    """Run a trial in a process that does nothing else, which therefore keeps to one thread."""
     torch.set_num_threads(1)
     return run_trial(trial)
 
 
 class InThisProcess(Executor):
-    """Runs what it is given at once."""
+    """An executor that runs every call at once in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -156,14 +187,14 @@ class InThisProcess(Executor):
 
 
 def local_processes(count: int) -> Executor:
-    """Processes of one thread each that end when this one does, however it ends."""
+    """Return an executor of ``count`` processes of one thread each, which end when this process ends, however it does."""
     if count == 1:
         return InThisProcess()
     return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=prepare_worker)
 
 
 def prepare_worker() -> None:
-    """Ctrl-C is for the parent; a worker whose parent is gone goes too."""
+    """Set a worker up: it leaves Ctrl-C to its parent and exits when its parent is gone."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -178,23 +209,44 @@ def _follow_parent() -> None:
         os._exit(1)
 
 
-def _check_same(trial: Trial, known: TrialResult, file: ResultsFile) -> None:
-    stored, _ = opened(trial.map, trial.data, trial.device)
-    advice = "name another --out, or remove the file to begin anew"
-    if known.weights != stored.info.weights:
-        raise InputError(
-            f"{file.path}: holds results of another training of map {trial.map} "
-            f"({known.weights}, expected {stored.info.weights}); {advice}"
-        )
-    settings = to_plain(settings_of(trial.method, trial.config))
-    for name, value in settings.items():
-        if known.settings.get(name) != value:
-            found = known.settings.get(name)
-            raise InputError(f"{file.path}: was made with {name} {found}, expected {value}; {advice}")
+def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
+    """Raise ``InputError`` where a result of ``file`` was made with other weights, settings or input than its trial has now."""
+    digests: dict[Any, dict[str, Any]] = {}
+    for trial in trials:
+        known = file.results[key_of(trial)]
+        stored, dataset = opened(trial.map, trial.data, trial.device)
+        advice = "name another --out, or remove the file to begin anew"
+        if known.weights != stored.info.weights:
+            raise InputError(
+                f"{file.path}: holds results of another training of map {trial.map} "
+                f"({known.weights}, expected {stored.info.weights}); {advice}"
+            )
+        _check_settings(trial, known, f"{file.path}: was made with {{}} {{}}, expected {{}}; {advice}")
+        if known.inputs is None:  # an earlier version did not record it
+            continue
+        read = trial.frames, trial.depth, trial.depth_points
+        if read not in digests:
+            digests[read] = to_plain(input_digests(trial, stored, trial_views(trial, dataset)))
+        for name, digest in to_plain(known.inputs).items():
+            if digest != digests[read][name]:
+                what = CHANGED[name].format(trial=trial)
+                raise InputError(
+                    f"{file.path}: holds results of frame {trial.frame} made with other {what}; {advice}"
+                )
+
+
+def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
+    """Raise ``InputError`` where a result was made with other settings; what an earlier version lacked had its default."""
+    usual = to_flat(find_method(trial.method).config_type())
+    found = {RENAMED.get(name, name): value for name, value in known.settings.items()}
+    for name, value in to_flat(parse_settings(trial.method, trial.config)).items():
+        before = found.get(name, usual[name])
+        if before != value:
+            raise InputError(message.format(name, before, value))
 
 
 def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...]]:
-    """For each frame that may be tried, the names of its views."""
+    """Return the names of the views of each frame that may be tried."""
     for name in plan.frames or ():
         if name not in names:
             raise InputError(f"{plan.data}: split {plan.split!r} has no frame {name!r}")
@@ -213,7 +265,7 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
 
 
 def _check_points(plan: Plan, rigs: list[tuple[str, ...]]) -> None:
-    """Every trial must have some."""
+    """Raise ``InputError`` where the views of some frame observe no depth points."""
     points = opened_points(plan.depth_points, plan.map)
     if points is None:
         return

@@ -1,8 +1,8 @@
-"""Closed-form scenes as maps and datasets, so that a bench runs where there is no data: nothing is read, all is computed.
+"""Closed-form scenes as maps and datasets, so that an evaluation needs no files.
 
-``demo:blobs`` is a map as well: coloured clouds whose field is known exactly, with images rendered from that field.
-``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf_core.scenes``, with exact depth: data
-for a map that was trained on the same scene.
+``demo:blobs`` is also a map: coloured clouds whose field is known exactly, with images rendered from that field.
+``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf_core.scenes`` with exact depth, as data
+for maps that were trained on them.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map, MapInfo
 
 PREFIX = "demo:"
-CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
+DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 FRAMES = 24
 BLOBS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
-TURNED = re.compile(r"(?P<place>\d{4})(?:@(?P<angle>-?\d+(?:\.\d+)?))?")
-"""A frame's name: its number and, for one of a sequence, by how many degrees it is further round."""
+FRAME_NAME = re.compile(r"(?P<place>\d{4})(?:@(?P<angle>-?\d+(?:\.\d+)?))?")
+"""A frame's name: its number, and in a sequence the degrees by which it is turned."""
 
-T = TypeVar("T")
+Scene = TypeVar("Scene")
 Render = Callable[[SE3, str], Frame]
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedFormData:
-    """A ``Dataset`` of one split, "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the scene's middle."""
+    """A ``Dataset`` with the one split "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the scene's middle."""
 
     name: str
     poses: tuple[SE3, ...]  # T_world_camera
@@ -52,13 +52,16 @@ class ClosedFormData:
 
     @property
     def path(self) -> Path:
+        """The name of the scene, in the place of a folder."""
         return Path(PREFIX + self.name)
 
     @property
     def splits(self) -> tuple[str, ...]:
+        """The names of all splits."""
         return ("test",)
 
     def frame_names(self, split: str) -> list[str]:
+        """Return the names of the frames of ``split``."""
         if split != "test":
             raise InputError(f"{self.path}: no split {split!r}, expected test")
         return [f"{place:04d}" for place in range(len(self.poses))]
@@ -66,6 +69,7 @@ class ClosedFormData:
     def views(
         self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
     ) -> list[View]:
+        """Render the frames with these names, by default all of the split."""
         asked, views = self.frame_names(split) if names is None else names, []
         for done, name in enumerate(asked, start=1):
             pose = self._pose(name)
@@ -75,11 +79,11 @@ class ClosedFormData:
         return views
 
     def sequence(self, name: str, count: int, angle: float) -> tuple[str, ...]:
-        """Names of ``count`` frames, ``angle`` degrees apart, that end with frame ``name``."""
+        """Return the names of ``count`` frames, ``angle`` degrees apart, that end with frame ``name``."""
         return (*(f"{name}@{k * angle:g}" for k in range(count - 1, 0, -1)), name)
 
     def _pose(self, name: str) -> SE3:
-        found = TURNED.fullmatch(name)
+        found = FRAME_NAME.fullmatch(name)
         if found is None or int(found["place"]) >= len(self.poses):
             last = len(self.poses) - 1
             raise InputError(f"{self.path}: no frame {name!r}, expected 0000 to {last:04d} or one as 0000@15")
@@ -90,20 +94,21 @@ class ClosedFormData:
 
 
 def is_closed_form(name: str) -> bool:
+    """Return whether a map or dataset is a closed-form scene, and no folder."""
     return name.startswith(PREFIX)
 
 
 def closed_form_data(name: str) -> ClosedFormData:
-    """The data of ``demo:NAME``."""
+    """Return the data of ``demo:NAME``. Raises ``InputError`` for an unknown name."""
     return _found(name, DATA, "data")()
 
 
 def closed_form_map(name: str) -> Map:
-    """The map of ``demo:NAME``: only what has a field in closed form is one."""
+    """Return the map of ``demo:NAME``. Raises ``InputError`` for a name whose field is not known in closed form."""
     return _found(name, MAPS, "map")()
 
 
-def _found(name: str, known: dict[str, Callable[[], T]], what: str) -> Callable[[], T]:
+def _found(name: str, known: dict[str, Callable[[], Scene]], what: str) -> Callable[[], Scene]:
     own = name.removeprefix(PREFIX)
     if own in known:
         return known[own]
@@ -118,7 +123,7 @@ def _object() -> ClosedFormData:
     scene = demo_object()
     poses = tuple(orbit(3.5, FRAMES, elevation=(15.0, 50.0), seed=1))
     return ClosedFormData(
-        "object", poses, lambda T, name: scene.render(CAMERA, T, name), scene.bounds.background
+        "object", poses, lambda T, name: scene.render(DEMO_CAMERA, T, name), scene.bounds.background
     )
 
 
@@ -127,7 +132,7 @@ def _room() -> ClosedFormData:
     middle = (0.0, 0.0, 1.25)
     poses = tuple(look_around(scene.bounds, FRAMES, seed=1))
     return ClosedFormData(
-        "room", poses, lambda T, name: scene.render(CAMERA, T, name), scene.bounds.background, middle
+        "room", poses, lambda T, name: scene.render(DEMO_CAMERA, T, name), scene.bounds.background, middle
     )
 
 
@@ -136,7 +141,7 @@ def _blobs() -> ClosedFormData:
 
     def render(T: SE3, name: str) -> Frame:
         image = render_image(field, half, T, BLOBS)
-        depth = torch.where(image.opacity > 0.99, image.depth, 0)  # what is nearly solid has one
+        depth = torch.where(image.opacity > 0.99, image.depth, 0)  # only nearly opaque pixels have depth
         return Frame(name, image.rgb, half, depth, image.opacity)
 
     return ClosedFormData("blobs", tuple(orbit(3.5, FRAMES, seed=1)), render, BLOBS.background)

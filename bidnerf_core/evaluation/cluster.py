@@ -1,4 +1,4 @@
-"""Trials on a cluster: dask's workers behind the executor that every bench takes."""
+"""Trials on a cluster: the workers of dask behind an ordinary executor."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from contextlib import contextmanager
 from bidnerf_core.errors import InputError
 
 PATIENCE = "20s"
-"""To reach the scheduler."""
+"""How long to wait for the scheduler."""
 
 
 @contextmanager
 def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
-    """An executor of the scheduler at ``address``, and how many trials its workers run at once.
+    """Yield an executor of the scheduler at ``address``, and the number of trials that its workers run at once.
 
-    Workers need this package, the same backends, and the maps and data under the same paths. Peak memory is told per
-    process: give each worker one thread (``dask worker --nthreads 1``) where it is to be that of one trial.
+    Workers need this package, the same backends, and the maps and data under the same paths. Peak memory is measured for
+    a process: a worker needs one thread (``dask worker --nthreads 1``) for it to be the memory of one trial.
+
+    Raises ``InputError`` where dask is missing, and where no scheduler or worker answers.
     """
     try:
         from distributed import Client

@@ -1,4 +1,4 @@
-"""Several maps tried on the same frames from the same starts: what each finds, and what that costs."""
+"""Several maps compared on the same frames from the same starts: what each finds, and at what cost."""
 
 from __future__ import annotations
 
@@ -12,49 +12,37 @@ from typing import Any, TypeAlias
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, is_closed_form
-from bidnerf_core.evaluation.errors import CRITERIA, Rate, steps_to_success, success_rate
 from bidnerf_core.evaluation.protocols import find_protocol
+from bidnerf_core.evaluation.summary import Success, summarize
+from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trial_process import Measured, TrialProcess
-from bidnerf_core.evaluation.trials import Trial, TrialResult
 from bidnerf_core.storage import DESCRIPTION, load_info
 
-USUAL = "10%"
-"""The criterion by which speed is told where there is room for one."""
-
-Told: TypeAlias = Callable[[int, int, Measured], None]
-"""Hears of each finished trial: how many are done, of how many, and what came of the last."""
-
-
-@dataclass(frozen=True)
-class Reached:
-    """How often a criterion was met, and how soon where it was: medians over the trials that met it."""
-
-    rate: Rate
-    steps: float | None
-    milliseconds: float | None
+ProgressCallback: TypeAlias = Callable[[int, int, Measured], None]
+"""Called after each trial with the number of finished trials, the number of all, and the latest result."""
 
 
 @dataclass(frozen=True)
 class MapRow:
-    """One map in a comparison. Medians and means are over its trials."""
+    """One map of a comparison. Medians and means are over its trials."""
 
-    map: str  # as short as tells it from the others
+    map: str  # the shortest name that is unique among the maps
     backend: str
-    weights: str  # which training of it
-    success: dict[str, Reached]  # by criterion
+    weights: str  # file name, new with every training
+    success: dict[str, Success | None]  # by criterion; none where it does not apply
     translation: float | None  # metres, median of the final errors; none where most are not finite
     rotation_deg: float | None
     steps: float  # median
     seconds: float  # median of a trial's
     ms_per_step: float  # median
-    peak_memory_bytes: int  # of the process that had this map alone
+    peak_memory_bytes: int  # of the process of this map
     samples_per_ray: float  # mean
-    map_bytes: int  # of what localizing reads
+    map_bytes: int  # size of the files that localization reads
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was done, and one row a map, in the order in which they were named."""
+    """The setup of a comparison, and one row a map in the order given."""
 
     data: str
     split: str
@@ -63,16 +51,18 @@ class Comparison:
     method: str
     settings: dict[str, Any]
     seed: int
-    trials: int  # of each map
+    trials: int  # on each map
     rows: tuple[MapRow, ...]
-    results: tuple[tuple[TrialResult, ...], ...] = ()  # of each map, in the same order of starts
+    results: tuple[tuple[TrialResult, ...], ...] = ()  # by map, in the same order of starts
 
 
-def plan(usual: Trial, maps: Sequence[str], names: Sequence[str], count: int | None) -> list[list[Trial]]:
-    """For each start, one trial a map. Frames and seeds are those of the protocol's plan.
+def plan_comparison(
+    usual: Trial, maps: Sequence[str], names: Sequence[str], count: int | None
+) -> list[list[Trial]]:
+    """Return one trial a map for each start, with the frames and seeds of the protocol.
 
-    ``usual`` says all but the map and the frame; ``names`` are the frames to choose from, all of the split where empty.
-    Raises ``InputError`` where a name or a number is not usable.
+    ``usual`` gives everything but the map and the frame; ``names`` are the frames to choose from, empty for all frames of
+    the split. Raises ``InputError`` for a name or a number that cannot be used.
     """
     if len({Path(m).resolve() for m in maps}) != len(maps):
         raise InputError(f"maps: {', '.join(maps)}: one is named twice, expected different ones")
@@ -87,10 +77,10 @@ def plan(usual: Trial, maps: Sequence[str], names: Sequence[str], count: int | N
     ]
 
 
-def compare(planned: Sequence[Sequence[Trial]], told: Told) -> Comparison:
-    """Run what was planned: each map in a process of its own, and the maps in turn at each start.
+def compare_maps(planned: Sequence[Sequence[Trial]], progress: ProgressCallback) -> Comparison:
+    """Run what was planned: each map in a process of its own, one map after the other at each start.
 
-    Whatever else the machine does meanwhile so disturbs all of them alike. Only one of them works at a time.
+    Only one process works at a time, so that a change of the machine's load affects all maps alike.
     """
     maps = [trial.map for trial in planned[0]]
     done: list[list[Measured]] = [[] for _ in maps]
@@ -99,48 +89,37 @@ def compare(planned: Sequence[Sequence[Trial]], told: Told) -> Comparison:
         for number, trials in enumerate(planned):
             for place, (process, trial) in enumerate(zip(processes, trials, strict=True)):
                 done[place].append(process.run(trial))
-                told(number * len(maps) + place + 1, len(planned) * len(maps), done[place][-1])
+                progress(number * len(maps) + place + 1, len(planned) * len(maps), done[place][-1])
     first, result = planned[0][0], done[0][0].result
     return Comparison(
         Path(first.data).resolve().name, first.split, first.protocol, first.size, result.method, result.settings,
-        first.seed, len(planned), tuple(map(row, labels(maps), maps, done)),
+        first.seed, len(planned), tuple(map(map_row, map_labels(maps), maps, done)),
         tuple(tuple(m.result for m in column) for column in done),
     )  # fmt: skip
 
 
-def row(label: str, folder: str, measured: Sequence[Measured]) -> MapRow:
+def map_row(label: str, folder: str, measured: Sequence[Measured]) -> MapRow:
+    """Return the statistics of the trials on one map."""
     results = [m.result for m in measured]
-    finals = [r.error for r in results]
-    translation, rotation = (
-        _median([getattr(e, what) if e else None for e in finals]) for what in ("translation", "rotation_deg")
-    )
+    found = summarize(results)
     return MapRow(
-        label, results[0].backend, results[0].weights,
-        {name: reached(results, name) for name in CRITERIA}, translation, rotation,
-        statistics.median(r.steps for r in results), statistics.median(r.seconds for r in results),
-        statistics.median(_ms_per_step(r) for r in results), max(r.peak_memory_bytes for r in results),
-        statistics.fmean(m.samples_per_ray for m in measured), map_bytes(Path(folder)),
-    )  # fmt: skip
+        map=label,
+        backend=results[0].backend,
+        weights=results[0].weights,
+        success=found.criteria,
+        translation=found.translation,
+        rotation_deg=found.rotation_deg,
+        steps=found.steps,
+        seconds=found.seconds,
+        ms_per_step=found.milliseconds_per_step,
+        peak_memory_bytes=found.peak_memory_bytes,
+        samples_per_ray=statistics.fmean(m.samples_per_ray for m in measured),
+        map_bytes=map_bytes(Path(folder)),
+    )
 
 
-def reached(results: Sequence[TrialResult], criterion: str) -> Reached:
-    """Over trials that began from a start; the error of the start belongs to the first criterion."""
-    steps = [steps_to_success(r.errors.as_error(), CRITERIA[criterion]) for r in results]
-    soon = [(s, s * _ms_per_step(r)) for s, r in zip(steps, results, strict=True) if s is not None]
-    rate = success_rate(len(soon), len(results))
-    if not soon:
-        return Reached(rate, None, None)
-    return Reached(rate, statistics.median(s for s, _ in soon), statistics.median(ms for _, ms in soon))
-
-
-def seconds_to_success(results: Sequence[TrialResult], criterion: str) -> list[float]:
-    """Of the trials that met the criterion, the quickest first."""
-    steps = ((steps_to_success(r.errors.as_error(), CRITERIA[criterion]), r) for r in results)
-    return sorted(s * _ms_per_step(r) / 1000 for s, r in steps if s is not None)
-
-
-def labels(maps: Sequence[str]) -> list[str]:
-    """The folders' names where these tell them apart, else as much more of their paths as is needed."""
+def map_labels(maps: Sequence[str]) -> list[str]:
+    """Return the folders' names, with as many of their parents as make them unique."""
     parts = [Path(m).resolve().parts for m in maps]
     length = 1
     while len({p[-length:] for p in parts}) < len(parts):
@@ -149,14 +128,14 @@ def labels(maps: Sequence[str]) -> list[str]:
 
 
 def map_bytes(folder: Path) -> int:
-    """Of the description and the weights; not of what an interrupted training keeps for itself."""
+    """Return the size of a map's description and weights, without what an interrupted training keeps for itself."""
     if is_closed_form(str(folder)):
         return 0
     return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))
 
 
 def _known(usual: Trial, names: Sequence[str]) -> list[str]:
-    """The frames to choose from, of which each is there."""
+    """Return the frames to choose from. Raises ``InputError`` for one that the split does not have."""
     data = usual.data
     dataset = closed_form_data(data) if is_closed_form(data) else open_dataset(data)
     known = dataset.frame_names(usual.split)
@@ -166,13 +145,3 @@ def _known(usual: Trial, names: Sequence[str]) -> list[str]:
             f"{data}: no frame {missing[0]!r} in split {usual.split!r}, expected names of its frames"
         )
     return list(names) or known
-
-
-def _ms_per_step(result: TrialResult) -> float:
-    return 1000 * result.seconds / max(1, result.steps)
-
-
-def _median(values: Sequence[float | None]) -> float | None:
-    """With what is not known counted as larger than all."""
-    middle = sorted(values, key=lambda v: (v is None, v or 0.0))[len(values) // 2]
-    return middle

@@ -1,4 +1,4 @@
-"""How wrong a pose is, and whether that counts as success. Poses are ``T_world_camera``."""
+"""Errors of poses (``T_world_camera``), and the criteria by which they count as success."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.stats import binomtest
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
@@ -16,7 +15,7 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Of one pose, or of a batch: of all steps of a run, say."""
+    """The translation and rotation error of one pose, or of a batch: of all steps of a run, for example."""
 
     translation: Float[Tensor, "*b"]  # metres between the camera centres
     rotation_deg: Float[Tensor, "*b"]  # geodesic angle, degrees, 0 to 180
@@ -26,7 +25,7 @@ class PoseError:
 
 
 def pose_error(found: SE3, true: SE3) -> PoseError:
-    """In float64; batches broadcast. Not finite where a pose is not."""
+    """Return the error of ``found`` in float64; batches broadcast. It is not finite where a pose is not."""
     found, true = found.to(dtype=torch.float64), true.to(dtype=torch.float64)
     distance = torch.linalg.vector_norm(found.translation - true.translation, dim=-1)
     return PoseError(distance, torch.rad2deg(rotation_angle(true.rotation.mT @ found.rotation)))
@@ -35,8 +34,10 @@ def pose_error(found: SE3, true: SE3) -> PoseError:
 def normalized_error_squared(
     found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]
 ) -> Float[Tensor, "*b"]:
-    """``xi^T C^-1 xi`` with ``true = found exp(xi)``: chi-squared with 6 degrees of freedom where C tells the truth
-    (Bar-Shalom et al. 2001, "Estimation with applications to tracking and navigation", 5.4.2).
+    """Return ``xi^T C^-1 xi`` with ``true = found exp(xi)``.
+
+    It is chi-squared with 6 degrees of freedom where the covariance C is consistent (Bar-Shalom et al. 2001, "Estimation
+    with applications to tracking and navigation", 5.4.2).
 
     Infinite or not a number where the covariance has no inverse.
     """
@@ -46,7 +47,7 @@ def normalized_error_squared(
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Radians, 0 to pi. ``acos`` of the trace would lose half of the digits near both ends, ``atan2`` loses none."""
+    """Return the angle in radians, 0 to pi. ``acos`` of the trace would lose half of the digits near both ends."""
     skewed = rotation - rotation.mT
     twice_axis = torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -55,14 +56,14 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 @runtime_checkable
 class Criterion(Protocol):
-    """Whether an error counts as success, given the error that the start had. A pose that is not finite never does."""
+    """Decides whether an error counts as success, given the error of the start. A pose that is not finite never succeeds."""
 
     def __call__(self, error: PoseError, start: PoseError) -> Bool[Tensor, "*b"]: ...
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """The centre came to within ``fraction`` of the distance it started at (BID-NeRF, section IV)."""
+    """Success is a translation error of at most ``fraction`` of the start's (BID-NeRF, section IV)."""
 
     fraction: float
 
@@ -72,7 +73,7 @@ class Reduced:
 
 @dataclass(frozen=True)
 class Within:
-    """Both errors are under a bar, wherever the start was."""
+    """Success is a rotation and a translation error below fixed thresholds, wherever the start was."""
 
     rotation_deg: float
     translation: float  # metres
@@ -86,11 +87,11 @@ CRITERIA: dict[str, Criterion] = {
     "5deg 0.05": Within(5.0, 0.05),
     "1deg 0.02": Within(1.0, 0.02),
 }
-"""Reported side by side: the one of the paper, a usual one, a strict one."""
+"""Reported side by side: the criterion of the paper, a usual one and a strict one."""
 
 
 def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
-    """The first step from which on the error stays under the bar; None where it is over it at the end.
+    """Return the first step from which on the criterion holds; none where it does not hold at the end.
 
     ``trace`` has one axis: entry 0 is the start's error, entry n the error after step n.
     """
@@ -106,7 +107,7 @@ def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
 
 @dataclass(frozen=True)
 class Rate:
-    """A share of successes and the ends of Wilson's interval for it."""
+    """A share of successes and the ends of its Wilson interval."""
 
     successes: int
     trials: int
@@ -123,7 +124,10 @@ class Rate:
 
 
 def success_rate(successes: int, trials: int, confidence: float = 0.95) -> Rate:
+    """Return the share of successes with Wilson's interval (Wilson 1927)."""
     if not (trials >= 1 and 0 <= successes <= trials):
         raise InputError(f"success rate: {successes} of {trials}, expected 0 to n of at least one trial")
+    from scipy.stats import binomtest  # here, because its import takes longer than any help page should
+
     interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
     return Rate(successes, trials, float(interval.low), float(interval.high))

@@ -1,4 +1,4 @@
-"""Pictures of results: plain arrays in, 8-bit images out. Only ``convergence_plot`` needs matplotlib."""
+"""Pictures of poses and depth from plain arrays, as 8-bit images; only ``convergence_plot`` needs matplotlib."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import PoseError
+from bidnerf_core.evaluation.plot_style import line_look, new_figure, styled
 
 TILE = 240  # pixels: smaller images are enlarged to about this, so that captions fit
 CAPTION, GAP = 22, 6  # pixels
 INK, FRAME, PAPER = (30, 34, 42), (214, 216, 220), (255, 255, 255)
 OBSERVED_EDGES, RENDERED_EDGES = (0, 190, 110), (235, 0, 140)
-NOTHING = (38, 38, 42)  # where no depth was measured
+NO_DEPTH = (38, 38, 42)  # colour where no depth was measured
 
 # Turbo colours (Mikhailov 2019): their author's polynomial of degree 5: rows red, green, blue; columns 1, x, x^2 ...
 TURBO = (
@@ -37,7 +38,9 @@ def overlay(
     found: ArrayLike | Tensor,
     captions: tuple[str, str, str] = ("observed", "rendered at the start", "rendered at the pose found"),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Observed, rendered at start and at the pose found; below, how well each lies on the observed image.
+    """Return one picture of the observed image and of what is rendered at the start and at the pose found.
+
+    Below each image is its comparison with the observed one.
 
     Images (h w 3) as ``as_picture`` takes them.
     """
@@ -57,7 +60,7 @@ def overlay(
 
 
 def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarray, "h w 3"]:
-    """Eight bits of an image (h w 3) or (h w): floats in [0, 1], tensor or array, clipped; NaN is drawn black."""
+    """Return an image (h w 3) or (h w) of floats in [0, 1] as 8 bits, clipped; NaN becomes black."""
     array = _array(image)
     if array.ndim == 2:
         array = np.repeat(array[..., None], 3, axis=-1)
@@ -72,25 +75,25 @@ def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarr
 def depth_to_rgb(
     depth: ArrayLike | Tensor, near: float | None = None, far: float | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Depth (h w, metres) in colours, near red and far blue; dark where there is none (0 or not finite).
+    """Return depth (h w, metres) in colours from near red to far blue, dark where none was measured (0 or not finite).
 
-    ``near`` and ``far`` (metres) are the ends of the scale; by default the 1st and 99th percentile of what was measured.
+    ``near`` and ``far`` (metres) are the ends of the scale; by default the 1st and 99th percentile of the measured depth.
     """
     array = _array(depth).astype(np.float64)
     if array.ndim != 2 or array.size == 0:
         raise InputError(f"depth: expected an image (height, width), got shape {array.shape}")
     measured = np.isfinite(array) & (array > 0)
     if not measured.any():
-        return np.full((*array.shape, 3), NOTHING, dtype=np.uint8)
+        return np.full((*array.shape, 3), NO_DEPTH, dtype=np.uint8)
     low, high = np.percentile(array[measured], (1, 99))
     low, high = low if near is None else near, high if far is None else far
     share = ((np.where(measured, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
     powers = (0.96 - 0.9 * share)[..., None] ** np.arange(6)  # the map's own ends are nearly black
-    return np.where(measured[..., None], as_picture(powers @ np.array(TURBO).T), np.array(NOTHING, np.uint8))
+    return np.where(measured[..., None], as_picture(powers @ np.array(TURBO).T), np.array(NO_DEPTH, np.uint8))
 
 
 def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:
-    """Both, half and half and pale, with the edges of each in its own colour: they coincide at the true pose."""
+    """Return the pale mean of two images with the edges of each in its own colour, which coincide at the true pose."""
     a, b = as_picture(observed, "observed"), as_picture(rendered, "rendered")
     _require_same_size([a, b], ("observed", "rendered"))
     mixed = 0.55 * (a / 2 + b / 2) + 0.45 * 255
@@ -103,7 +106,7 @@ def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[n
 def chequered(
     first: ArrayLike | Tensor, second: ArrayLike | Tensor, squares: int = 6
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Squares of one and the other in turn: contours run on across their borders at the true pose."""
+    """Return a chequerboard of two images; contours continue across its squares at the true pose."""
     a, b = as_picture(first, "first"), as_picture(second, "second")
     _require_same_size([a, b], ("first", "second"))
     side = max(1, math.ceil(max(a.shape[:2]) / squares))
@@ -112,7 +115,7 @@ def chequered(
 
 
 def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
-    """Strength of the strongest tenth of contours, 0 to 1."""
+    """Return the strength of edges, 0 to 1, of which the strongest tenth stands out."""
     grey = as_picture(image).astype(np.float64).mean(-1) / 255
     padded = np.pad(grey, 1, mode="edge")
     across, down = padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]
@@ -122,7 +125,7 @@ def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
 
 
 def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
-    """The image, enlarged if it is small, on white with its caption above."""
+    """Return the image on white, enlarged if it is small, with its caption above."""
     picture = Image.fromarray(as_picture(image))
     scale = max(1, round(TILE / picture.width))
     picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
@@ -137,7 +140,7 @@ def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
-    """An endless animation of equally large images (h w 3)."""
+    """Write an endless animation of images (h w 3) of one size."""
     if not (math.isfinite(fps) and fps > 0):
         raise InputError(f"{path}: {fps} frames a second, expected a positive number")
     pictures = [as_picture(frame, f"frame {i}") for i, frame in enumerate(frames)]
@@ -149,25 +152,24 @@ def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float 
 
 
 def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
-    """Translation and rotation error after each step, one curve per name, on a logarithmic scale.
+    """Plot translation and rotation error after each step on a logarithmic scale, one curve a name.
 
-    Entry 0 of a trace is the start. Values that a logarithm does not have leave a gap.
+    Entry 0 of a trace is the start. Values that have no logarithm leave a gap. Raises ``InputError`` without matplotlib.
     """
     if not traces:
         raise InputError(f"{path}: a plot of no traces")
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise InputError("plots need matplotlib, which is missing: pip install 'bidnerf[plots]'") from error
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)  # not pyplot: no global state, no window
-    left, right = figure.subplots(1, 2)
-    _draw_errors(left, {name: trace.translation for name, trace in traces.items()}, "translation (m)", 0.05)
-    _draw_errors(right, {name: trace.rotation_deg for name, trace in traces.items()}, "rotation (deg)", 5.0)
-    left.legend(fontsize="small", frameon=False)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    with styled():
+        figure = new_figure(9, 3.6)
+        left, right = figure.subplots(1, 2)
+        _draw_errors(
+            left, {name: trace.translation for name, trace in traces.items()}, "translation (m)", 0.05
+        )
+        _draw_errors(
+            right, {name: trace.rotation_deg for name, trace in traces.items()}, "rotation (deg)", 5.0
+        )
+        left.legend(fontsize="small")
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=130)
 
 
 def _array(values: ArrayLike | Tensor) -> np.ndarray:
@@ -175,12 +177,14 @@ def _array(values: ArrayLike | Tensor) -> np.ndarray:
 
 
 def _draw_errors(axes: Any, errors: Mapping[str, Tensor], unit: str, bar: float) -> None:
-    for name, trace in errors.items():
+    for place, (name, trace) in enumerate(errors.items()):
         values = _array(trace).astype(np.float64).reshape(-1)
-        axes.plot(np.where(np.isfinite(values) & (values > 0), values, np.nan), label=name, linewidth=1.6)
+        axes.plot(
+            np.where(np.isfinite(values) & (values > 0), values, np.nan), label=name, **line_look(place)
+        )
     axes.axhline(bar, color="0.6", linewidth=1, linestyle="--")
     axes.set(yscale="log", xlabel="step", ylabel=f"error in {unit}")
-    axes.grid(alpha=0.25, which="both")
+    axes.grid(which="both")
 
 
 def _require_same_size(images: Sequence[np.ndarray], names: Sequence[str]) -> None:

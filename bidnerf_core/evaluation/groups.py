@@ -1,4 +1,4 @@
-"""Results put side by side: what was asked (situation) and what answered (condition)."""
+"""Results grouped by situation, which is what was to be localized, and by condition, which is what localized it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from bidnerf_core.evaluation.trials import TrialResult
+from bidnerf_core.evaluation.trial import TrialResult
 
 
 @dataclass(frozen=True)
 class Situation:
-    """Where trials began, and in which map. ``size`` is none where all sizes are taken together."""
+    """The map, the images and the starts of some trials. ``size`` is none where trials of all sizes are pooled."""
 
     map: str
     weights: str  # which training of it
@@ -23,16 +23,18 @@ class Situation:
 
     @property
     def start(self) -> str:
-        """The start in words."""
+        """Return the start in words."""
         if self.size is None:
             return f"{self.protocol}, all sizes"
+        if self.protocol == "none":
+            return "no start"
         numbers = " : ".join(f"{number:g}" for number in self.size)
         return f"{self.protocol} {numbers}".rstrip()
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What was tried there."""
+    """The method with its settings and what it ran on."""
 
     method: str
     settings: str  # JSON of all of them
@@ -43,7 +45,7 @@ class Condition:
     depth_points: str | None = None
 
     def facts(self) -> dict[str, Any]:
-        """What tells conditions apart, by name."""
+        """Return everything that tells conditions apart, by name."""
         own = {"images": self.images, "depth": self.depth, "depth_points": self.depth_points}
         own |= {"backend": self.backend, "device": self.device}
         return {"method": self.method, **own, **json.loads(self.settings)}
@@ -51,6 +53,8 @@ class Condition:
 
 @dataclass(frozen=True)
 class Group:
+    """The trials of one condition in one situation."""
+
     situation: Situation
     condition: Condition
     label: str  # of the condition, among the others
@@ -58,25 +62,43 @@ class Group:
 
 
 def grouped(results: Sequence[TrialResult]) -> list[Group]:
-    """All groups, situations and conditions in the order in which they appear; "all sizes" behind the sizes."""
+    """Return all groups in the order in which they appear; groups that pool all sizes come after the single sizes."""
     found: dict[tuple[Situation, Condition], list[TrialResult]] = {}
     for result in results:
         found.setdefault((situation_of(result), condition_of(result)), []).append(result)
-    names = labels(list(dict.fromkeys(condition for _, condition in found)))
+    names = condition_labels(list(dict.fromkeys(condition for _, condition in found)))
     groups = [Group(s, c, names[c], tuple(rows)) for (s, c), rows in found.items()]
     return sorted_by_situation([*groups, *_together(groups)])
 
 
 def situations(groups: Sequence[Group]) -> list[Situation]:
+    """Return the situations of ``groups``, each once, in order."""
     return list(dict.fromkeys(group.situation for group in groups))
 
 
+def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
+    """Return a title for each situation: its start, after the map and the data where these are not all the same."""
+    maps = {situation.map for situation in every}
+    trainings = {(situation.map, situation.weights) for situation in every}
+    datasets = {(situation.data, situation.split) for situation in every}
+    titles = {}
+    for s in every:
+        retrained = sum(name == s.map for name, _ in trainings) > 1
+        name = f"{s.map} ({s.weights.partition('.')[0]})" if retrained else s.map
+        places = [name] if len(maps) > 1 or retrained else []
+        places += [f"{s.data}/{s.split}"] if len(datasets) > 1 else []
+        titles[s] = ": ".join([" on ".join(places), s.start] if places else [s.start])
+    return titles
+
+
 def situation_of(result: TrialResult) -> Situation:
+    """Return the situation that a trial belongs to."""
     trial = result.trial
     return Situation(trial.map, result.weights, trial.data, trial.split, trial.protocol, trial.size)
 
 
 def condition_of(result: TrialResult) -> Condition:
+    """Return the condition that a trial belongs to."""
     trial, settings = result.trial, json.dumps(result.settings, sort_keys=True)
     images = len(trial.frames)
     return Condition(
@@ -84,8 +106,8 @@ def condition_of(result: TrialResult) -> Condition:
     )
 
 
-def labels(conditions: Sequence[Condition]) -> dict[Condition, str]:
-    """The method's name and, of all else, what not all conditions of that method have in common."""
+def condition_labels(conditions: Sequence[Condition]) -> dict[Condition, str]:
+    """Return a label for each condition: its method, and whatever not all conditions of that method share."""
     named: dict[Condition, str] = {}
     for condition in conditions:
         same = [other.facts() for other in conditions if other.method == condition.method]
@@ -96,7 +118,7 @@ def labels(conditions: Sequence[Condition]) -> dict[Condition, str]:
 
 
 def sorted_by_situation(groups: Sequence[Group]) -> list[Group]:
-    """Situations of one map and protocol together, sizes from small to large, then all of them."""
+    """Sort by map, data and protocol in order of appearance, then by size, with the pooled sizes last."""
     places: dict[tuple[str, ...], int] = {}
     for group in groups:
         places.setdefault(_family(group.situation), len(places))
@@ -104,7 +126,7 @@ def sorted_by_situation(groups: Sequence[Group]) -> list[Group]:
 
 
 def _together(groups: Sequence[Group]) -> list[Group]:
-    """For each condition that was tried at several sizes, all of them in one."""
+    """Return a pooled group for each condition that was tried at several sizes."""
     found: dict[tuple[tuple[str, ...], Condition], list[Group]] = {}
     for group in groups:
         found.setdefault((_family(group.situation), group.condition), []).append(group)

@@ -1,4 +1,4 @@
-"""How much memory something took at most."""
+"""Measures the peak memory of this process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def forget_peak_memory() -> None:
-    """Start anew, where the system can; else the peak is that of the process since it began."""
+    """Reset the peak where the system can; elsewhere it stays the peak since the process began."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()
     with contextlib.suppress(OSError):
@@ -20,7 +20,7 @@ def forget_peak_memory() -> None:
 
 
 def peak_memory_bytes() -> int:
-    """Of the GPU where one is in use, else resident memory of this process."""
+    """Return the peak memory of the GPU where one is in use, else the peak resident memory of this process."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return int(torch.cuda.max_memory_allocated())
     with contextlib.suppress(OSError):

@@ -9,13 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bidnerf_core.evaluation.errors import CRITERIA
-from bidnerf_core.evaluation.groups import Group, Situation, situations
-from bidnerf_core.evaluation.plots import NAMES
+from bidnerf_core.evaluation.groups import Group, Situation, situation_titles, situations
+from bidnerf_core.evaluation.plot_style import CRITERION_NAMES
 from bidnerf_core.evaluation.provenance import Provenance
-from bidnerf_core.evaluation.summary import Comparison, Judged, comparisons, summarize
+from bidnerf_core.evaluation.significance import PairTest, pairwise_tests
+from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summarize
 
 MARK = '<meta name="generator" content="bidnerf report">'
-"""By which a page is known as one of these."""
+"""Marks a page as a report, which a later report may replace."""
+
+UNFINISHED = (
+    f"<!doctype html>{MARK}<title>Unfinished report</title>"
+    "<p>This report was interrupted; the same command writes it again.</p>\n"
+)
 
 CSS = """
 :root { color-scheme: light; }
@@ -46,8 +52,13 @@ dt { color: #666; } dd { margin: 0; overflow-wrap: anywhere; }
 """
 
 
+Titles = dict[Situation, str]
+
+
 @dataclass(frozen=True)
 class Figure:
+    """A figure of the page, with its caption."""
+
     file: Path  # SVG
     caption: str
 
@@ -59,18 +70,19 @@ def page(
     runs: Sequence[tuple[str, Sequence[Provenance]]],
     criterion: str,
 ) -> str:
-    """``runs``: for each file of results its name and what is known of how it was made."""
+    """Return the HTML of a report. ``runs`` has the name of each results file and the runs that made it."""
+    titles = situation_titles(situations(groups))
     trials = sum(len(g.results) for g in groups if g.situation.size is not None)
     body = [
         f"<h1>{_text(title)}</h1>",
         f'<p class="small">{_opening(groups, trials)}</p>',
         "<h2>Success</h2>",
-        _rates(groups),
+        _rates(groups, titles),
         _notes(groups),
         *[_figure(figure) for figure in figures],
         "<h2>Speed and accuracy</h2>",
-        _costs(groups),
-        *_tests(groups, criterion),
+        _costs(groups, titles),
+        *_tests(groups, titles, criterion),
         "<h2>How this was made</h2>",
         *[_made(name, known) for name, known in runs],
     ]
@@ -93,22 +105,22 @@ def _map_name(s: Situation) -> str:
     return f"{s.map} ({s.weights.partition('.')[0]}) on {s.data}/{s.split}"
 
 
-def _rates(groups: Sequence[Group]) -> str:
-    heads = [("start and method", True), ("n", False), *((NAMES[name], False) for name in CRITERIA)]
+def _rates(groups: Sequence[Group], titles: Titles) -> str:
+    heads = [("start and method", True), ("n", False), *((CRITERION_NAMES[name], False) for name in CRITERIA)]
     rows = []
     for situation in situations(groups):
-        rows.append(_section(situation, groups, 2 + len(CRITERIA)))
+        rows.append(_section(titles[situation], 2 + len(CRITERIA)))
         for group in (g for g in groups if g.situation == situation):
             summary = summarize(group.results)
-            cells = [_rate(judged) for judged in summary.criteria.values()]
+            cells = [_rate(success) for success in summary.criteria.values()]
             rows.append(_row([_text(group.label), str(summary.trials), *cells]))
     return _table(heads, rows)
 
 
-def _rate(judged: Judged | None) -> str:
-    if judged is None:
+def _rate(success: Success | None) -> str:
+    if success is None:
         return "&ndash;"
-    rate = judged.rate
+    rate = success.rate
     return (
         f"{rate.rate * 100:.1f} %"
         f'<span class="sub">{rate.successes}/{rate.trials}, {rate.low * 100:.0f} to {rate.high * 100:.0f} %</span>'
@@ -117,51 +129,59 @@ def _rate(judged: Judged | None) -> str:
 
 def _notes(groups: Sequence[Group]) -> str:
     pooled = any(g.situation.size is None for g in groups)
-    together = " &ldquo;All sizes&rdquo; takes the trials of all sizes together." if pooled else ""
+    together = " &ldquo;All sizes&rdquo; pools the trials of all sizes." if pooled else ""
     return (
-        '<p class="small">Share of trials, successes of n, and Wilson&rsquo;s 95 % interval. Errors are the distance of camera '
-        "centres, in the map&rsquo;s units (metres in a room), and the geodesic angle. What all conditions of a method have in "
-        f"common is not in their names; it is in each line of the results.{together}</p>"
+        '<p class="small">Each cell gives the share of successful trials, their number, and Wilson&rsquo;s 95 % interval. The '
+        "translation error is the distance between the camera centres in the map&rsquo;s units (metres in a room); the "
+        "rotation error is the geodesic angle. A dash marks a criterion that does not apply: a share of the start&rsquo;s "
+        "error needs a start. Settings that all conditions of a method share are not part of their names; each line of the "
+        f"results holds all of them.{together}</p>"
     )
 
 
-def _costs(groups: Sequence[Group]) -> str:
+def _costs(groups: Sequence[Group], titles: Titles) -> str:
     heads = [
         ("start and method", True),
         *(
             (name, False)
             for name in (
                 "translation error", "rotation error", "steps to 10 %", "steps to 5°, 0.05",
-                "ms a step", "s a trial", "memory (MiB)", "converged, but wrong", "right, but not converged",
+                "ms per step", "s per trial", "memory (MiB)", "converged, but wrong", "right, but not converged",
             )
         ),
     ]  # fmt: skip
     rows = []
     for situation in situations(groups):
-        rows.append(_section(situation, groups, len(heads)))
+        rows.append(_section(titles[situation], len(heads)))
         for group in (g for g in groups if g.situation == situation):
             s = summarize(group.results)
             rows.append(
                 _row([
-                    _text(group.label), f"{s.translation:.4f}", f"{s.rotation_deg:.2f}°", _steps(s.criteria["10%"]),
-                    _steps(s.criteria["5deg 0.05"]), f"{s.milliseconds_per_step:.1f}", f"{s.seconds:.1f}",
+                    _text(group.label), _number(s.translation, 4), _number(s.rotation_deg, 2, "°"),
+                    _steps(s.criteria[RELATIVE]), _steps(s.criteria[ABSOLUTE]), f"{s.milliseconds_per_step:.1f}", f"{s.seconds:.1f}",
                     f"{s.peak_memory_bytes / 2**20:.0f}", str(s.converged_but_wrong), str(s.right_but_not_converged),
                 ])
             )  # fmt: skip
     note = (
-        '<p class="small">Medians over trials: errors at the end over all trials, steps to success over those that '
-        "succeeded. Memory is the most of any trial&rsquo;s process. &ldquo;Converged&rdquo; is the method&rsquo;s own word, &ldquo;right&rdquo; is "
-        "5° and 0.05.</p>"
+        '<p class="small">Errors, steps and times are medians: final errors and times over all trials, steps to success over '
+        "the trials that succeeded. Memory is the largest peak of any trial&rsquo;s process. &ldquo;Converged&rdquo; is the "
+        "method&rsquo;s own judgement; &ldquo;right&rdquo; means within 5° and 0.05 units.</p>"
     )
     return _table(heads, rows) + note
 
 
-def _steps(judged: Judged | None) -> str:
-    return "&ndash;" if judged is None or judged.median_steps is None else f"{judged.median_steps:g}"
+def _number(value: float | None, digits: int, unit: str = "") -> str:
+    return "&ndash;" if value is None else f"{value:.{digits}f}{unit}"
 
 
-def _tests(groups: Sequence[Group], criterion: str) -> list[str]:
-    found = {s: comparisons([g for g in groups if g.situation == s], criterion) for s in situations(groups)}
+def _steps(success: Success | None) -> str:
+    return "&ndash;" if success is None or success.steps is None else f"{success.steps:g}"
+
+
+def _tests(groups: Sequence[Group], titles: Titles, criterion: str) -> list[str]:
+    found = {
+        s: pairwise_tests([g for g in groups if g.situation == s], criterion) for s in situations(groups)
+    }
     count = sum(map(len, found.values()))
     if count == 0:
         return []
@@ -172,18 +192,18 @@ def _tests(groups: Sequence[Group], criterion: str) -> list[str]:
     rows = []
     for situation, pairs in found.items():
         if pairs:
-            rows.append(_section(situation, groups, len(heads)))
+            rows.append(_section(titles[situation], len(heads)))
             rows += [_pair(pair) for pair in pairs]
     note = (
-        f'<p class="small">Success: {_text(NAMES[criterion])}. Rates: Fisher&rsquo;s exact test. Steps: Mann-Whitney U of the '
-        "first group, over trials that succeeded; &ldquo;all trials&rdquo; is the same test with a failure slower than any success. "
-        f"All are two-sided; p values are not corrected for the number of pairs, {count}. Those under 0.05 "
-        "are bold.</p>"
+        f'<p class="small">Success is: {_text(CRITERION_NAMES[criterion])}. Rates are compared with Fisher&rsquo;s exact test, steps '
+        "to success with the Mann-Whitney U test (U of the first group) over the trials that succeeded; &ldquo;all trials&rdquo; "
+        "repeats it over all trials, with a failure slower than every success. All tests are two-sided. The p values are "
+        f"not corrected for the number of pairs, which is {count}; those under 0.05 are bold.</p>"
     )
     return ["<h2>Differences</h2>", _table(heads, rows), note]
 
 
-def _pair(pair: Comparison) -> str:
+def _pair(pair: PairTest) -> str:
     good = " : ".join(f"{s}/{n}" for s, n in zip(pair.successes, pair.trials, strict=True))
     steps = " : ".join("&ndash;" if s is None else f"{s:g}" for s in pair.median_steps)
     u = "&ndash;" if pair.steps_u is None else f"{pair.steps_u:g}"
@@ -193,7 +213,7 @@ def _pair(pair: Comparison) -> str:
 
 def _made(name: str, runs: Sequence[Provenance]) -> str:
     if not runs:
-        return f'<p class="small">{_text(name)}: nothing is recorded of how it was made.</p>'
+        return f'<p class="small">{_text(name)}: no record of how it was made.</p>'
     last = runs[-1]
     commits = list(dict.fromkeys(_commit(run) for run in runs))
     machines = list(dict.fromkeys(_machine(run) for run in runs))
@@ -223,10 +243,8 @@ def _machine(run: Provenance) -> str:
     return f"{run.cpu}, {run.cores} cores{memory}, {gpu}, {run.system}"
 
 
-def _section(situation: Situation, groups: Sequence[Group], columns: int) -> str:
-    several = len({(s.map, s.weights) for s in situations(groups)}) > 1
-    name = f"{situation.map}: {situation.start}" if several else situation.start
-    return f'<tr class="section"><td colspan="{columns}">{_text(name)}</td></tr>'
+def _section(title: str, columns: int) -> str:
+    return f'<tr class="section"><td colspan="{columns}">{_text(title)}</td></tr>'
 
 
 def _row(cells: Sequence[str | float | None]) -> str:

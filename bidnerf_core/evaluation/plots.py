@@ -1,4 +1,4 @@
-"""The figures of a report: one panel a situation, one colour a condition, the same everywhere."""
+"""The figures of a report: one panel a situation, and for each condition the same colour everywhere."""
 
 from __future__ import annotations
 
@@ -11,67 +11,54 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import CRITERIA, success_rate
-from bidnerf_core.evaluation.groups import Group, Situation, situations
-from bidnerf_core.evaluation.summary import NEVER, applies, steps_of
+from bidnerf_core.evaluation.errors import CRITERIA
+from bidnerf_core.evaluation.groups import Group, situation_titles, situations
+from bidnerf_core.evaluation.plot_style import (
+    SHORT_CRITERION_NAMES,
+    line_look,
+    new_figure,
+    require_matplotlib,
+    styled,
+)
+from bidnerf_core.evaluation.summary import NEVER, applies, steps_of, success_of
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
-"""Okabe and Ito's, which the colour-blind tell apart; yellow, which white paper swallows, gave way to brown."""
-
-DASHES = ("-", "--", ":", "-.")  # for conditions beyond the number of colours
 COLUMNS, PANEL = 3, (3.6, 2.7)  # inches
-STYLE: Any = {
-    "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9, "axes.titlelocation": "left",
-    "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "axes.edgecolor": "#555",
-    "xtick.color": "#333", "ytick.color": "#333", "xtick.major.width": 0.7, "ytick.major.width": 0.7,
-    "grid.color": "#ddd", "grid.linewidth": 0.6, "legend.frameon": False, "legend.fontsize": 8.5,
-    "svg.hashsalt": "bidnerf",
-}  # fmt: skip
-
-Draw = Callable[[Any, list[Group]], None]
-NAMES = {"10%": "translation error at most 10 % of the start's", "5deg 0.05": "under 5° and 0.05 units",
-         "1deg 0.02": "under 1° and 0.02 units"}  # fmt: skip
-
-SHORT = {
-    "10%": "translation: 10 % of the start's",
-    "5deg 0.05": "5° and 0.05 units",
-    "1deg 0.02": "1° and 0.02 units",
-}
+DrawPanel = Callable[[Any, list[Group]], None]
 
 
 class Figures:
-    """Draws and saves figures of ``groups`` as PNG and SVG in ``folder``. Raises ``InputError`` without matplotlib."""
+    """Draws figures of ``groups`` and saves them as PNG and SVG in ``folder``. Raises ``InputError`` without matplotlib.
+
+    ``criterion`` is what counts as success in the figures that show one criterion only.
+    """
 
     def __init__(self, groups: Sequence[Group], folder: Path, criterion: str) -> None:
-        try:
-            import matplotlib
-        except ImportError as error:
-            raise InputError(
-                "figures need matplotlib, which is missing: pip install 'bidnerf[plots]'"
-            ) from error
-        self._matplotlib = matplotlib
+        require_matplotlib()
         self.groups, self.folder, self.criterion = list(groups), folder, criterion
         self.labels = list(dict.fromkeys(group.label for group in groups))
+        self.titles = situation_titles(situations(groups))
 
     def rates(self) -> Path:
-        """Success rates and their intervals, one panel a criterion, one line a group."""
+        """Draw success rates with intervals: one panel a criterion, one line a group."""
         shown = self.groups
         height = 0.9 + 0.27 * len(shown) + 0.2 * len(situations(shown))
-        with self._matplotlib.rc_context(STYLE):
-            figure, axes = self._figure(1, 3, (3 * PANEL[0], height), sharey=True)
+        with styled():
+            figure = new_figure(3 * PANEL[0], height)
+            axes = figure.subplots(1, len(CRITERIA), squeeze=False, sharey=True)
             places = _lines(shown)
             for panel, criterion in zip(axes[0], CRITERIA, strict=True):
                 for group, y in zip(shown, places, strict=True):
                     self._interval(panel, group, criterion, y)
-                panel.set(title=SHORT[criterion], xlabel="successful trials (%)", xlim=(-3, 103))
+                panel.set(
+                    title=SHORT_CRITERION_NAMES[criterion], xlabel="successful trials (%)", xlim=(-3, 103)
+                )
                 panel.grid(axis="x")
             axes[0][0].set_yticks(places, [self._line_label(group) for group in shown])
             axes[0][0].set_ylim(max(places) + 0.7, min(places) - 0.7)
             return self._saved(figure, "rates")
 
     def steps(self) -> Path:
-        """Box plots of steps to success: median, quartiles, whiskers to 1.5 of their distance, each trial a point."""
+        """Draw box plots of steps to success, with whiskers to 1.5 times the interquartile range and a point a trial."""
 
         def draw(panel: Any, groups: list[Group]) -> None:
             for place, group in enumerate(groups):
@@ -88,7 +75,7 @@ class Figures:
         return self._panels("steps", draw, title_pad=15)
 
     def share(self) -> Path:
-        """Share of trials that are, after each step, within the criterion and stay there."""
+        """Draw the share of trials that meet the criterion from each step on."""
 
         def draw(panel: Any, groups: list[Group]) -> None:
             last = max(1, *(result.steps for group in groups for result in group.results))
@@ -98,13 +85,13 @@ class Figures:
                 x = np.concatenate([[0], known, [last]])
                 y = np.concatenate([[0], np.arange(1, len(known) + 1), [len(known)]]) / len(steps) * 100
                 panel.step(x, y, where="post", **self._look(group))
-            panel.set(xlabel="step", ylabel="converged trials (%)", ylim=(-2, 102), xlim=(0, last))
+            panel.set(xlabel="step", ylabel="successful trials (%)", ylim=(-2, 102), xlim=(0, last))
             panel.grid()
 
         return self._panels("share", draw)
 
     def traces(self, kind: str) -> Path:
-        """Errors after each step: median and quartiles. ``kind`` is "translation" or "rotation_deg"."""
+        """Draw median and quartiles of the error after each step. ``kind`` is "translation" or "rotation_deg"."""
         unit, bar = {"translation": ("units", 0.05), "rotation_deg": ("degrees", 5.0)}[kind]
 
         def draw(panel: Any, groups: list[Group]) -> None:
@@ -123,35 +110,34 @@ class Figures:
             panel.set_xlim(left=0)
             panel.grid(which="major")
 
-        return self._panels(kind.partition("_")[0], draw, sharey=True)
+        return self._panels(kind.partition("_")[0], draw, sharey=True, groups=self.groups)
 
-    def _panels(self, name: str, draw: Draw, title_pad: float = 6, sharey: bool = False) -> Path:
-        """One panel a situation that the criterion applies to, with a legend below."""
-        shown = [group for group in self.groups if applies(self.criterion, group.results)] or self.groups
+    def _panels(
+        self,
+        name: str,
+        draw: DrawPanel,
+        title_pad: float = 6,
+        sharey: bool = False,
+        groups: Sequence[Group] | None = None,
+    ) -> Path:
+        """Draw one panel a situation with a legend below: of ``groups``, by default those that the criterion applies to."""
+        fitting = [group for group in self.groups if applies(self.criterion, group.results)]
+        shown = fitting if groups is None else groups
         places = situations(shown)
-        columns = min(COLUMNS, len(places))
-        rows = math.ceil(len(places) / columns)
+        columns = max(1, min(COLUMNS, len(places)))
+        rows = max(1, math.ceil(len(places) / columns))
         legend = 0.35 + 0.2 * len(self.labels)
-        with self._matplotlib.rc_context(STYLE):
+        with styled():
             size = (max(columns, 1.6) * PANEL[0], rows * PANEL[1] + legend)
-            figure, axes = self._figure(rows, columns, size, sharey)
+            figure = new_figure(*size)
+            axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey)
             for panel, situation in zip(axes.flat, places, strict=False):
                 draw(panel, [group for group in shown if group.situation == situation])
-                panel.set_title(self._title(situation), pad=title_pad)
+                panel.set_title(self.titles[situation], pad=title_pad)
             for panel in list(axes.flat)[len(places) :]:
                 panel.set_axis_off()
             self._legend(figure, shown)
             return self._saved(figure, name)
-
-    def _figure(
-        self, rows: int, columns: int, size: tuple[float, float], sharey: bool = False
-    ) -> tuple[Any, Any]:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(figure)  # not pyplot: no global state, no window
-        return figure, figure.subplots(rows, columns, squeeze=False, sharey=sharey)
 
     def _legend(self, figure: Any, groups: Sequence[Group]) -> None:
         from matplotlib.lines import Line2D
@@ -162,10 +148,10 @@ class Figures:
         figure.legend(handles, named, loc="outside lower left", ncols=1 if len(named) < 3 else 2)
 
     def _interval(self, panel: Any, group: Group, criterion: str, y: float) -> None:
-        if not applies(criterion, group.results):
+        found = success_of(group.results, criterion)
+        if found is None:
             return
-        good = sum(s < NEVER for s in steps_of(group.results, criterion))
-        rate = success_rate(good, len(group.results))
+        rate = found.rate
         colour = self._look(group)["color"]
         panel.plot(
             [100 * rate.low, 100 * rate.high],
@@ -190,18 +176,13 @@ class Figures:
         panel.plot(beside, steps, "o", color=colour, markersize=3.5, alpha=0.5, markeredgewidth=0, zorder=3)
 
     def _look(self, group: Group) -> dict[str, Any]:
-        turn, place = divmod(self.labels.index(group.label), len(COLOURS))
-        return {"color": COLOURS[place], "linestyle": DASHES[turn % len(DASHES)], "linewidth": 1.6}
+        return line_look(self.labels.index(group.label))
 
     def _line_label(self, group: Group) -> str:
-        return f"{self._title(group.situation)}  ·  {group.label}  (n = {len(group.results)})"
-
-    def _title(self, situation: Situation) -> str:
-        maps = {(s.map, s.weights) for s in situations(self.groups)}
-        return situation.start if len(maps) == 1 else f"{situation.map}: {situation.start}"
+        return f"{self.titles[group.situation]}  ·  {group.label}  (n = {len(group.results)})"
 
     def _saved(self, figure: Any, name: str) -> Path:
-        """The SVG; the PNG lies beside it."""
+        """Save a figure as SVG, whose path is returned, and as PNG beside it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         figure.savefig(self.folder / f"{name}.png", dpi=160)
         figure.savefig(self.folder / f"{name}.svg", metadata={"Date": None})
@@ -209,7 +190,7 @@ class Figures:
 
 
 def _lines(groups: Sequence[Group]) -> list[float]:
-    """Heights of lines, with a gap between situations."""
+    """Return the heights of lines, with a gap between situations."""
     heights: list[float] = []
     for place, group in enumerate(groups):
         new = place > 0 and group.situation != groups[place - 1].situation
@@ -218,14 +199,14 @@ def _lines(groups: Sequence[Group]) -> list[float]:
 
 
 def _quartiles(errors: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "3 s"]:
-    """Over the trials whose pose was finite; a gap where none was."""
+    """Return the quartiles over the trials whose pose was finite, NaN where none was."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.nanpercentile(errors, (25, 50, 75), axis=0)
 
 
 def _table(group: Group, kind: str) -> Float[np.ndarray, "n s"]:
-    """Errors (trials, steps), the last one held where a trial ended sooner."""
+    """Return errors (trials, steps); the last one continues where a trial ended sooner."""
     rows = [
         np.array([np.nan if x is None else x for x in getattr(result.errors, kind)])
         for result in group.results

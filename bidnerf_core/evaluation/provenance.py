@@ -1,4 +1,4 @@
-"""What it takes to make results again: the command, the code, the machine."""
+"""What it takes to reproduce results: the command, the code and the machine; and records that hold it."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ import torch
 
 import bidnerf_core
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import write_file
 from bidnerf_core.serialization import from_plain, to_plain
-from bidnerf_core.storage import write_file
 
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
+SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
+"""Folders whose changes make a run irreproducible from its commit."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Of one run."""
+    """When, how and where a run took place."""
 
     date: str  # UTC, when it began
     command: str
@@ -43,12 +45,12 @@ class Provenance:
 
 
 def provenance(command: str, workers: str) -> Provenance:
-    """Of the run that begins now."""
+    """Return the provenance of a run that begins now; ``workers`` says what runs it."""
     return Provenance(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         command=command,
         commit=git("rev-parse", "--verify", "HEAD") or None,
-        dirty=bool(git("status", "--porcelain", "--untracked-files=no", "--", "bidnerf_core", "backends")),
+        dirty=bool(git("status", "--porcelain", "--untracked-files=no", "--", *SOURCES)),
         cpu=cpu_model(),
         cores=os.cpu_count(),
         gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -61,29 +63,30 @@ def provenance(command: str, workers: str) -> Provenance:
 
 
 def command_line(name: str, arguments: list[str]) -> str:
-    """As a shell takes it."""
+    """Return a command as a shell takes it."""
     return shlex.join([*name.split(), *arguments])
 
 
 def beside(results: Path) -> Path:
-    """The file that tells of the runs behind a file of results."""
+    """Return the path of the file that lists the runs behind a file of results."""
     return results.with_suffix(".meta.json")
 
 
 def note_run(results: Path, run: Provenance) -> None:
-    """Add to what is known of the file; a run that went on where another stopped is told as well."""
+    """Add a run to the list beside a file of results, which may take several runs to complete."""
     runs = [*read_runs(results), run]
     write_file(beside(results), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
 
 
 def read_runs(results: Path) -> list[Provenance]:
-    """Of a file of results, first to last; none where nothing is known."""
+    """Return the runs behind a file of results, first to last; none where no list lies beside it."""
     path = beside(results)
     if not path.is_file():
         return []
     expected = "expected what 'bidnerf evaluate' writes beside its results"
     try:
         found: Any = json.loads(path.read_bytes())
+        json.dumps(found, ensure_ascii=False).encode()  # half of a surrogate pair cannot be written again
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}), {expected}") from error
     if not isinstance(found, dict) or not isinstance(found.get("runs"), list):
@@ -92,7 +95,7 @@ def read_runs(results: Path) -> list[Provenance]:
 
 
 def git(*arguments: str) -> str:
-    """Output of a git command where this package is; nothing where there is no checkout of it, or no git."""
+    """Return the output of a git command in this package's checkout; nothing where there is no checkout or no git."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
     if not (root / ".git").exists():  # installed, perhaps inside of some other project
         return ""
@@ -104,6 +107,7 @@ def git(*arguments: str) -> str:
 
 
 def cpu_model() -> str:
+    """Return the name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -129,9 +133,23 @@ def _version(name: str) -> str | None:
 
 
 def script_command() -> str:
-    """Of a script: paths relative to the checkout; of a path outside of it, only the name is kept."""
+    """Return the command of the running script, with paths relative to the checkout, or their names outside of it."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
     return shlex.join(["python", *(_without_local_path(word, root) for word in sys.argv)])
+
+
+def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:
+    """Write the results of a benchmark script with its provenance to ``path``, a JSON file, and return the path.
+
+    Raises ``ValueError`` where ``results`` hold what strict JSON cannot.
+    """
+    threads = torch.get_num_threads()
+    run = provenance(script_command(), f"one process of {threads} thread{'s' if threads > 1 else ''}")
+    record = {"benchmark": path.stem, **to_plain(run), "seed": seed, "results": results}
+    content = json.dumps(record, indent=2, allow_nan=False) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, content.encode())
+    return path
 
 
 def _without_local_path(argument: str, root: Path) -> str:

@@ -15,7 +15,7 @@ from bidnerf_core.se3 import SE3
 def turned_about(
     T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float
 ) -> SE3:
-    """The camera carried round a vertical axis through ``middle`` (metres, world), with what it sees in the same place."""
+    """Return the camera's pose after a rotation of camera and all about the axis ``up`` through ``middle`` (metres, world)."""
     phi = math.radians(angle_deg) * torch.nn.functional.normalize(up, dim=0)
     turn = SE3.exp(torch.cat([torch.zeros_like(phi), phi]))
     moved = T_world_camera.translation - middle
@@ -23,27 +23,26 @@ def turned_about(
 
 
 def seen_middle(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
-    """The point nearest to all optical axes (least squares), metres, world: where cameras around an object look."""
+    """Return the point nearest to all optical axes (least squares; metres, world), which cameras around an object look at."""
     eye = torch.eye(3, dtype=torch.float64)
     across = [eye - torch.outer(T.rotation[:, 2], T.rotation[:, 2]) for T in poses]
-    normal = torch.stack(across).sum(0) + 1e-9 * eye  # parallel axes have no such point; any will do
+    normal = torch.stack(across).sum(0) + 1e-9 * eye  # parallel axes have no such point, and any one does
     return torch.linalg.solve(
         normal, torch.stack([A @ T.translation for A, T in zip(across, poses, strict=True)]).sum(0)
     )
 
 
 def mean_up(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
-    """The direction that is up in most images (unit, world)."""
+    """Return the mean upward direction of the images (unit, world)."""
     mean = -torch.stack([T.rotation[:, 1] for T in poses]).mean(0)
     return torch.nn.functional.normalize(mean if mean.norm() > 1e-3 else -poses[0].rotation[:, 1], dim=0)
 
 
 def sequence(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
-    """Places of ``count`` frames ending with ``last``, neighbours ``angle_deg`` apart about what the cameras look at.
+    """Return the indices of ``count`` frames that end with ``last`` and lie ``angle_deg`` apart about their common middle.
 
-    For each step round the vertical axis the frame is taken whose direction from the middle is nearest. None where a
-    step has no frame within half of the angle, or none that is not taken already. Both ways round are tried; the one
-    that fits better is taken.
+    At each step about the vertical axis, the frame with the nearest direction from the middle is chosen. Both senses of
+    rotation are tried, and the better fit is returned; none where no free frame lies within half of the angle of a step.
     """
     middle, up = seen_middle(poses), mean_up(poses)
     directions = torch.nn.functional.normalize(torch.stack([T.translation - middle for T in poses]), dim=-1)
@@ -55,7 +54,7 @@ def sequence(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> t
 def _one_way(
     poses: Sequence[SE3], directions: Tensor, last: int, middle: Tensor, up: Tensor, count: int, angle: float
 ) -> tuple[float, tuple[int, ...]] | None:
-    """Mean angle (rad) by which the frames miss their steps, and their places."""
+    """Return the mean angle (rad) by which the frames miss their steps, and their indices."""
     taken, missed = [last], 0.0
     for step in range(1, count):
         wanted = turned_about(poses[last], middle, up, step * angle).translation - middle

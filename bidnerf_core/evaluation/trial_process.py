@@ -1,4 +1,4 @@
-"""Trials in a process of their own, so that memory and time are those of one map."""
+"""Trials in a process of their own, so that its memory and time belong to one map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from typing import Any
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.trials import Trial, TrialResult, opened, run_trial, settings_of
+from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.evaluation.trials import opened, parse_settings, run_trial
 from bidnerf_core.field import levels
 from bidnerf_core.frames import View
 from bidnerf_core.pixels import draw, uniform
@@ -23,31 +24,31 @@ from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.settings import to_flat
 
 RAYS = 2048
-"""On how many the samples are counted."""
+"""The number of rays on which samples are counted."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A trial's result, and how many samples of the field a ray of its last frame takes, seen from the true pose."""
+    """The result of a trial, and the mean number of samples on a ray of its last frame at the true pose."""
 
     result: TrialResult
-    samples_per_ray: float  # at the level that the method's settings name, else at the finest
+    samples_per_ray: float  # of the field's level in the method's settings, else of the finest
 
 
 class TrialProcess:
-    """Runs trials one after another elsewhere; what it has read stays there. Use as a context: leaving it ends it.
+    """A process that runs trials one after another and keeps its map in memory. Use as a context: leaving it ends it.
 
-    It is a new Python that speaks JSON, not a fork: it shares no memory, and no script needs a guard for it.
+    It is a new interpreter that exchanges JSON, not a fork: it shares no memory, and no script needs a guard for it.
     """
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            start_new_session=True,  # Ctrl-C is for us: we end it
+            start_new_session=True,  # Ctrl-C goes to this process, which ends the other
         )  # fmt: skip
 
     def run(self, trial: Trial) -> Measured:
-        """Raises ``InputError`` where the trial cannot be, or where the process did not live to its end."""
+        """Run a trial. Raises ``InputError`` where the trial is impossible, and where the process ended before its result."""
         try:
             _send(self._process.stdin, to_plain(trial))
             line = self._process.stdout.readline() if self._process.stdout else ""
@@ -55,7 +56,7 @@ class TrialProcess:
             line = ""
         if not line:
             raise InputError(
-                f"{trial.map}: the process that tried frame {trial.frame} ended with status {self._process.wait()},"
+                f"{trial.map}: the process that localized frame {trial.frame} ended with status {self._process.wait()},"
                 " expected a result; was memory short?"
             )
         answer = json.loads(line)
@@ -74,21 +75,20 @@ class TrialProcess:
 
 
 def samples_per_ray(trial: Trial) -> float:
-    """Valid samples on uniformly drawn rays."""
+    """Return the mean number of valid samples on uniformly drawn rays."""
     stored, dataset = opened(trial.map, trial.data)
     (view,) = dataset.views(trial.split, trial.frames[-1:])
-    number = to_flat(settings_of(trial.method, trial.config)).get("level")
-    field = stored.field if number is None else levels(stored.field)[number]
-    pixels = draw(
-        [View(view.frame, SE3.identity())], RAYS, uniform, torch.Generator().manual_seed(trial.seed)
-    )
+    number = to_flat(parse_settings(trial.method, trial.config)).get("level")
+    level = stored.field if number is None else levels(stored.field)[number]
+    own = (View(view.frame, SE3.identity()),)
+    pixels = draw(own, RAYS, uniform, torch.Generator().manual_seed(trial.seed))
     with torch.no_grad():
-        samples = field.sampler(pixels.rays(view.T_ref_camera, stored.bounds))
+        samples = level.sampler(pixels.rays(view.T_ref_camera, stored.bounds))
     return float(samples.valid.sum()) / RAYS
 
 
 def _serve(questions: Iterable[str], answers: Any) -> None:
-    """A line for each line, until there are no more."""
+    """Answer each line with a line, until there are no more."""
     for line in questions:
         trial = from_plain(Trial, json.loads(line), "trial")
         try:
@@ -104,5 +104,5 @@ def _send(stream: Any, value: dict[str, Any]) -> None:
 
 if __name__ == "__main__":
     with os.fdopen(os.dup(1), "w") as answers:
-        os.dup2(2, 1)  # whatever a backend prints is no answer
+        os.dup2(2, 1)  # what a backend prints is not an answer
         _serve(sys.stdin, answers)

@@ -1,0 +1,184 @@
+"""Files of one JSON object a line that only grow, safe against a kill at any moment.
+
+A line is on the disk before the work behind it counts as done. What a kill left half-written at the end is cut off when
+the file is next opened; anything else that is no JSON is an error that names the line and is never thrown away.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.files import open_binary, write_file
+
+
+@dataclass(frozen=True)
+class LineFormat:
+    """How the lines of a file begin, and what writes them. Of a file whose lines begin otherwise nothing is cut off."""
+
+    opening: bytes
+    expected: str  # ends the error about a line that is something else
+
+    def parse(self, path: Path, content: bytes) -> tuple[list[tuple[str, Any]], int]:
+        """Return the place and the object of each line, and how many bytes belong to whole lines."""
+        lines, found, length = content.split(b"\n"), [], 0
+        for number, line in enumerate(lines, start=1):
+            where = f"{path}: line {number}"
+            try:
+                plain = _parsed(line) if line.strip() else None
+            except (ValueError, RecursionError) as error:
+                if number == len(lines) and (line.startswith(self.opening) or self.opening.startswith(line)):
+                    break
+                raise InputError(f"{where}: not JSON, expected {self.expected}") from error
+            if plain is not None:
+                found.append((where, plain))
+            length += len(line) + (number < len(lines))
+        return found, length
+
+    def read(self, path: Path) -> list[tuple[str, Any]]:
+        """Return the place and the object of each whole line of ``path``. Raises ``InputError`` where it cannot be read."""
+        with open_binary(path, self.expected) as file:
+            content = file.read()
+        return self.parse(path, content)[0]
+
+
+class JsonLinesFile:
+    """A file of JSON lines that is open for one process. Use as a context; a second process is refused meanwhile."""
+
+    def __init__(self, path: Path, kind: LineFormat) -> None:
+        self.path, self._kind = path, kind
+        self._file: IO[bytes] | None = None
+
+    def open(self) -> list[tuple[str, Any]]:
+        """Create, lock and repair the file; return the place and the object of each line."""
+        self._file = self._locked()
+        try:
+            content = self._file.read()
+            found, whole = self._kind.parse(self.path, content)
+        except BaseException:
+            self.close()
+            raise
+        self._whole, self._content = whole, content
+        return found
+
+    def repair(self) -> None:
+        """Cut off what a kill left half-written, and end the last line."""
+        file, whole, content = self._opened(), self._whole, self._content
+        if whole < len(content):
+            file.truncate(whole)
+        if whole and content[whole - 1 : whole] != b"\n":
+            file.write(b"\n")
+        file.flush()
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def append(self, plain: Any) -> None:
+        """Write one line, which is on the disk when this returns. Raises ``InputError`` where the file was removed."""
+        file = self._opened()
+        self.check_there()
+        file.write(as_line(plain))
+        file.flush()
+        os.fsync(file.fileno())
+
+    def replace(self, plain: Iterable[Any]) -> None:
+        """Write all lines anew, all of them or none."""
+        self.check_there()
+        write_file(self.path, b"".join(map(as_line, plain)))
+        self.close()  # what was open is the file of before
+        self._file = self._locked()
+
+    def check_there(self) -> None:
+        """Raise ``InputError`` where the path does not name the open file any more: its lines would be lost unnoticed."""
+        try:
+            same = os.path.samestat(os.fstat(self._opened().fileno()), self.path.stat())
+        except FileNotFoundError:
+            same = False
+        if not same:
+            raise InputError(
+                f"{self.path}: was removed or replaced while it was written, and what it held is gone with it; "
+                "begin again, or move the file back where it was"
+            )
+
+    def _opened(self) -> IO[bytes]:
+        if self._file is None:
+            raise RuntimeError(f"{self.path} is not open")
+        return self._file
+
+    def _locked(self) -> IO[bytes]:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists():
+            open_binary(self.path, self._kind.expected).close()  # not a pipe, which would wait for a reader
+        try:
+            file = self.path.open("a+b")
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written ({error.strerror}), expected a file") from error
+        with contextlib.suppress(ImportError):  # Windows has no such locks
+            import fcntl
+
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                file.close()
+                raise InputError(f"{self.path}: another process is writing it; name another --out") from error
+        file.seek(0)
+        return file
+
+
+class RowStore:
+    """Rows by key for scripts that go on where they stopped. Use as a context.
+
+    Each row is made once and kept in a line ``{"key": KEY, "row": ROW}``.
+    """
+
+    FORMAT = LineFormat(b'{"key": ', "lines as a benchmark keeps its rows")
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = JsonLinesFile(path, self.FORMAT)
+        self._rows: dict[str, Any] = {}
+
+    def __enter__(self) -> RowStore:
+        for where, plain in self._file.open():
+            if not isinstance(plain, dict) or plain.keys() != {"key", "row"}:
+                self._file.close()
+                raise InputError(f"{where}: no key and row, expected {self.FORMAT.expected}")
+            self._rows[plain["key"]] = plain["row"]
+        self._file.repair()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def get(self, key: list[Any], make: Callable[[], Any]) -> Any:
+        """Return the row of ``key``, which is made, and kept, where the file does not hold it."""
+        text = json.dumps(key)
+        if text not in self._rows:
+            row = make()
+            self._file.append({"key": text, "row": row})
+            self._rows[text] = row
+        return self._rows[text]
+
+
+def as_line(plain: Any) -> bytes:
+    """Return ``plain`` as one line of strict JSON."""
+    return json.dumps(plain, allow_nan=False).encode() + b"\n"
+
+
+def _parsed(line: bytes) -> Any:
+    """Return the object of a line. Raises ``ValueError`` also for text with half of a surrogate pair, which no file holds."""
+    plain = json.loads(line)
+    if b"\\ud" in line.lower():
+        json.dumps(plain, ensure_ascii=False).encode()
+    return plain

@@ -1,0 +1,61 @@
+"""What every plot shares: the palette, the style, the words for criteria, and a figure without global state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bidnerf_core.errors import InputError
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+"""The colour-blind-safe palette of Okabe and Ito (2008), with brown for its yellow, which white paper swallows."""
+
+DASHES = ("-", "--", ":", "-.")  # for more lines than there are colours
+STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9, "axes.titlelocation": "left",
+    "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "axes.edgecolor": "#555",
+    "xtick.color": "#333", "ytick.color": "#333", "xtick.major.width": 0.7, "ytick.major.width": 0.7,
+    "grid.color": "#ddd", "grid.linewidth": 0.6, "legend.frameon": False, "legend.fontsize": 8.5,
+    "svg.hashsalt": "bidnerf",
+}  # fmt: skip
+
+CRITERION_NAMES = {
+    "10%": "translation error at most 10 % of the start's",
+    "5deg 0.05": "under 5° and 0.05 units",
+    "1deg 0.02": "under 1° and 0.02 units",
+}
+SHORT_CRITERION_NAMES = {
+    "10%": "translation: 10 % of the start's",
+    "5deg 0.05": "5° and 0.05 units",
+    "1deg 0.02": "1° and 0.02 units",
+}
+
+
+def require_matplotlib() -> Any:
+    """Return matplotlib. Raises ``InputError`` where this extra is not installed."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise InputError("plots need matplotlib, which is missing: pip install 'bidnerf[plots]'") from error
+    return matplotlib
+
+
+def styled() -> Any:
+    """Return a context in which figures are drawn and saved in the common style."""
+    return require_matplotlib().rc_context(STYLE)
+
+
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure (inches) that no window shows and pyplot does not hold."""
+    require_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def line_look(place: int) -> dict[str, Any]:
+    """Return the colour and the dashes of line number ``place``."""
+    turn, colour = divmod(place, len(COLOURS))
+    return {"color": COLOURS[colour], "linestyle": DASHES[turn % len(DASHES)], "linewidth": 1.6}

@@ -1,0 +1,120 @@
+"""A trial and its result as plain data: what was tried, and what one line of a results file holds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+
+from bidnerf_core.evaluation.closed_form_data import is_closed_form
+from bidnerf_core.evaluation.errors import PoseError
+from bidnerf_core.evaluation.fingerprint import InputDigests
+
+Rows: TypeAlias = tuple[tuple[float, ...], ...]
+LARGEST_COUNT = 2**63 - 1
+"""JSON has integers that no tensor and no float holds."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Everything that the result of a trial depends on."""
+
+    map: str  # folder, or demo:NAME
+    data: str  # folder, or demo:NAME
+    frames: tuple[str, ...]  # views of a rig, or one image; the pose sought is the last one's
+    protocol: str = "bid"  # how the start is chosen
+    size: tuple[float, ...] = ()  # how far the start is from the truth, in the protocol's units
+    method: str = "auto"
+    config: str = "{}"  # JSON of the method's settings that differ from its defaults
+    seed: int = 0  # of the start and of every random choice of the method
+    split: str = "test"
+    device: str = "cpu"  # where the field computes
+    depth: bool = True  # whether the method gets the measured depth
+    depth_points: str | None = None  # folder of a COLMAP model whose points the method gets as depth rays
+
+    @property
+    def frame(self) -> str:
+        """The name of the frame whose pose is sought."""
+        return self.frames[-1]
+
+    @property
+    def portable(self) -> Trial:
+        """The same trial with folders' names instead of their paths, which differ from machine to machine."""
+        points = None if self.depth_points is None else "/".join(_parts(self.depth_points)[-2:])  # sparse/0
+        return replace(self, map=_name(self.map), data=_name(self.data), depth_points=points)
+
+
+@dataclass(frozen=True)
+class ScalarPoseError:
+    """The distance and the angle between a pose and the true one, as plain numbers."""
+
+    translation: float  # metres
+    rotation_deg: float
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Errors at the start and after each step; without a start, entry 0 is the method's first pose.
+
+    Raises ``ValueError`` where the two rows differ in length or are empty.
+    """
+
+    translation: tuple[float | None, ...]  # metres; none where a pose was not finite
+    rotation_deg: tuple[float | None, ...]
+
+    def __post_init__(self) -> None:
+        lengths = len(self.translation), len(self.rotation_deg)
+        if lengths[0] != lengths[1] or lengths[0] == 0:
+            raise ValueError(
+                f"{lengths[0]} translation and {lengths[1]} rotation errors, expected as many of each"
+            )
+
+    def as_error(self) -> PoseError:
+        """Return the errors as tensors (n), NaN where a pose was not finite."""
+        rows = ([math.nan if x is None else x for x in row] for row in (self.translation, self.rotation_deg))
+        return PoseError(*(torch.tensor(row, dtype=torch.float64) for row in rows))
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """One line of results: what ``bidnerf localize --json`` prints, and everything that a report needs.
+
+    Raises ``ValueError`` for a count that does not fit into 64 bits.
+    """
+
+    T_world_camera: Rows | None  # 4x4; none where it was not finite
+    converged: bool  # according to the method itself
+    steps: int
+    seconds: float
+    covariance: Rows | None
+    loss: float | None
+    backend: str
+    method: str
+    error: ScalarPoseError | None  # none where the pose was not finite
+    frame: str
+    seed: int
+    start_error: ScalarPoseError | None  # none where no start was given
+    errors: Trace
+    reason: str  # why the method stopped
+    peak_memory_bytes: int  # of the process during the trial: resident memory, or memory of the GPU
+    settings: dict[str, Any]  # all settings of the method
+    weights: str  # file name of the map's weights, which is new with every training
+    trial: Trial  # with folders' names instead of paths
+    outcome: str = ""  # the kind of the method's judgement; empty in results of earlier versions
+    inputs: InputDigests | None = None  # none in results of earlier versions
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "seed", "peak_memory_bytes"):
+            if abs(getattr(self, name)) > LARGEST_COUNT:
+                raise ValueError(f"{name} is larger than any number that was measured")
+
+
+def _name(folder: str) -> str:
+    return folder if is_closed_form(folder) else Path(folder).resolve().name
+
+
+def _parts(folder: str) -> tuple[str, ...]:
+    return Path(folder).resolve().parts[1:]
