@@ -100,7 +100,13 @@ class Frame:
             warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=2)
         source = photo.camera
         return Frame(
-            path.stem, photo.rgb, source.intrinsics, photo.depth, photo.alpha, source.description, source.approximate
+            path.stem,
+            photo.rgb,
+            source.intrinsics,
+            photo.depth,
+            photo.alpha,
+            source.description,
+            source.approximate,
         )
 
     @staticmethod

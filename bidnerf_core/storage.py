@@ -10,15 +10,13 @@ import contextlib
 import json
 import re
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as tensors_from_bytes
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
@@ -34,9 +32,8 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.registry import load_backend
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.tensor_files import check_weights, load_part, packed, read_tensors
 from bidnerf_core.training import TrainingState
-
-Part = TypeVar("Part")
 
 FORMAT = "bidnerf map"
 VERSION = 1
@@ -72,6 +69,7 @@ class MapInfo:
     training: str | None = None  # what resuming needs; dropped when training is complete
     surface: str | None = None  # baked from these weights
     landmarks: str | None = None  # of the training images
+    colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
     version: int = VERSION
@@ -89,6 +87,11 @@ class Map:
     @property
     def bounds(self) -> SceneBounds:
         return self.info.bounds
+
+    @property
+    def colour_noise(self) -> float | None:
+        """Root mean square error of the field's colours on its own training images, in [0, 1]."""
+        return self.info.colour_noise
 
 
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
@@ -122,9 +125,9 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        write_file(folder / info.weights, tensors_to_bytes(_packed(state.field)))
+        write_file(folder / info.weights, tensors_to_bytes(packed(state.field)))
         if info.training is not None:
-            write_file(folder / info.training, tensors_to_bytes(_packed(state.optimizer)))
+            write_file(folder / info.training, tensors_to_bytes(packed(state.optimizer)))
         write_file(folder / DESCRIPTION, description)
     finally:
         _sweep(folder)
@@ -139,20 +142,24 @@ def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
     return _save_part(folder, of, "surface", surface_tensors(surface))
 
 
-def save_landmarks(folder: Path, of: MapInfo, landmarks: LandmarkMap) -> MapInfo:
-    """Add landmarks to map ``of``, in place of those that it had.
+def save_landmarks(
+    folder: Path, of: MapInfo, landmarks: LandmarkMap, colour_noise: float | None = None
+) -> MapInfo:
+    """Add landmarks to map ``of``, in place of those that it had, and how well the field renders its training images.
 
     Raises ``InputError`` where another training has replaced that map meanwhile.
     """
-    return _save_part(folder, of, "landmarks", landmark_tensors(landmarks))
+    return _save_part(folder, of, "landmarks", landmark_tensors(landmarks), colour_noise=colour_noise)
 
 
-def _save_part(folder: Path, of: MapInfo, part: str, tensors: dict[str, Tensor]) -> MapInfo:
+def _save_part(
+    folder: Path, of: MapInfo, part: str, tensors: dict[str, Tensor], **facts: float | None
+) -> MapInfo:
     """Add a file of tensors to a map under the name of a part of its description."""
     if load_info(folder).weights != of.weights:
         raise InputError(f"{folder}: was trained anew while its {part} was made; bake it again")
     name = f"{part}-{of.step:08d}-{secrets.token_hex(4)}.safetensors"
-    info = replace(load_info(folder), **{part: name})
+    info = replace(load_info(folder), **{part: name}, **facts)  # type: ignore[arg-type]
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     try:
         write_file(folder / name, tensors_to_bytes(tensors))
@@ -204,21 +211,11 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     folder = Path(folder)
     info, tensors, surface, landmarks = _read(folder, baked)
     field, _ = build_field(load_backend(info.backend, str(folder)), info, str(folder / DESCRIPTION))
-    _check_weights(field, tensors, folder / info.weights)
+    check_weights(field, tensors, folder / info.weights)
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
     return Map(info, field, surface, landmarks)
-
-
-def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) -> Part:
-    """Return what ``make`` makes of the tensors in a file. Raises ``InputError`` where it refuses them."""
-    tensors = read_tensors(path)
-    try:
-        return make(tensors)
-    except (KeyError, ValueError) as error:
-        why = f"no tensor {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{path}: not {what} ({why}); bake it anew with 'bidnerf bake'") from error
 
 
 def load_surface(path: Path) -> SurfaceMap:
@@ -231,7 +228,7 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
     if info.training is None:
         raise InputError(f"{folder}: training is complete ({info.step} steps), nothing to resume")
     weights = read_tensors(folder / info.weights)
-    _check_weights(field, weights, folder / info.weights)
+    check_weights(field, weights, folder / info.weights)
     return TrainingState(info.step, weights, read_tensors(folder / info.training))
 
 
@@ -252,42 +249,6 @@ def _read(
             before, info = info, load_info(folder)
             if replace(before, bidnerf="") == replace(info, bidnerf=""):
                 raise
-
-
-def read_tensors(path: Path) -> dict[str, Tensor]:
-    try:
-        return tensors_from_bytes(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: no such file, but {DESCRIPTION} names it; the map is incomplete"
-        ) from error
-    except SafetensorError as error:
-        raise InputError(f"{path}: not readable ({error}), expected a safetensors file") from error
-
-
-def _check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> None:
-    """Compare names, shapes and values with what a field takes: torch's own message would run over many lines."""
-    module = cast(nn.Module, field)
-    expected = module.state_dict()
-    for name, value in expected.items():
-        if name not in tensors:
-            raise InputError(f"{path}: no tensor {name!r}, expected one of shape {list(value.shape)}")
-        if tensors[name].shape != value.shape:
-            found, wanted = list(tensors[name].shape), list(value.shape)
-            raise InputError(f"{path}: tensor {name!r} has shape {found}, expected {wanted}")
-    surplus = sorted(tensors.keys() - expected.keys())
-    if surplus:
-        raise InputError(
-            f"{path}: tensor {surplus[0]!r} is not part of the field that {DESCRIPTION} describes"
-        )
-    for name, _ in module.named_parameters():
-        if name in tensors and not bool(tensors[name].isfinite().all()):
-            raise InputError(f"{path}: tensor {name!r} holds NaN or infinity, expected finite numbers")
-
-
-def _packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return contiguous copies on the CPU, as safetensors needs them."""
-    return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
 
 
 def _sweep(folder: Path) -> None:

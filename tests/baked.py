@@ -6,14 +6,14 @@ import functools
 from dataclasses import replace
 
 import torch
+from bidnerf_core.localization.alignment import Cloud
+from bidnerf_core.localization.clouds import measured_cloud
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.localization import Problem, rig
-from bidnerf_core.localization.alignment import Cloud
-from bidnerf_core.localization.clouds import measured_cloud
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, Surfels, bake
 from bidnerf_core.mapping.surface_map import nearest_surfels
 from bidnerf_core.scenes.closed_form import ClosedFormScene

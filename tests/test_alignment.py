@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.alignment import Cloud, Scales, alignment, contact, misfit
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.localization.alignment import Cloud, Scales, alignment, contact, misfit
 from bidnerf_core.mapping import SurfaceMap, Surfels
 from bidnerf_core.se3 import SE3
 from bidnerf_core.voxel_grid import VoxelGrid

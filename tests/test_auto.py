@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.clouds import measured_cloud
 
 import baked
 import bidnerf_core.localization.auto as module
@@ -16,7 +17,6 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import AutoConfig, Localization, Problem, localize, rig
 from bidnerf_core.localization.bid import BidConfig
-from bidnerf_core.localization.clouds import measured_cloud
 from bidnerf_core.localization.search import Found, score
 from bidnerf_core.mapping import bake
 from bidnerf_core.rendering import render_image

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.clouds import measured_cloud
 from torch import Tensor
 
 import baked
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues
 from bidnerf_core.frames import View
-from bidnerf_core.localization.clouds import measured_cloud
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.scenes.primitives import Box, Sphere

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.clouds import measured_cloud
 
 import baked
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization.clouds import measured_cloud
 from bidnerf_core.se3 import SE3
 
 

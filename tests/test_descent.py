@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.sampled import RayCounts, SampledLoss
+from bidnerf_core.localization.trail import WINDOW, Trail
 
 import tiny
 from bidnerf_core.camera import Intrinsics
@@ -16,9 +18,7 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, InerfConfig, Problem, localize, rig, single
-from bidnerf_core.localization.sampled import RayCounts, SampledLoss
 from bidnerf_core.localization.pivots import PivotName, pivot
-from bidnerf_core.localization.trail import WINDOW, Trail
 from bidnerf_core.pixels import DrawerName, draw, uniform
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs

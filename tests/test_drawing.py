@@ -6,16 +6,16 @@ import math
 
 import pytest
 import torch
+from bidnerf_core.localization.drawing import UNKNOWN, Drawing, Looks, brightened, compared, drawn
+from bidnerf_core.localization.sketches import ByField, OnSurface, Sketcher
+from bidnerf_core.localization.thumbnails import Thumbnail, thumbnail
 from scipy.optimize import minimize
 from torch import Generator
 
 import baked
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization.drawing import UNKNOWN, Drawing, Looks, brightened, compared, drawn
-from bidnerf_core.localization.sketches import ByField, OnSurface, Sketcher
 from bidnerf_core.localization.solvers.levenberg_marquardt import solve
-from bidnerf_core.localization.thumbnails import Thumbnail, thumbnail
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from bidnerf_core.localization.hypotheses import centred, drawn, hypotheses, random_rotations
 from scipy.stats import kstest
 from torch import Generator
 
 import baked
-from bidnerf_core.localization.hypotheses import centred, drawn, hypotheses, random_rotations
 from bidnerf_core.se3 import SE3
 
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.linearization import Linearization, linearize
+from bidnerf_core.localization.ray_batch import RayBatch
 
 from bidnerf_core.field import Rays, SceneBounds
 from bidnerf_core.localization.exposure import fit_exposure
-from bidnerf_core.localization.linearization import Linearization, linearize
 from bidnerf_core.localization.normal_equations import Losses, residuals
-from bidnerf_core.localization.ray_batch import RayBatch
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.robust import Robust
 from bidnerf_core.scenes.fields import GaussianBlobs

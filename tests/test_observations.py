@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from bidnerf_core.localization.sampled import RayCounts, SampledLoss
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.points import read_depth_points
@@ -17,7 +18,6 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, Problem, localize, single, window
-from bidnerf_core.localization.sampled import RayCounts, SampledLoss
 from bidnerf_core.observations import Observations
 from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.rendering import render, render_image

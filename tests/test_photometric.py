@@ -6,6 +6,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.neighbours import neighbours
+from bidnerf_core.localization.photometric import refine, stepped
+from bidnerf_core.localization.ray_batch import blurred
+from bidnerf_core.localization.stages import Refinement, Stage
 from torch import Generator
 
 from bidnerf_core.camera import Intrinsics
@@ -15,11 +19,7 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, BidLmConfig, InerfLmConfig, localize, rig, single
-from bidnerf_core.localization.neighbours import neighbours
-from bidnerf_core.localization.photometric import refine, stepped
-from bidnerf_core.localization.ray_batch import blurred
 from bidnerf_core.localization.pivots import PivotName
-from bidnerf_core.localization.stages import Refinement, Stage
 from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.rendering import render
 from bidnerf_core.scenes.fields import GaussianBlobs

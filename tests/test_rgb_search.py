@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.polish import without_depth
+from bidnerf_core.localization.rgb_hypotheses import around, hypotheses
+from bidnerf_core.localization.rgb_only import STAGES, surface_sight
+from bidnerf_core.localization.rgb_search import Sight, Stage, different, search
 from torch import Generator
 
 import baked
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.frames import View
-from bidnerf_core.localization.polish import without_depth
-from bidnerf_core.localization.rgb_hypotheses import around, hypotheses
-from bidnerf_core.localization.rgb_only import STAGES, surface_sight
-from bidnerf_core.localization.rgb_search import Sight, Stage, different, search
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches
 from bidnerf_core.se3 import SE3

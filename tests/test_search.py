@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import torch
+from bidnerf_core.localization.hypotheses import centred, hypotheses, random_rotations
 from torch import Generator
 
 import baked
 from bidnerf_core.evaluation.errors import pose_error
-from bidnerf_core.localization.hypotheses import centred, hypotheses, random_rotations
 from bidnerf_core.localization.search import STAGES, score, search
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches

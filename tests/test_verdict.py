@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bidnerf_core.localization.alignment import Cloud
+from bidnerf_core.localization.hypotheses import hypotheses
+from bidnerf_core.localization.verdict import Bars, Evidence, covariance, crossed, evidence
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.localization.alignment import Cloud
-from bidnerf_core.localization.hypotheses import hypotheses
 from bidnerf_core.localization.search import Found, search
-from bidnerf_core.localization.verdict import Bars, Evidence, covariance, crossed, evidence
 from bidnerf_core.scenes.demo import demo_room
 from bidnerf_core.se3 import SE3
 

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-from bidnerf_core.cli.common import MapFolder, console, option, parse, read_views, say
+from bidnerf_core.cli.common import MapFolder, option, parse, read_views, say
+from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.storage import cameras_of, load_info, load_map, save_surface
-
-SPEAK_EVERY = 10.0
-"""Seconds, where nobody sees a bar."""
+from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
+from bidnerf_core.mapping.landmark_building import build_landmarks
+from bidnerf_core.storage import Map, cameras_of, load_info, load_map, save_landmarks, save_surface
 
 
 def run(arguments: list[str]) -> None:
-    """Parse."""
+    """Parse and bake."""
     parse("bake", _bake, arguments)
 
 
@@ -30,15 +27,20 @@ def _bake(
     map: MapFolder,
     data: Annotated[
         Path | None,
-        option("DATA", "dataset whose measured depth is taken where there is some", "rendered depth only"),
+        option(
+            "DATA",
+            "dataset whose photos give landmarks and whose measured depth gives the surface",
+            "rendered images only",
+        ),
     ] = None,
     split: Annotated[str, option("NAME", "which of the dataset's splits")] = "train",
     config: BakeConfig = BakeConfig(),
 ) -> None:
-    """Find the surface that a map shows, and store it in the map.
+    """Find the surface and the landmarks of a map, and store them in the map.
 
     Depth is rendered from where the training images were taken; what several of these views agree on is kept. With
-    --data, views with measured depth are taken as they are instead; of views without, an imported map takes the places.
+    --data, views with measured depth are taken as they are instead, and landmarks are built from the photos; without it
+    they are built from images that the field renders, which are as sharp as the field.
     """
     background = load_info(map).bounds.background
     views = [] if data is None else read_views(open_dataset(data, background), split)
@@ -46,17 +48,31 @@ def _bake(
 
 
 def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
-    """Bake the map in ``folder``; of ``views``, those with measured depth take the place of rendered ones."""
-    began = time.monotonic()
-    stored = load_map(folder, baked=False)  # which may be damaged, and is to be replaced
-    measured = [view for view in views if view.frame.has_depth]
+    """Bake the surface and the landmarks of the map in ``folder``.
+
+    Of ``views``, those with measured depth take the place of rendered ones for the surface, and all of them give landmarks;
+    without views, landmarks come from images that the field renders.
+    """
+    stored = load_map(folder, baked=False)  # its parts may be damaged, and are to be replaced
     places = [(view.frame.intrinsics, view.T_ref_camera) for view in views]
+    cameras = cameras_of(stored.info) or places
+    if not cameras:
+        raise InputError(
+            f"{folder}: holds no cameras to render it from; give a dataset of its views by --data"
+        )
+    _bake_surface(folder, stored, views, cameras, config)
+    _bake_landmarks(folder, stored, views or rendered_views(stored.field, stored.bounds, cameras))
+
+
+def _bake_surface(
+    folder: Path, stored: Map, views: Sequence[View], cameras: Sequence[Camera], config: BakeConfig
+) -> None:
+    began = time.monotonic()
+    measured = [view for view in views if view.frame.has_depth]
     if not any(view.frame.has_dense_depth for view in measured):
         measured = []  # a few points are no surface
-    cameras = [] if measured else cameras_of(stored.info) or places
-    if not (measured or cameras):
-        raise InputError(f"{folder}: knows no place to see it from; say by --data where it was seen from")
-    with _progress() as report:
+    cameras = [] if measured else cameras
+    with counted("baking", "views") as report:
         surface = bake(stored.field, stored.bounds, cameras, measured, config, report)
     save_surface(folder, stored.info, surface)
     source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
@@ -65,24 +81,18 @@ def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
     )
 
 
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int], None]]:
-    """A bar, or a line now and then."""
-    columns = (
-        TextColumn("baking"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total} views"),
-        TimeRemainingColumn(),
+def _bake_landmarks(folder: Path, stored: Map, views: Sequence[View]) -> None:
+    """Build landmarks of the views; a scene without texture has none, and the surface alone then serves."""
+    began = time.monotonic()
+    try:
+        with counted("landmarks", "steps") as report:
+            landmarks = build_landmarks(views, progress=report, report=say)
+    except InputError as error:
+        say(f"{folder}: no landmarks: {error}")
+        return
+    noise = colour_noise(stored.field, stored.bounds, views)
+    save_landmarks(folder, stored.info, landmarks, noise)
+    say(
+        f"{folder}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(views)} views,"
+        f" {time.monotonic() - began:.1f} s"
     )
-    spoke = time.monotonic()
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("baking", total=None)
-
-        def report(done: int, total: int) -> None:
-            nonlocal spoke
-            bar.update(task, completed=done, total=total)
-            if not console.is_terminal and time.monotonic() - spoke > SPEAK_EVERY:
-                spoke = time.monotonic()
-                say(f"baking: view {done}/{total}")
-
-        yield report

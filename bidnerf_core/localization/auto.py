@@ -77,7 +77,9 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     """
     began, answer = time.perf_counter(), None
     if problem.matcher is not None and config.landmarks:
-        answer = answer_by_landmarks(problem, problem.matcher, config.refine_rays if config.refine_steps else 0, seed)
+        answer = answer_by_landmarks(
+            problem, problem.matcher, config.refine_rays if config.refine_steps else 0, seed
+        )
     if answer is not None and landmark_verdict(answer.found).accepted:
         return localization_by_landmarks(problem, answer, began)
     if answer is not None and problem.start is None:

@@ -116,7 +116,9 @@ def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generat
     cell = 0.01 if problem.surface is None else problem.surface.cell
     stage = RefinementStage(STEPS, rays, depth_scale=6 * cell)
     depth = DepthSettings() if problem.has_depth else None
-    settings = RenderedCostSettings(ColourSettings(), depth, RefinementSettings(exposure=problem.exposure_varies))
+    settings = RenderedCostSettings(
+        ColourSettings(), depth, RefinementSettings(exposure=problem.exposure_varies)
+    )
     cost = settings.drawn(problem, stage, about, generator)
     assert problem.start is not None
     variance = max(float(cost.cost(problem.start[None])[0]), LEAST_VARIANCE)

@@ -78,7 +78,9 @@ class Localizer:
         ``InputError`` for a query that cannot be localized at all; a pose that is merely doubtful is returned, with an
         ``outcome`` other than ``CONVERGED``.
         """
-        problem = rig(self.map, _views(query), None if start is None else _pose(start), depth_rays, self._matcher)
+        problem = rig(
+            self.map, _views(query), None if start is None else _pose(start), depth_rays, self._matcher
+        )
         return METHODS[self.method].run(problem, self.config, seed)
 
     @torch.no_grad()

@@ -18,7 +18,9 @@ class GaussianPrior:
     """The squared Mahalanobis distance of poses from a mean; updates turn about ``pivot``."""
 
     mean: SE3  # T_world_camera
-    covariance: Float[Tensor, "6 6"]  # of a right update of the mean: translation (metres), rotation (radians)
+    covariance: Float[
+        Tensor, "6 6"
+    ]  # of a right update of the mean: translation (metres), rotation (radians)
     pivot: Pivot
 
     def __call__(self, T: SE3) -> NormalEquations:

@@ -1,0 +1,44 @@
+"""Keyframes: images that a field renders from known places, and how well it renders those that it was trained on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.pixels import draw, uniform
+from bidnerf_core.rendering import render, render_image
+from bidnerf_core.se3 import SE3
+
+Camera = tuple[Intrinsics, SE3]
+"""Intrinsics and T_world_camera."""
+
+LARGEST = 400
+"""Pixels along the longer side of a rendered keyframe, at most."""
+MOST = 100
+"""Keyframes that are rendered, at most: evenly many of the cameras."""
+NOISE_RAYS = 4096
+"""Rays on which the colour noise is measured."""
+
+
+def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[Camera]) -> list[View]:
+    """Return images with depth that ``field`` renders from ``cameras``, for a map that came without photos."""
+    every = max(1, math.ceil(len(cameras) / MOST))
+    views = []
+    for number, (intrinsics, T) in enumerate(cameras[::every]):
+        small = intrinsics.scaled(min(1.0, LARGEST / max(intrinsics.width, intrinsics.height)))
+        image = render_image(field, small, T, bounds)
+        views.append(View(Frame(f"{number:04d}", image.rgb, small, image.depth), T))
+    return views
+
+
+@torch.no_grad()
+def colour_noise(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float:
+    """Return the root mean square difference between rendered and photographed colours, over pixels of all views."""
+    pixels = draw(views, max(NOISE_RAYS, len(views)), uniform, torch.Generator().manual_seed(0)).flattened()
+    seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
+    return float((seen.rgb - pixels.rgb).square().mean().sqrt())

@@ -1,0 +1,62 @@
+"""Files of named tensors: reading them, and checking them against what they are for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar, cast
+
+from safetensors import SafetensorError
+from safetensors.torch import load as tensors_from_bytes
+from torch import Tensor, nn
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.field import RadianceField
+
+Part = TypeVar("Part")
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    try:
+        return tensors_from_bytes(path.read_bytes())
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{path}: no such file, but map.json names it; the map is incomplete"
+        ) from error
+    except SafetensorError as error:
+        raise InputError(f"{path}: not readable ({error}), expected a safetensors file") from error
+
+
+def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) -> Part:
+    """Return what ``make`` makes of the tensors in a file. Raises ``InputError`` where it refuses them."""
+    tensors = read_tensors(path)
+    try:
+        return make(tensors)
+    except (KeyError, ValueError) as error:
+        why = f"no tensor {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{path}: not {what} ({why}); bake it anew with 'bidnerf bake'") from error
+
+
+def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> None:
+    """Compare names, shapes and values with what a field takes: torch's own message would run over many lines."""
+    module = cast(nn.Module, field)
+    expected = module.state_dict()
+    for name, value in expected.items():
+        if name not in tensors:
+            raise InputError(f"{path}: no tensor {name!r}, expected one of shape {list(value.shape)}")
+        if tensors[name].shape != value.shape:
+            found, wanted = list(tensors[name].shape), list(value.shape)
+            raise InputError(f"{path}: tensor {name!r} has shape {found}, expected {wanted}")
+    surplus = sorted(tensors.keys() - expected.keys())
+    if surplus:
+        raise InputError(
+            f"{path}: tensor {surplus[0]!r} is not part of the field that map.json describes"
+        )
+    for name, _ in module.named_parameters():
+        if name in tensors and not bool(tensors[name].isfinite().all()):
+            raise InputError(f"{path}: tensor {name!r} holds NaN or infinity, expected finite numbers")
+
+
+def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return contiguous copies on the CPU, as safetensors needs them."""
+    return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
