@@ -20,9 +20,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     try:
         return tensors_from_bytes(path.read_bytes())
     except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: no such file, but map.json names it; the map is incomplete"
-        ) from error
+        raise InputError(f"{path}: no such file, but map.json names it; the map is incomplete") from error
     except SafetensorError as error:
         raise InputError(f"{path}: not readable ({error}), expected a safetensors file") from error
 
@@ -49,9 +47,7 @@ def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) 
             raise InputError(f"{path}: tensor {name!r} has shape {found}, expected {wanted}")
     surplus = sorted(tensors.keys() - expected.keys())
     if surplus:
-        raise InputError(
-            f"{path}: tensor {surplus[0]!r} is not part of the field that map.json describes"
-        )
+        raise InputError(f"{path}: tensor {surplus[0]!r} is not part of the field that map.json describes")
     for name, _ in module.named_parameters():
         if name in tensors and not bool(tensors[name].isfinite().all()):
             raise InputError(f"{path}: tensor {name!r} holds NaN or infinity, expected finite numbers")

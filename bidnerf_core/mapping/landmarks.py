@@ -29,7 +29,7 @@ class LandmarkMap:
         return len(self.positions)
 
     def __getitem__(self, index: Tensor) -> LandmarkMap:
-        return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
+        return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})  # type: ignore[arg-type]
 
     @property
     def megabytes(self) -> float:
@@ -44,4 +44,4 @@ PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones",
 
 def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
     """All landmarks of ``maps``, which have descriptors of one length; what else there is comes from the first one."""
-    return replace(maps[0], **{name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK})
+    return replace(maps[0], **{name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK})  # type: ignore[arg-type]
