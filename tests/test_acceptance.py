@@ -66,7 +66,11 @@ SOUND = SurfaceDiagnostics(
         ({}, Outcome.CONVERGED, "100% of the measured points have the surface's place and colour"),
         ({"on_surface": 0.8}, Outcome.OFF_SURFACE, "only 80% of the measured points lie on the surface"),
         ({"colour_inliers": 0.3}, Outcome.COLOUR_MISMATCH, "only 30% of the measured points have the colour"),
-        ({"free_space_violations": 0.2}, Outcome.FREE_SPACE_VIOLATED, "20% of the lines of sight pass through"),
+        (
+            {"free_space_violations": 0.2},
+            Outcome.FREE_SPACE_VIOLATED,
+            "20% of the lines of sight pass through",
+        ),
         ({"runner_up_margin": 0.1}, Outcome.AMBIGUOUS, "another pose fits about as well"),
         ({"rendered_inliers": 0.5}, Outcome.RENDERING_MISMATCH, "only 50% of the rendered rays agree"),
         ({"rendered_inliers": math.nan}, Outcome.RENDERING_MISMATCH, "of the rendered rays agree"),
@@ -159,3 +163,14 @@ def test_lines_of_sight_run_through_the_surface_from_behind() -> None:
     # The same points as if seen from the other side.
     through = baked.points(cloud.points, cloud.rgb, cloud.origins + 2 * cloud.middle)
     assert free_space_violations(PointSearch(baked.toy(), through).judge(), truth) > 0.5
+
+
+def test_only_points_with_a_colour_tell_of_colours() -> None:
+    """Half of the points are those of a lidar; the colours of the others are wrong."""
+    view = baked.unseen()[0]
+    seen = baked.cloud(view)
+    coloured = torch.arange(len(seen)) % 2 == 0
+    inverted = baked.points(seen.points, 1 - seen.rgb, seen.origins, coloured)
+    assert outcome(view.T_ref_camera, inverted) is Outcome.COLOUR_MISMATCH
+    bare = baked.points(seen.points, 1 - seen.rgb, seen.origins, torch.zeros_like(coloured))
+    assert outcome(view.T_ref_camera, bare) is Outcome.CONVERGED

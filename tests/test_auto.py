@@ -149,7 +149,10 @@ def colour_only(view: View) -> View:
     ("make", "said"),
     [
         (lambda v, T: rig(FieldMap(baked.FIELD, baked.BOUNDS), [v], T), "the map has no surface"),
-        (lambda v, T: rig(FieldMap(baked.FIELD, baked.BOUNDS), [colour_only(v)], T), "the map has no surface"),
+        (
+            lambda v, T: rig(FieldMap(baked.FIELD, baked.BOUNDS), [colour_only(v)], T),
+            "the map has no surface",
+        ),
     ],
     ids=["depth", "no depth"],
 )
@@ -194,8 +197,8 @@ def test_depth_rays_stand_in_for_a_depth_image(number: int) -> None:
 def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_sees_them() -> None:
     """A narrow image gives colours to the middle of the scan only; the rest counts by its shape."""
     view = baked.unseen()[0]
-    narrow = View(replace(view.frame, rgb=view.frame.rgb[24:48, 24:48], depth=None,
-        intrinsics=replace(baked.CAMERA, cx=12.0, cy=12.0, width=24, height=24)), view.T_ref_camera)  # fmt: skip
+    camera = replace(baked.CAMERA, cx=12.0, cy=12.0, width=24, height=24)
+    narrow = View(Frame("narrow", view.frame.rgb[24:48, 24:48], camera), view.T_ref_camera)
     rays = in_camera(view)
     start = perturb(view.T_ref_camera, 0.1, 5, 0)
     problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [narrow], start, rays)

@@ -160,8 +160,7 @@ def test_another_exposure_costs_little(generator: Generator) -> None:
         View(Frame("d", 0.8 * view.frame.rgb + 0.05, view.frame.intrinsics), SE3.identity()), 24
     )
     plain, fitted = (
-        float(compared(on_surface(), [darker], scales, T[None]).cost[0])
-        for scales in (PLAIN, ColourScales())
+        float(compared(on_surface(), [darker], scales, T[None]).cost[0]) for scales in (PLAIN, ColourScales())
     )
     exact = float(compared(on_surface(), [small], ColourScales(), T[None]).cost[0])
     assert fitted < plain

@@ -72,8 +72,7 @@ def test_the_same_seed_gives_the_same_answer() -> None:
     search = image_search(baked.unseen()[1])
     stages = (ImageStage(12, 0, 4), ImageStage(12, 3, 2))
     one, same, other = (
-        search(hypotheses(search, None, 24, Generator().manual_seed(seed)), stages)
-        for seed in (3, 3, 4)
+        search(hypotheses(search, None, 24, Generator().manual_seed(seed)), stages) for seed in (3, 3, 4)
     )
     assert torch.equal(one.T.matrix(), same.T.matrix())
     assert not torch.equal(one.T.matrix(), other.T.matrix())

@@ -46,9 +46,7 @@ def test_the_gradient_is_that_of_the_cost(colour_weight: float, generator: Gener
     assert (cost.correspondences(T).beyond > 0).any(), "some points beside an edge"
     found = cost(T)
     for i in range(4):
-        expected = numerical(
-            lambda d, i=i: cost(cloud.pivot.moved(T[i], d)[None]).cost[0]
-        )
+        expected = numerical(lambda d, i=i: cost(cloud.pivot.moved(T[i], d)[None]).cost[0])
         assert torch.allclose(2 * found.gradient[i], expected, rtol=1e-4, atol=1e-6)
 
 
@@ -89,9 +87,7 @@ def test_a_moved_world_changes_nothing(generator: Generator) -> None:
         (x, y, z), surface.cell, surface.nearest.permute(1, 2, 0).contiguous(), surface.keyframes,
     )  # fmt: skip
     T = poses(generator)
-    here, there = (
-        SurfaceCost(s, cloud, SCALES)(t) for s, t in ((surface, T), (moved, T_new_world @ T))
-    )
+    here, there = (SurfaceCost(s, cloud, SCALES)(t) for s, t in ((surface, T), (moved, T_new_world @ T)))
     assert torch.allclose(here.cost, there.cost, rtol=1e-9)
     assert torch.allclose(here.gradient, there.gradient, rtol=1e-6, atol=1e-9)
     assert torch.allclose(here.hessian, there.hessian, rtol=1e-6, atol=1e-6)
@@ -235,9 +231,7 @@ def test_points_of_depth_rays_that_no_view_sees_have_no_colour() -> None:
 def test_views_and_depth_rays_have_equal_shares() -> None:
     view = View(baked.unseen()[0].frame, SE3.identity())
     rays = depth_rays_of([view])
-    moved = Observations(
-        rays.origins + 0.1, rays.directions, rays.rgb, rays.distance, rays.coloured
-    )
+    moved = Observations(rays.origins + 0.1, rays.directions, rays.rgb, rays.distance, rays.coloured)
     found = PointCloud.measured((view,), moved, 200, torch.Generator().manual_seed(0))
     assert int((found.origins == 0).all(-1).sum()) == 100
     assert len(found) == 200
