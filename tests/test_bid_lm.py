@@ -95,7 +95,7 @@ def test_a_window_about_the_measured_depth_serves_as_well() -> None:
 @pytest.mark.parametrize(
     ("setting", "value"),
     [("poses", 0), ("fine_rays", 6), ("coarse_steps", 0), ("blur", 0), ("colour_scale", 0.0),
-     ("least_weight", 1.0), ("play", -1.0), ("stop_step", -1e-9), ("depth_scale", 0.0), ("depth_window", -0.1),
+     ("least_weight", 1.0), ("surface_sigma", -1.0), ("stop_step", -1e-9), ("depth_scale", 0.0), ("depth_window", -0.1),
      ("centring", -1), ("window_samples", 0), ("depth_rays", -1)],
 )  # fmt: skip
 def test_settings_that_make_no_sense_are_named(setting: str, value: object) -> None:

@@ -43,7 +43,7 @@ def test_colour_alone_finds_a_place_that_is_far() -> None:
 @pytest.mark.parametrize(
     ("setting", "value"),
     [("poses", 0), ("search_poses", 0), ("middle_steps", 0), ("width", 3), ("spread_rotation", -1.0), ("fine_rays", 6),
-     ("coarse_steps", 0), ("colour_scale", 0.0), ("least_weight", 1.0), ("play", -1.0)],
+     ("coarse_steps", 0), ("colour_scale", 0.0), ("least_weight", 1.0), ("surface_sigma", -1.0)],
 )  # fmt: skip
 def test_settings_that_make_no_sense_are_named(setting: str, value: object) -> None:
     with pytest.raises(InputError, match=f"{setting} is .*, expected "):
