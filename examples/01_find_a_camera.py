@@ -31,9 +31,8 @@ field = backend.build(config, scene.bounds)
 backend.train(field, seen, config, Silent())
 field.requires_grad_(False)
 
-map = Map(
-    MapInfo(given.backend, {}, scene.bounds, given.steps, complete=True), field
-)  # load_map(folder) reads a stored one
+# load_map(folder) gives the same for a map that 'bidnerf train' stored.
+map = Map(MapInfo(given.backend, {}, scene.bounds, given.steps, complete=True), field)
 localizer = Localizer(map, "bid", settings_of("bid", {"rays": 512, "max_steps": given.descent}))
 start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
 found = localizer(unseen.frame, start)

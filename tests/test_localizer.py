@@ -41,6 +41,7 @@ def poses(query: Any, **options: Any) -> torch.Tensor:
     return localizer()(query, **{"start": START, **options}).poses.matrix()
 
 
+@pytest.mark.usefixtures("unchecked")  # a list of one frame is accepted, but not declared
 def test_a_frame_a_view_and_a_list_of_one_are_one_query() -> None:
     """Where a single view stands in its common frame plays no part."""
     expected = poses(FRAME)
