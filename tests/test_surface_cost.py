@@ -16,6 +16,7 @@ from bidnerf_core.mapping import SurfaceMap, Surfels
 from bidnerf_core.observations import Observations
 from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.se3 import SE3
+from bidnerf_core.voxel_grid import VoxelGrid
 
 SCALES = PointScales(0.1, 0.3, 0.7)
 
@@ -80,11 +81,12 @@ def test_a_moved_world_changes_nothing(generator: Generator) -> None:
     surface, cloud = baked.exact(baked.toy()), exact_cloud()
     turn = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)
     T_new_world = SE3(turn, surface.cell * torch.tensor([3.0, -5.0, 11.0], dtype=torch.float64))
-    parts, lower = surface.surfels, T_new_world.apply(torch.tensor(surface.lower, dtype=torch.float64))
-    x, y, z = lower.tolist()
+    parts, lower = surface.surfels, T_new_world.apply(torch.tensor(surface.grid.lower, dtype=torch.float64))
+    (x, y, z), (a, b, c) = lower.tolist(), surface.grid.shape
     moved = SurfaceMap(
         Surfels(T_new_world.apply(parts.positions), parts.normals @ turn.T, parts.rgb, parts.rgb_gradient @ turn.T),
-        (x, y, z), surface.cell, surface.nearest.permute(1, 2, 0).contiguous(), surface.keyframes,
+        VoxelGrid((x, y, z), surface.cell, (b, c, a)), surface.nearest_in_cell.permute(1, 2, 0).contiguous(),
+        surface.keyframes,
     )  # fmt: skip
     T = poses(generator)
     here, there = (SurfaceCost(s, cloud, SCALES)(t) for s, t in ((surface, T), (moved, T_new_world @ T)))
