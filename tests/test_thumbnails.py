@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization.thumbnails import slopes, smooth, thumbnail
+from bidnerf_core.localization.costs.thumbnails import slopes, smooth, thumbnail
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
