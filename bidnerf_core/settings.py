@@ -12,6 +12,7 @@ import difflib
 import functools
 import math
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
@@ -56,7 +57,7 @@ class Above(Range):
 class OneOf:
     """The names that a setting may take, where they are those of a table that users may extend."""
 
-    table: typing.Mapping[str, Any]
+    table: Mapping[str, Any]
 
     def __contains__(self, value: str) -> bool:
         return value in self.table

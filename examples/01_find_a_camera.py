@@ -6,11 +6,12 @@ python examples/01_find_a_camera.py [--backend hashgrid] [--steps 200]
 import argparse
 import dataclasses
 
-from bidnerf_core import Intrinsics, load_backend, localize
+from bidnerf_core import Intrinsics, Localizer, Map, load_backend
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.localization import BidConfig, single
+from bidnerf_core.localization import settings_of
 from bidnerf_core.scenes.demo import demo_object, orbit, views
+from bidnerf_core.storage import MapInfo
 from bidnerf_core.training import Silent
 
 parser = argparse.ArgumentParser(description=__doc__)
@@ -30,9 +31,11 @@ field = backend.build(config, scene.bounds)
 backend.train(field, seen, config, Silent())
 field.requires_grad_(False)
 
+# load_map(folder) gives the same for a map that 'bidnerf train' stored.
+map = Map(MapInfo(given.backend, {}, scene.bounds, given.steps, complete=True), field)
+localizer = Localizer(map, "bid", settings_of("bid", {"rays": 512, "max_steps": given.descent}))
 start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
-problem = single(field, scene.bounds, unseen.frame, start)
-found = localize(problem, "bid", BidConfig(rays=512, max_steps=given.descent))
+found = localizer(unseen.frame, start)
 
 for what, pose in (("start", start), ("found", found.T_world_camera)):
     error = pose_error(pose, unseen.T_ref_camera)

@@ -8,11 +8,12 @@ The rays are shared out among the images, so a step costs the same; the pose tha
 import argparse
 import dataclasses
 
-from bidnerf_core import Intrinsics, load_backend, localize
+from bidnerf_core import Intrinsics, Localizer, Map, load_backend
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.localization import BidConfig, rig
+from bidnerf_core.localization import settings_of
 from bidnerf_core.scenes.demo import demo_object, look_at, orbit, views
+from bidnerf_core.storage import MapInfo
 from bidnerf_core.training import Silent
 
 parser = argparse.ArgumentParser(description=__doc__)
@@ -27,6 +28,8 @@ config = dataclasses.replace(backend.config_type(), steps=given.steps)
 field = backend.build(config, scene.bounds)
 backend.train(field, views(scene, camera, orbit(radius=3.5, count=40)), config, Silent())
 field.requires_grad_(False)
+map = Map(MapInfo(given.backend, {}, scene.bounds, given.steps, complete=True), field)
+localizer = Localizer(map, "bid", settings_of("bid", {"rays": 512, "max_steps": given.descent}))
 
 # Four cameras along an arc. Only their relative poses are used; the map never saw these images.
 arc = [
@@ -36,9 +39,7 @@ sequence = views(scene, camera, arc)
 start = perturb(arc[-1], translation=0.5, rotation_deg=12, seed=0)
 
 for used in (sequence[-1:], sequence):
-    found = localize(
-        rig(field, scene.bounds, used, start), "bid", BidConfig(rays=512, max_steps=given.descent)
-    )
+    found = localizer(used, start)
     error = pose_error(found.T_world_camera, arc[-1])
     print(
         f"{len(used)} view(s): off by {float(error.translation):.3f} m, {float(error.rotation_deg):.2f} degrees"

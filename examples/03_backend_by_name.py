@@ -11,11 +11,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from bidnerf_core import Intrinsics, list_backends, load_backend, load_map, localize
+from bidnerf_core import Intrinsics, Localizer, list_backends, load_backend, load_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.localization import BidConfig, single
+from bidnerf_core.localization import settings_of
 from bidnerf_core.scenes.demo import demo_object, orbit, views
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import MapInfo, save_map
@@ -47,8 +47,8 @@ with tempfile.TemporaryDirectory() as folder:  # as `bidnerf train` and `bidnerf
 
 (unseen,) = views(scene, camera, orbit(radius=3.5, count=1, elevation=(20, 40), seed=1))
 start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
-problem = single(stored.field, stored.bounds, unseen.frame, start)
-found = localize(problem, "bid", BidConfig(rays=512, max_steps=given.descent))
+localizer = Localizer(stored, "bid", settings_of("bid", {"rays": 512, "max_steps": given.descent}))
+found = localizer(unseen.frame, start)
 error = pose_error(found.T_world_camera, unseen.T_ref_camera)
 print(
     f"{stored.info.backend}: off by {float(error.translation):.3f} m and {float(error.rotation_deg):.2f} degrees"

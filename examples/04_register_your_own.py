@@ -14,14 +14,15 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core import Intrinsics, list_backends, load_backend, localize
+from bidnerf_core import Intrinsics, Localizer, Map, list_backends, load_backend
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import FieldValues
-from bidnerf_core.localization import BidConfig, single
+from bidnerf_core.localization import settings_of
 from bidnerf_core.rendering import render
 from bidnerf_core.sampling import Stratified
 from bidnerf_core.scenes.demo import demo_object, orbit, views
+from bidnerf_core.storage import MapInfo
 from bidnerf_core.training import RayBank, Silent, StepOutcome, fit, supervised_loss
 
 
@@ -95,9 +96,9 @@ def main() -> None:
 
     (unseen,) = views(scene, camera, orbit(radius=3.5, count=1, elevation=(20, 40), seed=1))
     start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
-    found = localize(
-        single(field, scene.bounds, unseen.frame, start), "bid", BidConfig(rays=256, max_steps=given.descent)
-    )
+    map = Map(MapInfo("balls", {}, scene.bounds, given.steps, complete=True), field)
+    localizer = Localizer(map, "bid", settings_of("bid", {"rays": 256, "max_steps": given.descent}))
+    found = localizer(unseen.frame, start)
     for what, pose in (("start", start), ("found", found.T_world_camera)):
         error = pose_error(pose, unseen.T_ref_camera)
         print(f"{what}: off by {float(error.translation):.3f} m and {float(error.rotation_deg):.2f} degrees")

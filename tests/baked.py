@@ -1,4 +1,4 @@
-"""What tests of the baked surface and of the search on it share: a toy that was baked from exact depth, and images of it."""
+"""What tests of the baked surface and of the search on it share: a toy baked from exact depth, and images of it."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import functools
 from dataclasses import replace
 
 import torch
-from bidnerf_core.localization.alignment import Cloud
-from bidnerf_core.localization.clouds import measured_cloud
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
-from bidnerf_core.localization import Problem, rig
+from bidnerf_core.localization.costs.surface import PointCloud
+from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, Surfels, bake
 from bidnerf_core.mapping.surface_map import nearest_surfels
 from bidnerf_core.scenes.closed_form import ClosedFormScene
@@ -24,11 +24,12 @@ from bidnerf_core.scenes.textures import Texture
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 from bidnerf_core.voxel_grid import VoxelGrid
+from problems import FieldMap
 
 CAMERA = Intrinsics(96.0, 96.0, 36.0, 36.0, 72, 72)
 BOUNDS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 CONFIG = BakeConfig(cells=100_000)
-FIELD = GaussianBlobs.random()  # whatever it is: measured depth asks no field
+FIELD = GaussianBlobs.random()  # any field: measured depth does not use it
 
 
 def baked(scene: ClosedFormScene, count: int = 24) -> SurfaceMap:
@@ -47,7 +48,7 @@ def toy() -> SurfaceMap:
 
 @functools.cache
 def unseen() -> tuple[View, ...]:
-    """Images of the toy from which its surface was not baked."""
+    """Return images of the toy from which its surface was not baked."""
     return tuple(images(demo_object(), 4, seed=7))
 
 
@@ -56,17 +57,33 @@ def one_solid(shape: Shape, texture: Texture) -> ClosedFormScene:
 
 
 def problem(*views: View, start: SE3 | None = None, surface: SurfaceMap | None = None) -> Problem:
-    return rig(FIELD, BOUNDS, views, start, surface=toy() if surface is None else surface)
+    return rig(FieldMap(FIELD, BOUNDS, toy() if surface is None else surface), views, start)
 
 
-def cloud(*views: View, count: int = 1000, seed: int = 0) -> Cloud:
-    return measured_cloud(problem(*views), count, torch.Generator().manual_seed(seed))
+def cloud(*views: View, count: int = 1000, seed: int = 0) -> PointCloud:
+    """Return measured points of views whose poses are known in the world, in the last one's frame."""
+    generator = torch.Generator().manual_seed(seed)
+    return PointCloud.measured(problem(*views).views, None, count, generator)
+
+
+def points(
+    places: Tensor, rgb: Tensor, origins: Tensor | None = None, coloured: Tensor | None = None
+) -> PointCloud:
+    """Return a cloud of given points, by default measured from the camera, and all with a colour."""
+    origins = torch.zeros_like(places) if origins is None else origins
+    return PointCloud(
+        places, rgb, origins, torch.ones(len(places), dtype=torch.bool) if coloured is None else coloured
+    )
+
+
+def point_search(*views: View, surface: SurfaceMap | None = None, count: int = 1000) -> PointSearch:
+    return PointSearch(toy() if surface is None else surface, cloud(*views, count=count))
 
 
 def of_points(
     positions: Tensor, rgb: Tensor, normal: tuple[float, float, float], cells: int = 20
 ) -> SurfaceMap:
-    """Surfels of one plane as they are, at most one a cell, in the cube from -1 to 1."""
+    """Return the surfels of one plane, at most one a cell, in the cube from -1 to 1."""
     grid = VoxelGrid.cube(BOUNDS, cells)
     numbers = grid.numbers(positions)
     assert (numbers.diff() > 0).all(), "one a cell, in the order of the cells"
@@ -79,7 +96,7 @@ def of_points(
 
 
 def patch(half: int = 5, dtype: torch.dtype = torch.float32) -> SurfaceMap:
-    """A square of 2 ``half`` by 2 ``half`` surfels in the plane z = 0.05, in cells of 0.1."""
+    """Return a square of 2 ``half`` by 2 ``half`` surfels in the plane z = 0.05, in cells of 0.1."""
     side = (torch.arange(-half, half, dtype=dtype) + 0.5) / 10
     x, y = torch.meshgrid(side, side, indexing="ij")
     positions = torch.stack([x, y, torch.full_like(x, 0.05)], dim=-1).reshape(-1, 3)
@@ -87,7 +104,7 @@ def patch(half: int = 5, dtype: torch.dtype = torch.float32) -> SurfaceMap:
 
 
 def exact(surface: SurfaceMap) -> SurfaceMap:
-    """The same in float64, for numerical derivatives."""
+    """Return the surface in float64, for numerical derivatives."""
     parts = surface.surfels
     values = (parts.positions, parts.normals, parts.rgb, parts.rgb_gradient)
     return replace(surface, surfels=Surfels(*(value.double() for value in values)))

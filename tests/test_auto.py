@@ -1,4 +1,4 @@
-"""Method ``auto``: poses without a start, with one, and what it does where there is no surface or no depth."""
+"""Method ``auto``: poses without a start, with one, from depth rays, and where there is no surface or no depth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from bidnerf_core.localization.clouds import measured_cloud
 
 import baked
 import bidnerf_core.localization.auto as module
@@ -15,15 +14,20 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import AutoConfig, Localization, Problem, localize, rig
-from bidnerf_core.localization.bid import BidConfig
-from bidnerf_core.localization.search import Found, score
+from bidnerf_core.localization import AutoConfig, Localization, Outcome, settings_of
+from bidnerf_core.localization.costs.surface import PointCloud
+from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.search.by_points import PointSearch
+from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.mapping import bake
+from bidnerf_core.observations import Observations
+from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.demo import demo_room
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
+from problems import FieldMap, localize
 
 QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)
 """The field of these tests does not show the toy."""
@@ -86,7 +90,7 @@ def test_the_same_seed_gives_the_same_answer() -> None:
 
 
 def shown(field: GaussianBlobs, count: int, seed: int) -> list[View]:
-    """Images of what a field shows, with its depth."""
+    """Return images of what a field shows, with its depth."""
     views = []
     for place, T in enumerate(orbit(3.5, count, elevation=(-10.0, 60.0), seed=seed)):
         image = render_image(field, baked.CAMERA, T, baked.BOUNDS)
@@ -99,13 +103,14 @@ def test_the_field_refines_what_the_surface_found() -> None:
     field = GaussianBlobs.random(density=60.0)
     surface = bake(field, baked.BOUNDS, [], shown(field, 12, seed=0), baked.CONFIG)
     view = shown(field, 1, seed=5)[0]
-    problem = rig(field, baked.BOUNDS, [view], None, surface=surface)
+    problem = rig(FieldMap(field, baked.BOUNDS, surface), [view], None)
     generator = torch.Generator().manual_seed(0)
-    cloud = measured_cloud(problem, 500, generator)
+    search = PointSearch(surface, PointCloud.measured(problem.views, None, 500, generator))
     near = perturb(view.T_ref_camera, 0.08, 3, 0)
-    found = Found(near, float(score(surface, cloud, near[None])[0]), math.inf, near[None])
-    refined, share = module._refined(problem, surface, cloud, found, AutoConfig(refine_steps=4), generator)
-    error = pose_error(refined.T, view.T_ref_camera)
+    nothing = torch.zeros(0, dtype=torch.float64)
+    found = SearchResult(near[None], search.score(near[None]), math.inf, near[None], nothing)
+    refined, share = module._refined(problem, search, found, AutoConfig(refine_steps=4), generator)
+    error = pose_error(refined.T[0], view.T_ref_camera)
     assert float(error.translation) < 0.02
     assert float(error.rotation_deg) < 0.5
     assert torch.equal(refined.path[0].matrix(), near.matrix())
@@ -113,12 +118,13 @@ def test_the_field_refines_what_the_surface_found() -> None:
     assert share > 0.9
 
 
-def test_a_field_that_does_not_show_the_surface_has_no_say() -> None:
+def test_a_field_that_does_not_show_the_surface_does_not_move_the_pose() -> None:
     problem = baked.problem(baked.unseen()[0])
     found = localize(problem, "auto", replace(QUICK, refine_steps=3), 0)
     assert torch.equal(found.T_world_camera.matrix(), found_for(problem).T_world_camera.matrix())
     assert not found.converged
-    assert "rays that the field renders" in found.reason
+    assert found.outcome is Outcome.RENDERING_MISMATCH
+    assert "of the rendered rays agree with what was measured" in found.reason
 
 
 def test_an_image_of_something_else_is_not_found() -> None:
@@ -128,7 +134,7 @@ def test_an_image_of_something_else_is_not_found() -> None:
     assert found.covariance is not None
 
 
-def test_nothing_is_asked_of_the_gradient_and_nothing_is_left_behind() -> None:
+def test_the_answer_has_no_gradient_and_the_mode_of_autograd_stays() -> None:
     with torch.enable_grad():
         found = found_for(baked.problem(baked.unseen()[0]))
     assert not found.T_world_camera.rotation.requires_grad
@@ -142,25 +148,72 @@ def colour_only(view: View) -> View:
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda v, T: rig(baked.FIELD, baked.BOUNDS, [v], T), "the map has no surface"),
-        (lambda v, T: rig(baked.FIELD, baked.BOUNDS, [colour_only(v)], T), "the map has no surface"),
+        (lambda v, T: rig(FieldMap(baked.FIELD, baked.BOUNDS), [v], T), "the map has no surface"),
+        (
+            lambda v, T: rig(FieldMap(baked.FIELD, baked.BOUNDS), [colour_only(v)], T),
+            "the map has no surface",
+        ),
     ],
     ids=["depth", "no depth"],
 )
 def test_without_surface_a_start_is_needed(make, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     view = baked.unseen()[0]
-    with pytest.raises(InputError, match=said) as told:
+    with pytest.raises(InputError, match=said) as raised:
         found_for(make(view, None))
-    assert "needs a start" in str(told.value)
-    assert "\n" not in str(told.value)
-    monkeypatch.setattr(module, "BidConfig", lambda: BidConfig(max_steps=2, rays=32))
+    assert "needs a start" in str(raised.value)
+    assert "\n" not in str(raised.value)
+    short = settings_of("bid", {"max_steps": 2, "rays": 32})
+    monkeypatch.setattr(module, "BidConfig", lambda: short)
     found = found_for(make(view, view.T_ref_camera))
     assert (found.method, found.steps) == ("bid", 2)
     assert said in found.reason
 
 
 @pytest.mark.parametrize("wrong", [{"points": 10}, {"hypotheses": 0}, {"rounds": 0}, {"rounds": 1000}])
-def test_settings_are_judged(wrong: dict[str, int]) -> None:
+def test_settings_are_checked(wrong: dict[str, int]) -> None:
     (name,) = wrong
     with pytest.raises(InputError, match=f"{name} is"):
         AutoConfig(**wrong)
+
+
+def in_camera(view: View) -> Observations:
+    """Return the depth image of a view as rays in the frame of its camera."""
+    return depth_rays_of([View(view.frame, SE3.identity())])
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_depth_rays_stand_in_for_a_depth_image(number: int) -> None:
+    """A colour image beside a lidar, without a start."""
+    view = baked.unseen()[number]
+    problem = rig(
+        FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, in_camera(view)
+    )
+    found = found_for(problem)
+    assert_right(found, view.T_ref_camera)
+    assert found.converged, found.reason
+    assert found.covariance is not None
+
+
+def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_sees_them() -> None:
+    """A narrow image gives colours to the middle of the scan only; the rest counts by its shape."""
+    view = baked.unseen()[0]
+    camera = replace(baked.CAMERA, cx=12.0, cy=12.0, width=24, height=24)
+    narrow = View(Frame("narrow", view.frame.rgb[24:48, 24:48], camera), view.T_ref_camera)
+    rays = in_camera(view)
+    start = perturb(view.T_ref_camera, 0.1, 5, 0)
+    problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [narrow], start, rays)
+    cloud = PointCloud.measured(problem.views, rays, 1000, torch.Generator().manual_seed(0))
+    assert 0.1 < float(cloud.coloured.float().mean()) < 0.9
+    assert_right(found_for(problem), view.T_ref_camera)
+
+
+def test_a_few_depth_rays_are_too_little_to_search_by() -> None:
+    """With fewer points than a shape needs, the images decide."""
+    view = baked.unseen()[0]
+    few = in_camera(view)[: module.LEAST_POINTS - 1]
+    problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, few)
+    quick = {"hypotheses": 8, "rounds": 1, "coarse_steps": 1, "fine_steps": 1, "fine_rays": 64}
+    found = localize(problem, "auto", quick)
+    alone = localize(problem.without_depth(), "auto", quick)
+    assert torch.equal(found.T_world_camera.matrix(), alone.T_world_camera.matrix())
+    assert "fresh rays" in found.reason

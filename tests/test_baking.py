@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from bidnerf_core.localization.clouds import measured_cloud
 from torch import Tensor
 
 import baked
@@ -47,7 +46,7 @@ def test_surfels_lie_on_the_true_surface() -> None:
 def test_all_that_was_seen_is_there() -> None:
     surface = baked.toy()
     for view in baked.unseen():
-        cloud = measured_cloud(baked.problem(view), 500, torch.Generator().manual_seed(0))
+        cloud = baked.cloud(view, count=500)
         world = view.T_ref_camera.apply(cloud.points.double()).float()
         assert (surface.distance(world) < 2 * surface.cell).float().mean() > 0.95
 

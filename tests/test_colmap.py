@@ -21,7 +21,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import BidConfig, localize, rig
+from bidnerf_core.localization.problem import rig
 from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import render, render_image
 from bidnerf_core.scenes.demo import demo_object
@@ -30,6 +30,7 @@ from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 from bidnerf_core.training import RayBank, Silent, depth_term
 from bidnerf_hashgrid import backend as hashgrid
+from problems import FieldMap, localize
 from sparse_model import Known
 
 CHOICE = SparseChoice()
@@ -326,13 +327,13 @@ def test_a_pose_comes_closer_with_the_points_than_without(tmp_path: Path) -> Non
     what = sparse_model.known(views, [f"{v.frame.name}.jpg" for v in views], each=60, agree=0.004)
     model = sparse_model.write(tmp_path, what)
     sparse = SparsePoints(model, places(what)[3:], CHOICE)
-    config = BidConfig(
-        rays=16, depth_rays=64, max_steps=25, learning_rate=0.03, pivot="camera", level=None
-    )  # fmt: skip
+    config = {
+        "rays": 16, "depth_rays": 64, "max_steps": 25, "learning_rate": 0.03, "pivot": "camera", "level": None,
+    }  # fmt: skip
 
     def error(view: View, rays: Observations | None, back: float) -> float:
         start = view.T_ref_camera.retract(torch.tensor([0, 0, back, 0, 0, 0], dtype=torch.float64))
-        found = localize(rig(FIELD, BOUNDS, [view], start, rays), "bid", config)
+        found = localize(rig(FieldMap(FIELD, BOUNDS), [view], start, rays), "bid", config)
         return float(pose_error(found.T_world_camera, view.T_ref_camera).translation)
 
     sought = [bare(view) for view in views[1:3]]

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from bidnerf_core.localization.sampled import RayCounts, SampledLoss
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.points import read_depth_points
@@ -17,18 +16,24 @@ from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import BidConfig, Problem, localize, single, window
+from bidnerf_core.localization import window
+from bidnerf_core.localization.costs.sampled import SampledLoss
+from bidnerf_core.localization.costs.weighted_rays import RayCounts
+from bidnerf_core.localization.method_settings import ColourSettings, DepthSettings, objective_of
+from bidnerf_core.localization.problem import Problem
 from bidnerf_core.observations import Observations
 from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.rendering import render, render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
+from problems import localize, single
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
 TRUTH = orbit(4.0, 3, seed=1)[1]
 FIELD = GaussianBlobs.random()
+OBJECTIVE = objective_of(ColourSettings(), DepthSettings())
 T_CAMERA_LIDAR = SE3.exp(torch.tensor([0.3, -0.4, 0.1, 0.2, 1.5, -0.4], dtype=torch.float64))
 
 
@@ -57,16 +62,8 @@ def depth_loss(problem: Problem, T: SE3, count: int = 10**6) -> float:
     """The part of the loss that the depth rays add."""
     values = []
     for counts in (RayCounts(16, count), RayCounts(16, 0)):
-        loss = SampledLoss(
-            problem,
-            BidConfig().objective,
-            counts,
-            "uniform",
-            True,
-            None,
-            1.0,
-            torch.Generator().manual_seed(0),
-        )
+        generator = torch.Generator().manual_seed(0)
+        loss = SampledLoss(problem, OBJECTIVE, counts, "uniform", True, None, 1.0, generator)
         values.append(float(loss(T)))
     return values[0] - values[1]
 
@@ -100,9 +97,9 @@ def test_a_moved_world_leaves_the_depth_loss_as_it_is() -> None:
 def test_a_pose_is_found_from_colour_and_a_lidar() -> None:
     """The camera has no depth."""
     start = perturb(TRUTH, 0.3, 6.0, seed=3)
-    config = BidConfig(
-        rays=64, depth_rays=128, max_steps=120, learning_rate=0.08, depth_weight=0.3, level=None
-    )
+    config = {
+        "rays": 64, "depth_rays": 128, "max_steps": 120, "learning_rate": 0.08, "depth_weight": 0.3, "level": None,
+    }  # fmt: skip
     found = localize(single(FIELD, BOUNDS, photograph(), start, lidar()), "bid", config)
     error = pose_error(found.T_world_camera, TRUTH)
     assert float(error.translation) < 0.05
@@ -113,9 +110,10 @@ def test_a_lidar_alone_tells_how_far_the_scene_is() -> None:
     """All black to the eye: no pixel has a gradient that is of use, but the distance comes right."""
     dark = Frame("dark", torch.zeros(40, 48, 3), CAMERA)
     start = TRUTH.retract(torch.tensor([0, 0, -0.2, 0, 0, 0], dtype=torch.float64))
-    config = BidConfig(
-        rays=1, depth_rays=200, max_steps=60, learning_rate=0.03, level=None, depth_weight=1e3, pivot="camera"
-    )
+    config = {
+        "rays": 1, "depth_rays": 200, "max_steps": 60, "learning_rate": 0.03, "level": None, "depth_weight": 1e3,
+        "pivot": "camera",
+    }  # fmt: skip
     found = localize(single(FIELD, BOUNDS, dark, start, lidar()), "bid", config)
     backward = TRUTH.inverse().apply(found.T_world_camera.translation)[2]
     assert abs(float(backward)) < 0.03
@@ -123,7 +121,7 @@ def test_a_lidar_alone_tells_how_far_the_scene_is() -> None:
 
 def test_weight_zero_leaves_depth_rays_out() -> None:
     start = perturb(TRUTH, 0.3, 6.0, seed=3)
-    few = BidConfig(rays=32, max_steps=3, depth_weight=0.0, level=None, pivot="camera")
+    few = {"rays": 32, "max_steps": 3, "depth_weight": 0.0, "level": None, "pivot": "camera"}
     with_rays, without = (
         localize(single(FIELD, BOUNDS, photograph(), start, rays), "bid", few) for rays in (lidar(), None)
     )
@@ -134,12 +132,12 @@ def test_the_gradient_by_the_pose_is_the_numerical_one() -> None:
     drawn = lidar().drawn(40, torch.Generator().manual_seed(0), torch.float64)
     start = perturb(TRUTH, 0.1, 2.0, seed=1)
     here = drawn.rays(start, BOUNDS)
-    objective = BidConfig().objective
 
     def loss(xi: torch.Tensor) -> torch.Tensor:
-        moved = drawn.rays(start.retract(xi), BOUNDS)  # where to look is held, as autograd does
-        rays = type(here)(moved.origins, moved.directions, here.near, here.far)
-        return objective.on_depth_rays(render(FIELD, rays), drawn)
+        moved = drawn.rays(start.retract(xi), BOUNDS)  # the sampled interval is held, as autograd does
+        parts = (moved.origins, moved.directions, here.near, here.far)
+        rays = type(here)(*(part[None] for part in parts))
+        return OBJECTIVE.loss(render(FIELD, rays), drawn[None])
 
     zero = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(loss, zero, eps=1e-6, atol=1e-6)

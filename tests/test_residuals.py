@@ -1,4 +1,4 @@
-"""What a rendering is judged by: colour, depth, and matter where a sensor saw through."""
+"""Residuals and objectives: colour, depth, matter in free space, and one objective for both kinds of solver."""
 
 from __future__ import annotations
 
@@ -7,18 +7,26 @@ import torch
 
 from bidnerf_core.field import Rays, RaySamples, SceneBounds
 from bidnerf_core.localization import BidConfig
+from bidnerf_core.localization.method_settings import ColourSettings, DepthSettings, objective_of
 from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import Rendering, render
-from bidnerf_core.residuals import Objective, depth, free_space, masked_mean, objective
-from bidnerf_core.robust import Robust
+from bidnerf_core.residuals import DEPTH_RESIDUALS, Objective, depth_residual, free_space, masked_mean
+from bidnerf_core.robust import RobustName
 from bidnerf_core.scenes.fields import GaussianBlobs
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)
-L2, HUBER = Robust("l2", 0.1), Robust("huber", 0.1)
+
+
+def objective(
+    colour: RobustName, depth: RobustName, depth_weight: float, free_space_weight: float = 0.0
+) -> Objective:
+    """Return the objective of robust losses with a scale of 0.1."""
+    settings = DepthSettings(depth_weight, depth, 0.1, free_space_weight=free_space_weight)
+    return objective_of(ColourSettings(colour, 0.1), settings)
 
 
 def wall(at: float, opacity: float = 1.0) -> Rendering:
-    """Two views of three rays each; all weight in one sample."""
+    """Return two views of three rays each; all weight in one sample."""
     shape = (2, 3)
     middle = torch.full((*shape, 1), at)
     samples = RaySamples(middle, middle, torch.ones(*shape, 1, dtype=torch.bool))
@@ -41,15 +49,15 @@ def test_free_space_counts_what_is_in_front_and_nothing_else() -> None:
         assert float(free_space(wall(at), distance, 0.1).abs().max()) == 0
 
 
-def test_matter_on_both_sides_is_told_from_a_surface() -> None:
-    """Half of the weight before, half behind: the mean depth is right, and only free space objects."""
+def test_matter_on_both_sides_is_distinguished_from_a_surface() -> None:
+    """Half of the weight before, half behind: the mean depth is right, and only the free-space term rejects it."""
     middles = torch.tensor([1.0, 3.0]).expand(2, 3, 2)
     weights = torch.full((2, 3, 2), 0.5)
     samples = RaySamples(middles, middles, torch.ones(2, 3, 2, dtype=torch.bool))
     both = Rendering(torch.full((2, 3, 3), 0.5), torch.full((2, 3), 2.0), torch.ones(2, 3), weights, samples)
     pixels = measured(torch.full((2, 3), 2.0))
-    assert float(Objective(L2, HUBER, 1.0)(both, pixels)) == 0
-    assert float(Objective(L2, HUBER, 1.0, free_space_weight=1.0)(both, pixels)) > 0.01
+    assert float(objective("l2", "huber", 1.0).loss(both, pixels)) == 0
+    assert float(objective("l2", "huber", 1.0, free_space_weight=1.0).loss(both, pixels)) > 0.01
 
 
 def test_the_derivative_by_the_rays_is_the_numerical_one() -> None:
@@ -59,11 +67,11 @@ def test_the_derivative_by_the_rays_is_the_numerical_one() -> None:
     directions = torch.nn.functional.normalize(aims - origins, dim=-1)
     field, here = GaussianBlobs.random(), BOUNDS.rays(origins, directions)
     probe = Observations.of_depth(origins, directions, torch.full((12,), 4.2, dtype=torch.float64))
-    judged = Objective(L2, Robust("cauchy", 0.1), 0.0, free_space_weight=1.0)
+    in_front = objective("l2", "cauchy", 0.0, free_space_weight=1.0)
 
     def loss(shift: torch.Tensor) -> torch.Tensor:
-        rays = Rays(origins + shift, directions, here.near, here.far)  # where to look is held
-        return judged.on_depth_rays(render(field, rays), probe)
+        rays = Rays((origins + shift)[None], directions[None], here.near[None], here.far[None])
+        return in_front.loss(render(field, rays), probe[None])
 
     zero = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     assert float(loss(zero).detach()) > 1e-3
@@ -73,23 +81,86 @@ def test_the_derivative_by_the_rays_is_the_numerical_one() -> None:
 def test_views_count_alike_however_many_of_their_pixels_were_measured() -> None:
     """Eq. 6: the mean over views of their means over measured rays."""
     distance = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
-    found = Objective(L2, L2, 1.0)(wall(2.4), measured(distance))
+    found = objective("l2", "l2", 1.0).loss(wall(2.4), measured(distance))
     assert float(found) == pytest.approx(0.5 * 0.4**2)
-    assert float(Objective(L2, L2, 1.0)(wall(2.4), measured(torch.zeros(2, 3)))) == 0
+    assert float(objective("l2", "l2", 1.0).loss(wall(2.4), measured(torch.zeros(2, 3)))) == 0
     torch.testing.assert_close(
-        masked_mean(depth(wall(2.4), measured(distance)), distance > 0), torch.tensor([0.4, 0.4])
+        masked_mean(depth_residual(wall(2.4), measured(distance)), distance > 0), torch.tensor([0.4, 0.4])
     )
 
 
-def test_the_papers_objective_is_hubers_for_both() -> None:
+def test_the_papers_objective_has_hubers_loss_for_both() -> None:
+    """Eq. 5 with ``rho(r) = delta (r - delta / 2)`` for depths that are 0.4 m off, and colours that agree."""
     distance = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
-    assert objective(wall(2.4), measured(distance), 0.1, 1.0) == BidConfig().objective(
-        wall(2.4), measured(distance)
+    default = objective_of(BidConfig().colour, BidConfig().depth)
+    assert float(default.loss(wall(2.4), measured(distance))) == pytest.approx(0.1 * (0.4 - 0.05))
+
+
+def test_weight_zero_uses_no_depth() -> None:
+    assert not objective("l2", "l2", 0.0).uses_depth
+    assert objective("l2", "l2", 0.0, free_space_weight=0.1).uses_depth
+    assert float(objective("l2", "l2", 0.0).loss(wall(9.0), measured(torch.full((2, 3), 2.0)))) == 0
+
+
+SOME = torch.tensor([[2.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
+
+
+def random_rendering() -> Rendering:
+    """Return a rendering of (2, 3) rays that differs from anything measured; float64."""
+    generator = torch.Generator().manual_seed(3)
+    middles = torch.rand((2, 3, 4), generator=generator, dtype=torch.float64).cumsum(-1)
+    weights = 0.25 * torch.rand((2, 3, 4), generator=generator, dtype=torch.float64)
+    samples = RaySamples(middles, middles, torch.ones(2, 3, 4, dtype=torch.bool))
+    rgb = torch.rand((2, 3, 3), generator=generator, dtype=torch.float64)
+    return Rendering(rgb, (weights * middles).sum(-1), weights.sum(-1), weights, samples)
+
+
+@pytest.mark.parametrize("loss", ["huber", "l2", "l1", "cauchy", "geman-mcclure"])
+@pytest.mark.parametrize("free", [0.0, 0.7])
+@pytest.mark.parametrize("miss", [None, 3.0])
+def test_the_loss_is_the_weighted_sum_of_rho(loss: RobustName, free: float, miss: float | None) -> None:
+    """Adam takes ``loss``, Levenberg-Marquardt takes residuals, weights and rho: both minimise one function."""
+    colour, depth = ColourSettings(loss, 0.2), DepthSettings(2.5, loss, 0.3, free_space_weight=free)
+    whole = objective_of(colour, depth, miss_scales=miss)
+    pixels, rendering = measured(SOME), random_rendering()
+    weights = whole.weights(pixels)
+    total = (weights * whole.rho(whole.residuals(rendering, pixels))).sum()
+    assert float(total) == pytest.approx(float(whole.loss(rendering, pixels)), rel=1e-6)
+    assert weights.shape[-1] == len(whole.scales) == (5 if free else 4)
+
+
+@pytest.mark.parametrize("loss", ["huber", "l2", "cauchy", "geman-mcclure"])
+def test_the_robust_weights_are_the_derivative_of_rho_over_the_residual(loss: RobustName) -> None:
+    whole = objective(loss, loss, 1.0, free_space_weight=1.0)
+    residuals = torch.linspace(-0.9, 0.95, 35, dtype=torch.float64).reshape(7, 5).requires_grad_()
+    (slope,) = torch.autograd.grad(whole.rho(residuals).sum(), residuals)
+    expected = whole.robust_weights(residuals.detach()) * residuals.detach()
+    torch.testing.assert_close(slope, expected)
+
+
+def test_weights_of_what_was_not_measured_are_zero() -> None:
+    """Each view's mean over its measured rays, and the mean over the views (eq. 6)."""
+    found = objective("l2", "l2", 3.0).weights(measured(SOME))
+    torch.testing.assert_close(found[..., :3], torch.full((2, 3, 3), 1 / 6))
+    torch.testing.assert_close(found[..., 3], 3 * torch.tensor([[0.5, 0.0, 0.0], [1 / 6] * 3]))
+    assert not bool(objective("l2", "l2", 3.0).weights(measured(torch.zeros(2, 3)))[..., 3].any())
+
+
+def test_a_ray_that_meets_nothing_is_off_by_the_miss() -> None:
+    pixels = measured(torch.full((2, 3), 2.0))
+    torch.testing.assert_close(depth_residual(wall(2.4, 0.0), pixels, 0.3), torch.full((2, 3), 0.3))
+    torch.testing.assert_close(depth_residual(wall(2.4, 1.0), pixels, 0.3), torch.full((2, 3), 0.4))
+    torch.testing.assert_close(depth_residual(wall(2.4, 0.5), pixels, 0.3), torch.full((2, 3), 0.35))
+    torch.testing.assert_close(depth_residual(wall(2.4, 0.0), pixels), torch.full((2, 3), -2.0))
+
+
+def test_a_depth_residual_of_ones_own_is_named_by_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    def halved(rendering: Rendering, observed: Observations, miss: float | None = None) -> torch.Tensor:
+        return (rendering.distance - observed.distance) / 2
+
+    monkeypatch.setitem(DEPTH_RESIDUALS, "halved", halved)
+    found = objective_of(ColourSettings(), DepthSettings(depth_residual="halved"))
+    pixels = measured(SOME)
+    torch.testing.assert_close(
+        found.residuals(wall(2.4), pixels)[..., 3], torch.where(SOME > 0, torch.tensor(0.2), 0.0)
     )
-    assert float(objective(wall(2.4), measured(distance), 0.1, 1.0)) == pytest.approx(0.1 * (0.4 - 0.05))
-
-
-def test_weight_zero_heeds_no_depth() -> None:
-    assert not Objective(L2, L2, 0.0).heeds_depth
-    assert Objective(L2, L2, 0.0, free_space_weight=0.1).heeds_depth
-    assert float(Objective(L2, L2, 0.0)(wall(9.0), measured(torch.full((2, 3), 2.0)))) == 0

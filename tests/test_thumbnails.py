@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from bidnerf_core.localization.thumbnails import slopes, smooth, thumbnail
 from scipy.ndimage import convolve1d
 from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.costs.thumbnails import slopes, smooth, thumbnail
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 

@@ -77,11 +77,14 @@ class SurfaceDiagnostics:
 def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDiagnostics:
     """Measure how the points of ``judge`` lie on the surface from one pose.
 
-    Each point counts by how much of an inlier it is, so that no threshold on single points decides.
+    Each point counts by how much of an inlier it is, so that no threshold on single points decides. Points without a
+    colour count for the colour inliers only where no point has one.
     """
     near, alike = judge.inliers(judge.correspondences(T[None]))
+    coloured = judge.cloud.coloured
+    both = (near * alike)[:, coloured] if bool(coloured.any()) else near
     violations = free_space_violations(judge, T)
-    return SurfaceDiagnostics(float(near.mean()), float((near * alike).mean()), violations, margin)
+    return SurfaceDiagnostics(float(near.mean()), float(both.mean()), violations, margin)
 
 
 @dataclass(frozen=True)

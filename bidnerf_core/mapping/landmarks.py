@@ -29,7 +29,7 @@ class LandmarkMap:
         return len(self.positions)
 
     def __getitem__(self, index: Tensor) -> LandmarkMap:
-        return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})  # type: ignore[arg-type]
+        return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
 
     @property
     def megabytes(self) -> float:

@@ -156,7 +156,8 @@ class SurfaceCost:
             [found.squared / scales.distance**2, (difference**2).sum(-1) / scales.colour**2]
         )
         near, alike = geman_mcclure_inlier(squared, 1.0)
-        weights = torch.stack([near**2, scales.colour_weight * near * alike**2])
+        by_colour = scales.colour_weight * self.cloud.coloured * near * alike**2
+        weights = torch.stack([near**2, by_colour])
         total = (weights * squared).sum((0, -1))
         return (total / weights.sum((0, -1)).clamp(min=1e-12)).double()
 

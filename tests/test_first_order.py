@@ -1,4 +1,4 @@
-"""First-order methods: what turns about what, when they stop, which pose they answer with, where they draw."""
+"""First-order methods: what updates turn about, when descents stop, and where pixels are drawn."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from bidnerf_core.localization.sampled import RayCounts, SampledLoss
-from bidnerf_core.localization.trail import WINDOW, Trail
 
 import tiny
 from bidnerf_core.camera import Intrinsics
@@ -17,14 +15,20 @@ from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import BidConfig, InerfConfig, Problem, localize, rig, single
+from bidnerf_core.localization import BidConfig, InerfConfig, settings_of
+from bidnerf_core.localization.costs.sampled import SampledLoss
+from bidnerf_core.localization.costs.weighted_rays import RayCounts
+from bidnerf_core.localization.method_settings import AdamSettings, objective_of
 from bidnerf_core.localization.pivots import PivotName, pivot
+from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.solvers.history import WINDOW
 from bidnerf_core.pixels import DrawerName, draw, uniform
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 from bidnerf_hashgrid import backend as hashgrid
+from problems import FieldMap, localize, single
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)
@@ -45,7 +49,7 @@ def problem() -> Problem:
 
 @pytest.mark.parametrize("pixels", ["interest-regions", "uniform"])
 def test_inerf_finds_its_place(problem: Problem, pixels: DrawerName) -> None:
-    found = localize(problem, "inerf", InerfConfig(rays=256, max_steps=150, pixels=pixels), seed=0)
+    found = localize(problem, "inerf", {"rays": 256, "max_steps": 150, "pixels": pixels}, seed=0)
     before, after = (pose_error(T, TRUTH) for T in (problem.start, found.T_world_camera))
     assert found.method == "inerf"
     assert float(after.translation) < 0.25 * float(before.translation)
@@ -55,16 +59,16 @@ def test_inerf_finds_its_place(problem: Problem, pixels: DrawerName) -> None:
 def test_pixels_are_drawn_where_the_config_says(problem: Problem) -> None:
     """Alone at its few corners this soft scene says too little of the pose; that they are looked at can be seen."""
     losses = [
-        localize(problem, "inerf", InerfConfig(rays=64, max_steps=1, pixels=name)).loss
+        localize(problem, "inerf", {"rays": 64, "max_steps": 1, "pixels": name}).loss
         for name in ("uniform", "interest-points", "interest-regions")
     ]
     assert len(set(losses)) == 3
 
 
-def test_inerf_heeds_no_depth(problem: Problem) -> None:
+def test_inerf_uses_no_depth(problem: Problem) -> None:
     frame = problem.views[0].frame
     wrong = torch.full((40, 48), 7.0)
-    few = InerfConfig(rays=64, max_steps=3)
+    few = {"rays": 64, "max_steps": 3}
     answers = [
         localize(single(FIELD, BOUNDS, replace(frame, depth=depth), problem.start), "inerf", few)
         for depth in (None, wrong)
@@ -75,24 +79,24 @@ def test_inerf_heeds_no_depth(problem: Problem) -> None:
 def test_inerf_takes_one_image() -> None:
     views = [View(photograph(T), T) for T in (orbit(4.0, 3, seed=1)[0], TRUTH)]
     with pytest.raises(InputError, match="one image, got 2; method bid"):
-        localize(rig(FIELD, BOUNDS, views, TRUTH), "inerf")
+        localize(rig(FieldMap(FIELD, BOUNDS), views, TRUTH), "inerf")
 
 
 def test_the_learning_rate_is_inerfs(problem: Problem) -> None:
     """Adam's first step is as long as the learning rate, in each entry of the tangent vector (Kingma and Ba 2015, section 2.1)."""
-    found = localize(problem, "inerf", InerfConfig(rays=64, max_steps=1))
+    found = localize(problem, "inerf", {"rays": 64, "max_steps": 1})
     xi = (found.poses[1] @ found.poses[0].inverse()).log()  # a left update
     torch.testing.assert_close(xi.abs(), torch.full((6,), 0.01, dtype=torch.float64), rtol=1e-3, atol=0)
-    config = InerfConfig()
+    config = InerfConfig().adam
     assert config.learning_rate * config.decay ** (200 / config.decay_steps) == pytest.approx(0.01 * 0.8**2)
 
 
 def test_bid_is_inerf_with_other_settings(problem: Problem) -> None:
-    few = InerfConfig(rays=64, max_steps=4, pixels="interest-regions")
-    same = BidConfig(
-        rays=64, max_steps=4, pixels="interest-regions", learning_rate=0.01, decay=0.8, decay_steps=100,
-        colour_loss="l2", pivot="world", level=None, depth_weight=0.0,
-    )  # fmt: skip
+    few = {"rays": 64, "max_steps": 4, "pixels": "interest-regions"}
+    same = {
+        **few, "learning_rate": 0.01, "decay": 0.8, "decay_steps": 100, "colour_loss": "l2", "pivot": "world",
+        "level": None, "depth_weight": 0.0,
+    }  # fmt: skip
     one, other = localize(problem, "inerf", few), localize(problem, "bid", same)
     assert torch.equal(one.poses.matrix(), other.poses.matrix())
 
@@ -126,7 +130,7 @@ def test_a_turn_moves_the_camera_as_far_as_a_shift(problem: Problem) -> None:
 
 
 def test_fixed_pixels_are_drawn_once(problem: Problem) -> None:
-    objective = BidConfig().objective
+    objective = objective_of(BidConfig().colour, BidConfig().depth)
     for renew in (True, False):
         generator = torch.Generator().manual_seed(0)
         loss = SampledLoss(problem, objective, RayCounts(64), "uniform", renew, None, 1.0, generator)
@@ -134,73 +138,44 @@ def test_fixed_pixels_are_drawn_once(problem: Problem) -> None:
 
 
 def test_descents_stop_on_the_loss_on_the_step_or_at_the_end(problem: Problem) -> None:
-    few = BidConfig(rays=64, max_steps=WINDOW + 5, level=None)
+    few = {"rays": 64, "max_steps": WINDOW + 5, "level": None}
     assert localize(problem, "bid", few).reason == f"reached {WINDOW + 5} steps"
-    loss = localize(problem, "bid", replace(few, stop_loss=10.0))
+    loss = localize(problem, "bid", {**few, "stop_loss": 10.0})
     assert (loss.steps, loss.reason) == (WINDOW, f"mean loss of {WINDOW} steps fell below 10")
-    step = localize(problem, "bid", replace(few, stop_step=10.0))
+    step = localize(problem, "bid", {**few, "stop_step": 10.0})
     assert (step.steps, step.reason) == (WINDOW, f"mean length of {WINDOW} steps fell below 10")
-    assert localize(problem, "bid", replace(few, stop_step=1e-6)).steps == WINDOW + 5
-
-
-def trail(losses: list[float]) -> Trail:
-    """One centimetre along x a step."""
-    poses = [
-        SE3.exp(torch.tensor([0.01 * i, 0, 0, 0, 0, 0], dtype=torch.float64)) for i in range(len(losses) + 1)
-    ]
-    return Trail(poses, losses)
-
-
-def test_the_best_pose_is_where_the_mean_loss_was_least() -> None:
-    losses = [1.0] * 30 + [0.2] * WINDOW + [0.5] * 30
-    losses[5] = 0.0  # one lucky draw is not the best
-    way = trail(losses)
-    T, mean = way.answer("best")
-    assert mean == pytest.approx(0.2)
-    assert float(T.translation[0]) == pytest.approx(0.01 * (30 + WINDOW - 1))
-    T, mean = way.answer("last")
-    assert float(T.translation[0]) == pytest.approx(0.01 * len(losses))
-    assert mean == pytest.approx(0.5)
-
-
-def test_a_short_way_ends_at_its_end() -> None:
-    T, mean = trail([0.1, 5.0]).answer("best")
-    assert float(T.translation[0]) == pytest.approx(0.02)
-    assert mean == pytest.approx(2.55)
-    assert math.isnan(trail([]).answer("best")[1])
-
-
-def test_the_length_of_steps_is_measured() -> None:
-    assert trail([1.0] * 40).recent_step() == pytest.approx(0.01)
-    assert trail([1.0] * 40).stop(0.0, 0.011) is not None
-    assert trail([1.0] * 40).stop(0.0, 0.009) is None
-    assert trail([1.0] * (WINDOW - 1)).stop(10.0, 10.0) is None
-    assert trail([]).recent_step() == math.inf
+    assert localize(problem, "bid", {**few, "stop_step": 1e-6}).steps == WINDOW + 5
 
 
 def test_best_is_no_worse_than_last_by_its_own_measure(problem: Problem) -> None:
-    wild = BidConfig(rays=64, max_steps=40, level=None, learning_rate=0.3, decay=1.0)
-    last, best = (localize(problem, "bid", replace(wild, answer=name)) for name in ("last", "best"))
+    wild = {"rays": 64, "max_steps": 40, "level": None, "learning_rate": 0.3, "decay": 1.0}
+    last, best = (localize(problem, "bid", {**wild, "answer": name}) for name in ("last", "best"))
     assert torch.equal(last.poses.matrix(), best.poses.matrix())
     assert best.loss <= last.loss
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
-        ({"stop_step": -1.0}, "stop_step is -1.0, expected a number, 0 or more"),
-        ({"stop_loss": math.nan}, "stop_loss is nan"),
+        ({"stop_step": -1.0}, "stop_step is -1.0, expected a number from 0.0 up"),
+        ({"stop_loss": -1.0}, "stop_loss is -1.0"),
         ({"colour_scale": 0.0}, "colour_scale is 0.0"),
         ({"rays": 0}, "rays is 0"),
     ],
 )
-def test_bad_settings_are_told(settings: dict[str, float], told: str) -> None:
-    for kind in (BidConfig, InerfConfig):
-        with pytest.raises(InputError, match=told):
-            kind(**settings)
+def test_bad_settings_are_named(settings: dict[str, float], message: str) -> None:
+    for method in ("bid", "inerf"):
+        with pytest.raises(InputError, match=message):
+            settings_of(method, settings)
 
 
-def test_rays_are_brought_to_where_the_field_computes(problem: Problem) -> None:
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_thresholds_are_finite(value: float) -> None:
+    with pytest.raises(InputError, match=f"stop_loss is {value}, expected a number from 0.0 up"):
+        AdamSettings(stop_loss=value)
+
+
+def test_rays_are_moved_to_the_device_of_the_field(problem: Problem) -> None:
     """The device "meta" stands for a GPU: it is another device, and one that every machine has."""
     elsewhere = hashgrid.build(tiny.config(), BOUNDS).to("meta")
     assert replace(problem, field=elsewhere).device.type == "meta"

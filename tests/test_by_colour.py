@@ -1,4 +1,4 @@
-"""Method ``auto`` without depth: a closed-form field, its baked surface, and images that nothing else is known of."""
+"""Poses by colour alone, as ``auto`` finds them without depth: a closed-form field, its baked surface, and plain images."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ import baked
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import AutoConfig, Localization, Problem, localize, rig
+from bidnerf_core.localization import AutoConfig, Localization
+from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.mapping import SurfaceMap, bake
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
+from problems import FieldMap, localize
 
 BOUNDS = replace(baked.BOUNDS, lower=(-1.2, -1.2, -1.2), upper=(1.2, 1.2, 1.2))
 FIELD = GaussianBlobs.random(density=60.0)
@@ -37,7 +39,7 @@ def photograph(T: SE3, depth: bool = False) -> View:
 
 
 def problem(*views: View, start: SE3 | None = None) -> Problem:
-    return rig(FIELD, BOUNDS, views, start, surface=surface())
+    return rig(FieldMap(FIELD, BOUNDS, surface()), views, start)
 
 
 def assert_right(found: Localization, truth: SE3) -> None:
@@ -70,14 +72,13 @@ def test_a_start_is_one_more_place_to_look() -> None:
     truth = UNSEEN[0]
     aside = replace(surface(), keyframes=surface().keyframes[:1])
     turned = truth @ SE3.exp(torch.tensor([0.1, 0.0, 0.1, 0.1, 0.3, 0.1], dtype=torch.float64))
-    found = localize(
-        rig(FIELD, BOUNDS, [photograph(truth)], turned, surface=aside), "auto", replace(QUICK, hypotheses=96)
-    )
+    started = rig(FieldMap(FIELD, BOUNDS, aside), [photograph(truth)], turned)
+    found = localize(started, "auto", replace(QUICK, hypotheses=96))
     assert_right(found, truth)
     assert torch.equal(found.poses[0].matrix(), turned.matrix())
 
 
-def test_an_image_of_something_else_is_not_believed() -> None:
+def test_an_image_of_something_else_is_rejected() -> None:
     view = baked.unseen()[0]
     other = View(replace(view.frame, depth=None), view.T_ref_camera)
     found = localize(problem(other), "auto", QUICK)
@@ -86,6 +87,6 @@ def test_an_image_of_something_else_is_not_believed() -> None:
 
 
 def test_a_map_without_surface_needs_a_start() -> None:
-    with pytest.raises(InputError, match=r"no surface .*needs a start") as told:
-        localize(rig(FIELD, BOUNDS, [photograph(UNSEEN[0])], None), "auto", QUICK)
-    assert "\n" not in str(told.value)
+    with pytest.raises(InputError, match=r"no surface .*needs a start") as raised:
+        localize(rig(FieldMap(FIELD, BOUNDS), [photograph(UNSEEN[0])], None), "auto", QUICK)
+    assert "\n" not in str(raised.value)

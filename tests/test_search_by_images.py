@@ -1,4 +1,4 @@
-"""The pose of an image without depth, from hypotheses anywhere."""
+"""The search by images: the pose of an image without depth, from hypotheses anywhere."""
 
 from __future__ import annotations
 
@@ -7,15 +7,21 @@ from dataclasses import replace
 
 import pytest
 import torch
-from bidnerf_core.localization.polish import without_depth
-from bidnerf_core.localization.rgb_hypotheses import around, hypotheses
-from bidnerf_core.localization.rgb_only import STAGES, surface_sight
-from bidnerf_core.localization.rgb_search import Sight, Stage, different, search
 from torch import Generator
 
 import baked
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.frames import View
+from bidnerf_core.localization.costs.view_renderers import SurfaceRenderer
+from bidnerf_core.localization.search.by_images import (
+    APART,
+    STAGES,
+    TURNED,
+    ImageSearch,
+    ImageStage,
+)
+from bidnerf_core.localization.search.halving import Distinct
+from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches
 from bidnerf_core.se3 import SE3
@@ -23,15 +29,20 @@ from bidnerf_core.se3 import SE3
 KEYFRAMES = SE3.from_matrix(baked.toy().keyframes)
 
 
-def sight(*views: View) -> Sight:
-    return surface_sight(without_depth(baked.problem(*views)), baked.toy())[0]
+def image_search(*views: View) -> ImageSearch:
+    return ImageSearch.on_surface(baked.problem(*views).without_depth(), baked.toy())
+
+
+def hypotheses(search: ImageSearch, start: SE3 | None, count: int, generator: Generator) -> SE3:
+    known = Surroundings(KEYFRAMES, search.extent, torch.zeros(3), search.middle)
+    return hypotheses_for_images(known, start, count, generator)
 
 
 @pytest.mark.parametrize("number", range(2))
 def test_the_pose_is_found_without_depth(number: int, generator: Generator) -> None:
     view = baked.unseen()[number]
-    of = sight(view)
-    found = search(of, hypotheses(of, KEYFRAMES, None, 64, generator), STAGES[:4])
+    search = image_search(view)
+    found = search(hypotheses(search, None, 64, generator), STAGES[:4])
     error = pose_error(found.T[0], view.T_ref_camera)
     # Of 3.5 m and with pixels and surfels that are 4 cm wide: what is left is the field's to take.
     assert float(error.translation) < 0.2
@@ -40,35 +51,34 @@ def test_the_pose_is_found_without_depth(number: int, generator: Generator) -> N
 
 def test_a_rig_is_placed_by_its_last_camera(generator: Generator) -> None:
     views = baked.unseen()[:2]
-    of = sight(*views)
-    found = search(of, hypotheses(of, KEYFRAMES, None, 32, generator), STAGES[:3])
+    search = image_search(*views)
+    found = search(hypotheses(search, None, 32, generator), STAGES[:3])
     assert float(pose_error(found.T[0], views[-1].T_ref_camera).rotation_deg) < 3
 
 
 def test_the_path_leads_from_a_hypothesis_to_the_answer(generator: Generator) -> None:
-    of = sight(baked.unseen()[0])
-    start = hypotheses(of, KEYFRAMES, None, 24, generator)
-    stages = (Stage(12, 0, 6), Stage(12, 3, 3), Stage(16, 2, 2))
-    found = search(of, start, stages)
+    search = image_search(baked.unseen()[0])
+    start = hypotheses(search, None, 24, generator)
+    stages = (ImageStage(12, 0, 6), ImageStage(12, 3, 3), ImageStage(16, 2, 2))
+    found = search(start, stages)
     assert len(found.path.translation) == 6
     assert len(found.losses) == 5
     assert (start.matrix() == found.path[0].matrix()).all(-1).all(-1).any()
     assert torch.equal(found.path[-1].matrix(), found.T[0].matrix())
-    assert found.costs.tolist() == sorted(found.costs.tolist())
+    assert found.scores.tolist() == sorted(found.scores.tolist())
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:
-    of = sight(baked.unseen()[1])
-    stages = (Stage(12, 0, 4), Stage(12, 3, 2))
+    search = image_search(baked.unseen()[1])
+    stages = (ImageStage(12, 0, 4), ImageStage(12, 3, 2))
     one, same, other = (
-        search(of, hypotheses(of, KEYFRAMES, None, 24, Generator().manual_seed(seed)), stages)
-        for seed in (3, 3, 4)
+        search(hypotheses(search, None, 24, Generator().manual_seed(seed)), stages) for seed in (3, 3, 4)
     )
     assert torch.equal(one.T.matrix(), same.T.matrix())
     assert not torch.equal(one.T.matrix(), other.T.matrix())
 
 
-def test_what_looks_the_same_from_two_sides_has_no_lead(generator: Generator) -> None:
+def test_what_looks_the_same_from_two_sides_has_no_margin(generator: Generator) -> None:
     """A box that half a turn maps onto itself."""
     paint = blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1)
 
@@ -78,32 +88,34 @@ def test_what_looks_the_same_from_two_sides_has_no_lead(generator: Generator) ->
 
     scene = replace(baked.one_solid(Box((0.6, 0.4, 0.3)), both), contrast=0.0)
     surface, (view,) = baked.baked(scene), baked.images(scene, 1, seed=5)
-    of, _ = surface_sight(baked.problem(view, surface=surface), surface)
+    search = ImageSearch.on_surface(baked.problem(view, surface=surface), surface)
     half = SE3(
         torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64)
     )
     T = view.T_ref_camera
-    found = search(of, SE3.stack([T, half @ T, T.retract(torch.full((6,), 0.05).double())]), STAGES[1:4])
-    assert found.lead < 0.15
-    assert bool(different(of, found.T)[1])
-    alone = search(of, T[None], STAGES[1:2])
-    assert math.isinf(alone.lead)
+    found = search(SE3.stack([T, half @ T, T.retract(torch.full((6,), 0.05).double())]), STAGES[1:4])
+    assert found.margin < 0.15 * float(found.scores[0])
+    assert bool(Distinct(search.middle, APART * search.extent, TURNED)(found.T)[1])
+    alone = search(T[None], STAGES[1:2])
+    assert math.isinf(alone.margin)
 
 
 def test_hypotheses_are_keyframes_and_what_is_about_them(generator: Generator) -> None:
-    of, start = sight(baked.unseen()[0]), baked.unseen()[0].T_ref_camera
-    many = hypotheses(of, KEYFRAMES, start, 64, generator)
+    search, start = image_search(baked.unseen()[0]), baked.unseen()[0].T_ref_camera
+    many = hypotheses(search, start, 64, generator)
     assert many.translation.shape == (64, 3)
     assert bool(many.is_rigid().all())
     assert torch.equal(many[0].matrix(), start.matrix())
     as_they_are = (many.matrix()[:, None] == KEYFRAMES.matrix()).flatten(2).all(-1).any(-1)
     assert int(as_they_are.sum()) == 24  # all there are
-    near = pose_error(around(of, start, 400, generator), start)
+    near = pose_error(hypotheses(search, start, 1600, generator)[:400], start)
     assert 10 < float(near.rotation_deg.median()) < 40
 
 
 def test_a_background_is_told_from_holes() -> None:
-    of, polish = surface_sight(baked.problem(baked.unseen()[0]), baked.toy())
-    assert of.sketcher.background == baked.BOUNDS.background  # type: ignore[attr-defined]
-    assert not polish.exposure
-    assert float(of.middle[2]) == pytest.approx(3.2, abs=0.5)  # cameras look at the toy from 3.5
+    """Keyframes look past the toy, so that it stands before a background, as bright as the map."""
+    search = image_search(baked.unseen()[0])
+    assert isinstance(search.renderer, SurfaceRenderer)
+    assert search.renderer.background == baked.BOUNDS.background
+    assert search.has_background
+    assert float(search.middle[2]) == pytest.approx(3.2, abs=0.5)  # cameras look at the toy from 3.5

@@ -1,0 +1,42 @@
+"""What tests of localization share: maps of any field, problems of one image, and methods by name with flat settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization import Localization, find_method, settings_of
+from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.observations import Observations
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMap:
+    """A field as a map."""
+
+    field: RadianceField
+    bounds: SceneBounds
+    surface: SurfaceMap | None = None
+
+
+def single(
+    field: RadianceField,
+    bounds: SceneBounds,
+    frame: Frame,
+    start: SE3 | None,
+    depth_rays: Observations | None = None,
+    surface: SurfaceMap | None = None,
+) -> Problem:
+    """Return the problem of one image."""
+    return rig(FieldMap(field, bounds, surface), [View(frame, SE3.identity())], start, depth_rays)
+
+
+def localize(problem: Problem, method: str, config: Any = None, seed: int = 0) -> Localization:
+    """Solve a problem by a method. ``config``: its settings, or some of them by flat name."""
+    if config is None or isinstance(config, dict):
+        config = settings_of(method, config or {})
+    return find_method(method).run(problem, config, seed)

@@ -1,0 +1,72 @@
+"""Exposure: weighted least squares with priors, against numpy, and under outliers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Generator
+
+from bidnerf_core.localization.costs.rendered import _robust_exposure
+from bidnerf_core.localization.exposure import Exposure, fit_exposure
+from bidnerf_core.residuals import Objective, colour_term
+from bidnerf_core.robust import Robust
+
+
+@pytest.mark.parametrize(
+    ("gain_precision", "bias_precision"), [(0.0, 0.0), (25.0, 100.0), (7.0, 0.0), (0.0, 3.0)]
+)
+def test_it_is_numpys_least_squares_with_the_priors_as_rows(
+    gain_precision: float, bias_precision: float, generator: Generator
+) -> None:
+    rendered = torch.rand((2, 3, 50), generator=generator, dtype=torch.float64)
+    measured = torch.rand((1, 3, 50), generator=generator, dtype=torch.float64)
+    weights = torch.rand((2, 1, 50), generator=generator, dtype=torch.float64)
+    found = fit_exposure(rendered, measured, weights, gain_precision, bias_precision)
+    for h in range(2):
+        for c in range(3):
+            root = weights[h, 0].sqrt().numpy()
+            x, y = rendered[h, c].numpy(), measured[0, c].numpy()
+            priors = np.sqrt([gain_precision, bias_precision])
+            rows = np.concatenate([root[:, None] * np.stack([x, np.ones_like(x)], -1), np.diag(priors)])
+            values = np.concatenate([root * y, priors * [1.0, 0.0]])
+            (gain, bias), *_ = np.linalg.lstsq(rows, values, rcond=None)
+            assert float(found.gain[h, c]) == pytest.approx(gain, rel=1e-9)
+            assert float(found.bias[h, c]) == pytest.approx(bias, rel=1e-9, abs=1e-12)
+
+
+def test_a_precision_for_each_pose() -> None:
+    rendered = torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64).expand(2, 1, 3)
+    weights = torch.ones((2, 1, 3), dtype=torch.float64)
+    found = fit_exposure(rendered, 2 * rendered, weights, torch.tensor([[0.0], [1e9]], dtype=torch.float64))
+    torch.testing.assert_close(found.gain[:, 0], torch.tensor([2.0, 1.0], dtype=torch.float64))
+
+
+def test_without_any_weight_there_is_no_correction() -> None:
+    rendered = torch.rand((1, 3, 10), dtype=torch.float64)
+    found = fit_exposure(rendered, rendered + 0.3, torch.zeros((1, 1, 10), dtype=torch.float64), 0.0)
+    torch.testing.assert_close(found.applied(rendered), rendered)
+
+
+def test_a_single_colour_leaves_the_gain_to_the_prior() -> None:
+    rendered = torch.full((1, 3, 10), 0.5, dtype=torch.float64)
+    found = fit_exposure(rendered, rendered + 0.1, torch.ones((1, 1, 10), dtype=torch.float64), 1e-3)
+    torch.testing.assert_close(found.applied(rendered), rendered + 0.1)
+    torch.testing.assert_close(found.gain, torch.ones((1, 3), dtype=torch.float64))
+
+
+def test_exposure_is_found_beside_outliers() -> None:
+    rendered = torch.rand((2, 500, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    gain, bias = torch.tensor([0.8, 1.1, 0.6], dtype=torch.float64), torch.tensor([0.1, -0.05, 0.2]).double()
+    measured = gain * rendered[0] + bias
+    measured[:50] = 1.0  # outliers
+    weights = torch.full((500, 3), 1 / 500, dtype=torch.float64)
+    found = robust(rendered[:1], measured, weights, Robust("geman-mcclure", 0.05))
+    assert float((found.gain - gain).abs().max()) < 0.12  # the prior about a gain of 1 has some weight
+    assert float((found.applied(rendered[:1].mT).mT[0] - measured)[50:].abs().mean()) < 0.03
+    plain = robust(torch.full((1, 500, 3), 0.5).double(), measured, weights, Robust("huber", 0.1))
+    assert bool(plain.gain.isfinite().all())
+
+
+def robust(rendered: torch.Tensor, measured: torch.Tensor, weights: torch.Tensor, loss: Robust) -> Exposure:
+    return _robust_exposure(rendered, measured, weights, Objective((colour_term(loss),)))

@@ -1,0 +1,246 @@
+"""The public door: what a localizer takes, what it refuses in one line, and that it keeps nothing between calls."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+
+import baked
+import tiny
+from bidnerf_core import InputError, Localizer, Outcome, View
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.localization import METHODS, AutoConfig, pose_from_matrix, settings_of
+from bidnerf_core.pixels import depth_rays_of
+from bidnerf_core.se3 import SE3
+from bidnerf_hashgrid import backend as hashgrid
+from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph
+from problems import FieldMap
+
+MAP = FieldMap(FIELD, BOUNDS)
+START = perturb(TRUTH, 0.1, 3.0, seed=2)
+FEW = settings_of("bid", {"rays": 64, "max_steps": 3, "level": None})
+QUICK = AutoConfig(points=500, hypotheses=64, rounds=1, refine_steps=0)
+
+
+@functools.cache
+def localizer() -> Localizer:
+    return Localizer(MAP, "bid", FEW)
+
+
+def poses(query: Any, **options: Any) -> torch.Tensor:
+    return localizer()(query, **{"start": START, **options}).poses.matrix()
+
+
+@pytest.mark.usefixtures("unchecked")  # a list of one frame is accepted, but not declared
+def test_a_frame_a_view_and_a_list_of_one_are_one_query() -> None:
+    """Where a single view stands in its common frame plays no part."""
+    expected = poses(FRAME)
+    elsewhere = View(FRAME, POSES[2])
+    for query in (View(FRAME, SE3.identity()), [FRAME], (FRAME,), [View(FRAME, SE3.identity())]):
+        assert torch.equal(poses(query), expected)
+    torch.testing.assert_close(poses(elsewhere), expected, rtol=0, atol=1e-9)
+
+
+def test_several_views_give_the_pose_of_the_last() -> None:
+    """Their common frame may be any: the world, the first camera, or one that is turned."""
+    turned = SE3.exp(torch.tensor([1.0, 2.0, 3.0, 0.3, 0.2, 0.1], dtype=torch.float64))
+    views = [View(photograph(T), T) for T in POSES]
+    start = perturb(POSES[-1], 0.1, 3.0, seed=2)
+    here = poses(views, start=start)
+    there = poses(tuple(replace(v, T_ref_camera=turned @ v.T_ref_camera) for v in views), start=start)
+    torch.testing.assert_close(here, there, rtol=0, atol=1e-5)
+    assert torch.equal(here[0], start.matrix())
+    assert not torch.equal(here[-1], poses(views[-1:], start=start)[-1])
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        START.matrix(),
+        START.matrix().float(),
+        START.matrix().numpy(),
+        START.matrix().numpy().astype(np.float32),
+        START.matrix().tolist(),
+        tuple(map(tuple, START.matrix().tolist())),
+        START.to("cpu", torch.float32),
+    ],
+    ids=["float64", "float32", "numpy", "numpy float32", "lists", "tuples", "SE3 float32"],
+)
+def test_a_start_of_any_kind_is_the_same_start(start: Any) -> None:
+    torch.testing.assert_close(poses(FRAME, start=start)[0], START.matrix(), rtol=0, atol=1e-6)
+
+
+def test_depth_rays_are_of_the_last_camera() -> None:
+    rays = depth_rays_of([View(FRAME, SE3.identity())])
+    bare = replace(FRAME, depth=None)
+    with_rays, without = poses(bare, depth_rays=rays), poses(bare)
+    assert torch.equal(with_rays[0], without[0])
+    assert not torch.equal(with_rays[-1], without[-1])
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Switch off the tests' own check of annotations, as it is for users."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+COLUMNS = START.matrix().T
+MIRRORED = START.matrix().clone()
+MIRRORED[:3, 0] *= -1
+
+
+@pytest.mark.parametrize(
+    ("query", "start", "message"),
+    [
+        (FRAME, COLUMNS, "start has the last row .*, expected .*written by columns: transpose it"),
+        (FRAME, COLUMNS.numpy(), "start has the last row .*transpose it"),
+        (FRAME, torch.eye(3), r"start has shape \(3, 3\), expected a 4x4 matrix T_world_camera"),
+        (FRAME, torch.eye(4)[:3], r"start has shape \(3, 4\), expected a 4x4 matrix"),
+        (FRAME, [0.0, 0.0, 1.0], r"start has shape \(3,\), expected a 4x4 matrix"),
+        (FRAME, 2 * np.eye(4), r"start has the last row \[0.0, 0.0, 0.0, 2.0\], expected \[0, 0, 0, 1\]$"),
+        (FRAME, np.diag([2.0, 2.0, 2.0, 1.0]), "start is not a rigid transform"),
+        (
+            FRAME,
+            MIRRORED,
+            "start is not a rigid transform, expected an orthonormal rotation of determinant 1",
+        ),
+        (FRAME, START.matrix() * torch.nan, "start has the last row .*nan"),
+        (FRAME, [[1.0, 2.0], [3.0]], "start is a list, expected an SE3 or a 4x4 matrix"),
+        (FRAME, "pose.json", "start is a str, expected an SE3 or a 4x4 matrix"),
+        (FRAME, SE3.stack([START, START]), "start holds 2 poses, expected one"),
+        (FRAME, None, "method 'bid' needs a start; give one, or take method 'auto'"),
+        (
+            [FRAME, FRAME],
+            START,
+            r"2 frames without relative poses, expected views: View\(frame, T_ref_camera\)",
+        ),
+        ([View(FRAME, START), FRAME], START, "2 frames without relative poses|expected views"),
+        ([], START, "nothing to localize: expected at least one view"),
+        ("image.png", START, "query is a str, expected a Frame"),
+        (Path("image.png"), START, "query is a PosixPath, expected a Frame"),
+        (FRAME.rgb, START, "query is a Tensor, expected a Frame"),
+        (FRAME.rgb.numpy(), START, "query is a ndarray, expected a Frame"),
+        (None, START, "query is a NoneType, expected a Frame"),
+        (["image.png"], START, "query is a list, expected a Frame"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_a_bad_query_is_refused_in_one_line(query: Any, start: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        localizer()(query, start)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("map", "method", "config", "message"),
+    [
+        ("maps/room", "auto", None, r"Localizer: got a str, expected a Map; load_map\(folder\) gives one"),
+        (Path("maps/room"), "auto", None, r"Localizer: got a PosixPath, expected a Map; load_map\(folder\)"),
+        (FIELD, "auto", None, "Localizer: got a GaussianBlobs, expected a Map$"),
+        (None, "auto", None, "Localizer: got a NoneType, expected a Map$"),
+        (MAP, "icp", None, "method 'icp' is unknown, expected one of auto, bid, bid-lm, inerf, inerf-lm"),
+        (MAP, "bid", AutoConfig(), "method 'bid' takes a BidConfig, got a AutoConfig"),
+        (MAP, "bid", {"rays": 5}, "method 'bid' takes a BidConfig, got a dict"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_a_bad_map_or_method_is_refused_when_the_localizer_is_made(
+    map: Any, method: str, config: Any, message: str
+) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        Localizer(map, method, config)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_settings_are_the_methods_own_by_default(method: str) -> None:
+    made = Localizer(MAP, method)
+    assert made.config == METHODS[method].config_type()
+    assert made.method == method
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    one = poses(FRAME, seed=4)
+    torch.manual_seed(99)
+    assert torch.equal(one, poses(FRAME, seed=4))
+    assert not torch.equal(one, poses(FRAME, seed=5))
+
+
+def test_warming_up_changes_no_answer_and_no_random_state() -> None:
+    state = torch.get_rng_state()
+    cold, warm = (Localizer(MAP, "bid", FEW, warm_up=warm) for warm in (False, True))
+    assert torch.equal(torch.get_rng_state(), state)
+    one, other = (made(FRAME, START).poses.matrix() for made in (cold, warm))
+    assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("method", ["auto", "bid"])
+def test_eight_threads_share_a_localizer(method: str) -> None:
+    """Neither the order of calls nor what else is being computed changes an answer."""
+    if method == "auto":
+        made = Localizer(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), "auto", QUICK)
+        queries = [(view.frame, None) for view in baked.unseen()] * 2
+    else:
+        made, queries = localizer(), [(FRAME, perturb(TRUTH, 0.1, 3.0, seed=i)) for i in range(8)]
+
+    def answer(number: int) -> torch.Tensor:
+        frame, start = queries[number]
+        return made(frame, start, seed=number).poses.matrix()
+
+    alone = [answer(i) for i in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        together = list(pool.map(answer, range(8)))
+    for one, other in zip(alone, together, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_no_start_is_needed_where_the_map_has_a_surface() -> None:
+    view = baked.unseen()[0]
+    found = Localizer(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), config=QUICK)(view.frame)
+    assert found.outcome is Outcome.CONVERGED
+    assert float(pose_error(found.T_world_camera, view.T_ref_camera).translation) < 0.05
+
+
+def test_a_device_that_is_another_one_gets_a_copy_of_the_field() -> None:
+    """The device "meta" stands for a GPU: it is another device, and one that every machine has."""
+    field = hashgrid.build(tiny.config(), BOUNDS)
+    own = FieldMap(field, BOUNDS)
+    before = {name: value.clone() for name, value in field.state_dict().items()}
+    moved = Localizer(own, "bid", device="meta", warm_up=False)
+    assert {p.device.type for p in moved.map.field.parameters()} == {"meta"}  # type: ignore[attr-defined]
+    assert own.field is field
+    assert moved.map is not own
+    assert {p.device.type for p in field.parameters()} == {"cpu"}
+    assert all(torch.equal(value, before[name]) for name, value in field.state_dict().items())
+    assert Localizer(own, "bid", device="cpu", warm_up=False).map is own
+
+
+def test_a_field_that_cannot_be_moved_is_named() -> None:
+    with pytest.raises(
+        InputError, match=r"device meta: the map's field is a GaussianBlobs, expected an nn.Module"
+    ):
+        Localizer(MAP, "bid", device="meta")
+
+
+def test_a_matrix_with_rounded_numbers_becomes_a_rigid_transform() -> None:
+    rounded = torch.tensor(np.round(START.matrix().numpy(), 6))
+    assert float((pose_from_matrix(rounded, "start").matrix() - START.matrix()).abs().max()) < 1e-5
+    assert bool(pose_from_matrix(rounded, "start").is_rigid())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_name_of_what_is_wrong_opens_the_message() -> None:
+    with pytest.raises(InputError, match=r"^pose.json has shape"):
+        pose_from_matrix(torch.eye(3), "pose.json")

@@ -1,0 +1,74 @@
+"""The cost of rendered rays: its gradient is exact, with exposure too, and steep residuals steer but do not judge."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization.costs.rendered import RenderedCost, Residuals, _residuals
+from bidnerf_core.localization.method_settings import RefinementSettings, RefinementStage
+from bidnerf_core.rendering import render
+from bidnerf_core.residuals import Objective, colour_term
+from bidnerf_core.robust import Robust
+from problems import single
+from rendered_rays import BOUNDS, FIELD, OBJECTIVE, OBSERVED, PIVOTS, POSES, RAYS, seen
+
+
+def residuals(about: str, exposure: bool = False, surface_sigma: float = 0.0) -> Residuals:
+    return _residuals(seen(POSES, PIVOTS[about]), RAYS, OBJECTIVE, exposure, surface_sigma)
+
+
+@pytest.mark.parametrize("exposure", [False, True])
+def test_the_gradient_of_the_cost_is_the_numerical_one(exposure: bool) -> None:
+    """With exposure, the brightness that fits best goes along with the pose; its rounds end near, not at, the best."""
+    about, step = PIVOTS["scene"], 1e-5
+    exact = residuals("scene", exposure).normal_equations().gradient
+    for k in range(6):
+        xi = step * torch.eye(6, dtype=torch.float64)[k].expand(3, 6)
+        ahead, behind = (
+            _residuals(seen(about.moved(POSES, sign * xi), about), RAYS, OBJECTIVE, exposure, 0.0).cost()
+            for sign in (1, -1)
+        )
+        allowed = 0.1 * float(exact.abs().max()) if exposure else 1e-8
+        torch.testing.assert_close(exact[:, k], (ahead - behind) / (4 * step), rtol=1e-4, atol=allowed)
+
+
+def test_the_cost_is_twice_the_loss_of_the_objective() -> None:
+    """Adam and Levenberg-Marquardt minimise one function: the weighted sum of rho is the loss."""
+    found = residuals("camera").cost()
+    for i in range(3):
+        rays = OBSERVED[None].rays(POSES[i], BOUNDS)
+        loss = OBJECTIVE.loss(render(FIELD, rays, BOUNDS.background), OBSERVED[None])
+        assert float(found[i]) == pytest.approx(2 * float(loss), rel=1e-6)
+
+
+def test_steep_residuals_steer_less_and_are_judged_alike() -> None:
+    confident, cautious = (residuals("scene", surface_sigma=sigma) for sigma in (0.0, 0.1))
+    torch.testing.assert_close(confident.cost(), cautious.cost())
+    assert bool((cautious.confidence <= confident.confidence).all())
+    one, other = (
+        found.normal_equations().hessian.diagonal(dim1=-2, dim2=-1) for found in (cautious, confident)
+    )
+    assert bool((one < other).all())
+
+
+def test_inliers_are_rays_none_of_whose_residuals_is_far_off() -> None:
+    """Three scales are the limit, of each channel that has a weight."""
+    objective = Objective((colour_term(Robust("huber", 0.1)),))
+    value = torch.tensor([[[0.29, 0, 0], [0.31, 0, 0], [0, 0, -0.31], [9.0, 9.0, 9.0]]], dtype=torch.float64)
+    weights = torch.ones((4, 3), dtype=torch.float64)
+    weights[3] = 0
+    found = Residuals(value, torch.zeros((1, 4, 3, 6)).double(), weights, torch.ones_like(value), objective)
+    assert found.inliers().tolist() == [0.5]
+
+
+def test_the_cost_without_derivatives_is_the_same() -> None:
+    blank = Frame("blank", torch.ones((4, 4, 3)), Intrinsics(4.0, 4.0, 2.0, 2.0, 4, 4))
+    problem = single(FIELD, BOUNDS, blank, POSES[0])
+    cost = RenderedCost(
+        problem, RAYS, OBJECTIVE, RefinementStage(1, 40), RefinementSettings(), PIVOTS["scene"]
+    )
+    torch.testing.assert_close(cost.cost(POSES), cost(POSES).cost)
+    assert not bool(cost.residuals(POSES, derivatives=False).jacobian.any())
