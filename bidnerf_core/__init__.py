@@ -2,31 +2,57 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any
 
 # Threads of OpenMP that wait should sleep. On cores that other work shares, spinning was measured to make training
-# more than ten times slower. It must be said before torch is loaded, and a user's own setting goes first.
+# more than ten times slower. It has to be set before torch is loaded; a user's own setting is kept.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# torch and typeguard (of the command line's parser) look for plugins among all entry points as they are imported: one
-# malformed file of any package would fail that. Where there is one, they do without.
+# torch and typeguard (which the command line's parser uses) look for plugins among all entry points as they are imported,
+# and fail on a malformed file of any package. Where there is such a file, they are imported without plugins.
 try:
     entry_points(group="bidnerf.backends")
 except Exception:
     os.environ.setdefault("TORCH_DEVICE_BACKEND_AUTOLOAD", "0")
     os.environ.setdefault("TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD", "1")
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds, levels
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import Localization, Localizer, Outcome
-from bidnerf_core.observations import Observations
-from bidnerf_core.registry import list_backends, load_backend
-from bidnerf_core.rendering import render, render_image
-from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import Map, load_map
+if TYPE_CHECKING:
+    from bidnerf_core.camera import Intrinsics
+    from bidnerf_core.errors import InputError, InputWarning
+    from bidnerf_core.field import (
+        FieldValues,
+        RadianceField,
+        Rays,
+        RaySampler,
+        RaySamples,
+        SceneBounds,
+        levels,
+    )
+    from bidnerf_core.frames import Frame, View
+    from bidnerf_core.localization import Localization, Localizer, Outcome
+    from bidnerf_core.observations import Observations
+    from bidnerf_core.registry import list_backends, load_backend
+    from bidnerf_core.rendering import render, render_image
+    from bidnerf_core.se3 import SE3
+    from bidnerf_core.storage import Map, load_map
+
+HOMES = {
+    "camera": ("Intrinsics",),
+    "errors": ("InputError", "InputWarning"),
+    "field": ("FieldValues", "RadianceField", "RaySampler", "RaySamples", "Rays", "SceneBounds", "levels"),
+    "frames": ("Frame", "View"),
+    "localization": ("Localization", "Localizer", "Outcome"),
+    "observations": ("Observations",),
+    "registry": ("list_backends", "load_backend"),
+    "rendering": ("render", "render_image"),
+    "se3": ("SE3",),
+    "storage": ("Map", "load_map"),
+}
+"""The modules that define the public names. They are imported with the first use of a name (PEP 562): to import torch
+takes seconds, and ``bidnerf --help`` does without it."""
 
 __all__ = [
     "SE3",
@@ -53,3 +79,15 @@ __all__ = [
     "render",
     "render_image",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in HOMES.items():
+        if name in names:
+            found = globals()[name] = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+            return found
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -18,10 +18,14 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, distributions
-from typing import Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from bidnerf_core.backend import Backend
 from bidnerf_core.errors import InputError
+
+if TYPE_CHECKING:
+    from bidnerf_core.backend import Backend
+else:
+    Backend = Any  # its module imports torch, which takes seconds and which a list of backends does without
 
 GROUP = "bidnerf.backends"
 

@@ -175,11 +175,12 @@ def load_info(folder: Path) -> MapInfo:
     return info
 
 
-def load_map(folder: Path, device: torch.device | str = "cpu", surface: bool = True) -> Map:
+def load_map(folder: str | Path, device: torch.device | str = "cpu", surface: bool = True) -> Map:
     """The map in ``folder``, its field built by its backend and frozen, on ``device``; the surface stays on the CPU.
 
     ``surface``: whether to read that as well.
     """
+    folder = Path(folder)
     info, tensors, baked = _read(folder, surface)
     field, _ = build_field(load_backend(info.backend, str(folder)), info, str(folder / DESCRIPTION))
     _check_weights(field, tensors, folder / info.weights)

@@ -10,19 +10,20 @@ import sys
 from collections.abc import Sequence
 from typing import TextIO
 
+from bidnerf_core.cli.text import printable
 from bidnerf_core.errors import InputError
 
 COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
-    "backends": "the installed kinds of field",
+    "backends": "list the installed kinds of field",
     "train": "make a map from a dataset",
-    "bake": "the surface of a map, which localization without a start needs; train does it as well",
+    "bake": "add to a map what localization without a start needs, as train does",
     "info": "describe a map",
-    "render": "images and depth of a map from a dataset's poses",
-    "localize": "find the pose of images in a map",
+    "render": "render images and depth of a map from a dataset's poses",
+    "localize": "find the poses of photos, or of a dataset's frames, in a map",
     "evaluate": "localize many frames from wrong starts, one JSON line a trial",
-    "compare": "the same starts in several maps: success, steps, time, memory",
-    "report": "tables, figures and tests of an evaluation, as one page",
+    "compare": "try the same starts in several maps: success, steps, time, memory",
+    "report": "make one page of tables, figures and tests of an evaluation",
 }
 
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
@@ -30,13 +31,13 @@ DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status."""
+    """Run one command and return the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     _open_streams()
     name = " ".join(["bidnerf", *[word for word in given[:1] if word in COMMANDS]])
     try:
         status = _guarded(name, given)
-        sys.stdout.flush()  # here, where a full disk can still be told
+        sys.stdout.flush()  # here, where a full disk can still be reported
     except BrokenPipeError:
         _discard(sys.stdout)
         return READER_GONE
@@ -47,10 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _guarded(name: str, given: list[str]) -> int:
-    """A user's mistake ends in one line, not in a traceback."""
+    """Run a command; a user's mistake ends in one line instead of a traceback."""
     try:
         return _dispatch(given)
-    except SystemExit as stopped:  # the parser has said all
+    except SystemExit as stopped:  # the parser has printed why
         return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
     except KeyboardInterrupt:
         return _failed(name, "interrupted", INTERRUPTED)
@@ -81,22 +82,22 @@ def _dispatch(given: list[str]) -> int:
 
 
 def _failed(name: str, message: str, status: int, more: str = "") -> int:
-    """Say why, on one line; that nobody listens is no reason to fail otherwise."""
+    """Print why a command failed, on one line, and return ``status``; a closed stderr does not change it."""
     with contextlib.suppress(OSError):
-        print(f"{name}: {' '.join(message.splitlines())}", file=sys.stderr)
+        print(f"{name}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
         print(more, end=more and "\n", file=sys.stderr, flush=True)
     return status
 
 
 def _open_streams() -> None:
-    """Python has no streams where the shell closed them (``>&-``): what would go there goes nowhere."""
+    """Replace streams that the shell closed (``>&-``), for which Python has None, by ones that discard everything."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
 
 
 def _discard(stream: TextIO) -> None:
-    """What is left in a stream's buffer must not fail once more when Python ends."""
+    """Discard what is left in a stream's buffer, which would fail once more when Python ends."""
     with contextlib.suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
@@ -106,4 +107,4 @@ def _discard(stream: TextIO) -> None:
 def _usage() -> str:
     width = max(map(len, COMMANDS))
     lines = [f"  {name.ljust(width)}  {what}" for name, what in COMMANDS.items()]
-    return "usage: bidnerf COMMAND ...\n\n" + "\n".join(lines) + "\n\n'bidnerf COMMAND --help' tells more."
+    return "usage: bidnerf COMMAND ...\n\n" + "\n".join(lines) + "\n\n'bidnerf COMMAND --help' describes a command."

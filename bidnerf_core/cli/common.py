@@ -1,31 +1,35 @@
-"""What several commands share."""
+"""Parsing, messages, and output folders, which several commands share."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import functools
-import io
 import json
 import math
-import re
 import shutil
 import sys
-import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 import tyro
 from rich.console import Console
+from rich.segment import Segment, Segments
 from rich.table import Table
+from rich.text import Text
 
-from bidnerf_core.datasets import Dataset
+from bidnerf_core.cli.help_page import Page, without_expert_settings
+from bidnerf_core.cli.text import printable
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
-from bidnerf_core.localization import find_method
-from bidnerf_core.localization.methods import Method
+
+if TYPE_CHECKING:
+    from bidnerf_core.datasets import Dataset
+    from bidnerf_core.frames import View
+    from bidnerf_core.localization import Method
+else:
+    Dataset = View = Method = Any  # their modules import torch, which commands such as 'backends' do without
 
 T = TypeVar("T")
 
@@ -34,23 +38,24 @@ LARGEST_SEED = 2**31 - 1
 
 
 class _Progress(Console):
+    """A console that falls silent when its reader goes away, so that work goes on."""
+
     def on_broken_pipe(self) -> None:
-        """Work goes on when nobody watches it any more."""
         self.quiet = True
 
 
 console = _Progress(stderr=True, highlight=False, soft_wrap=True)
-"""Everything that is not the result goes here."""
+"""Where all goes that is not the result: progress, remarks, errors."""
 
 
 class UsageError(InputError):
-    """The arguments contradict each other: wrong usage, where other bad input has status 1."""
+    """The arguments contradict each other. The exit status is that of wrong usage, 2, and not that of bad input, 1."""
 
     status = 2
 
 
 def option(metavar: str | None, help: str, default: str | None = None) -> Any:
-    """How an option is shown; ``default`` in words where the value itself would tell a reader nothing."""
+    """Describe an option for the help page; ``default`` says in words what a value such as None stands for."""
     hint = None if default is None else default and f"(default: {default})"
     return tyro.conf.arg(metavar=metavar, help=help, help_behavior_hint=hint)
 
@@ -61,38 +66,48 @@ MapFolder: TypeAlias = Annotated[
 DataFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, option("DATA", "folder of a dataset")]
 Flag: TypeAlias = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
-"""``--frame a b --frame c``: nothing that was named is forgotten."""
+"""``--frame a b --frame c`` names three frames."""
 
 
 def parse(command: str, function: Callable[..., T], arguments: list[str]) -> T:
-    """Call ``function`` with what the arguments say; wrong usage ends the program with status 2."""
+    """Call ``function`` with the parsed arguments; wrong usage ends the program with status 2.
 
-    def call() -> T:
-        config = (tyro.conf.OmitArgPrefixes,)
-        return tyro.cli(
-            _of_finite_settings(function), args=arguments, prog=f"bidnerf {command}", config=config
-        )
+    ``--help`` shows the options but for settings that are marked ``EXPERT``, and ``--help-all`` shows all of them.
+    """
+    if "--help-all" in arguments:
+        return _show_help(command, function, 0)
+    if {"-h", "--help"} & set(arguments):
+        return _show_help(command, *without_expert_settings(function))
+    return _called(command, _of_finite_settings(function), arguments)
 
-    if not {"-h", "--help"} & set(arguments):
-        return call()
-    page = _Page()
+
+def _called(command: str, function: Callable[..., T], arguments: list[str]) -> T:
+    return tyro.cli(
+        function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,)
+    )
+
+
+def _show_help(command: str, function: Callable[..., T], hidden: int) -> T:
+    page = Page()
     try:
         with contextlib.redirect_stdout(page):
-            return call()
+            return _called(command, function, ["--help"])
     finally:
+        if hidden:
+            page.write(f"\n{hidden} settings for experts are not shown; --help-all shows them.\n")
         sys.stdout.write(page.wrapped(shutil.get_terminal_size().columns))
 
 
 def _of_finite_settings(function: Callable[..., T]) -> Callable[..., T]:
-    """The same, called with settings that are numbers; what is not would be found out hours later, or never."""
+    """Return the function with a check that its settings are finite, which a training would fail on hours later."""
 
     @functools.wraps(function)
-    def judged(*arguments: Any, **options: Any) -> T:
+    def checked(*arguments: Any, **options: Any) -> T:
         for value in (*arguments, *options.values()):
             _require_finite(value)
         return function(*arguments, **options)
 
-    return judged
+    return checked
 
 
 def _require_finite(settings: Any) -> None:
@@ -105,60 +120,49 @@ def _require_finite(settings: Any) -> None:
         _require_finite(value)
 
 
-class _Page(io.StringIO):
-    """A help page. The parser leaves lines of running text and of usage as long as they are."""
-
-    def isatty(self) -> bool:  # what decides on colours
-        return sys.__stdout__ is not None and sys.__stdout__.isatty()
-
-    @property
-    def encoding(self) -> str:  # type: ignore[override]  # what decides on the lines of boxes
-        return getattr(sys.__stdout__, "encoding", None) or "ascii"
-
-    def wrapped(self, width: int) -> str:
-        lines = self.getvalue().splitlines()
-        return "".join(f"{_wrapped(line.rstrip(), width)}\n" for line in lines)
-
-
-def _wrapped(line: str, width: int) -> str:
-    unseen = sum(map(len, re.findall(r"\x1b\[[0-9;]*m", line)))
-    if len(line) - unseen <= width:
-        return line
-    return textwrap.fill(line, width + unseen, subsequent_indent="  " if "usage:" in line else "")
-
-
 def say(message: str) -> None:
-    console.print(message, markup=False)
+    """Print a line on stderr."""
+    console.print(printable(message), markup=False)
+
+
+def show(line: str) -> None:
+    """Print a line of the result on stdout."""
+    sys.stdout.write(printable(line) + "\n")
 
 
 def print_json(value: Any) -> None:
-    """One line of strict JSON, whole or not at all."""
+    """Print one line of strict JSON, whole or not at all."""
     sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
 
 
 def print_table(table: Table) -> None:
+    """Print a table on stdout."""
     screen = Console(highlight=False, markup=False)
-    with screen.capture() as drawn:  # printed by us: rich has ways of its own when the reader goes away
-        screen.print(table)
+    parts = [
+        part if part.text.strip("\n") == "" else Segment(printable(part.text), part.style, part.control)
+        for part in screen.render(table)
+    ]
+    with screen.capture() as drawn:  # written below, since rich handles a reader that goes away in its own way
+        screen.print(Segments(parts), end="")
     sys.stdout.write(drawn.get())
 
 
 def require(what: str, value: float, least: float, most: float = math.inf) -> None:
-    """Judge a number that the command line was given."""
+    """Check a number of the command line. Raises ``UsageError`` where it is not in the range."""
     if not least <= value <= most:
         expected = f"{least} or more" if most == math.inf else f"{least} to {most}"
         raise UsageError(f"{what} is {value}, expected {expected}")
 
 
 def require_different(what: str, names: Sequence[str]) -> None:
-    """No name may stand in a list twice."""
+    """Check that no name is listed twice. Raises ``UsageError``."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise UsageError(f"{what} names {twice[0]} more than once, expected each once")
 
 
 def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None) -> list[View]:
-    """Views of a split with a word on stderr while many are read; an empty split is an error."""
+    """Read views of a split, and show the progress where they are many. Raises ``InputError`` for an empty split."""
     total = len(dataset.frame_names(split)) if names is None else len(names)
     if total == 0:
         raise InputError(f"{dataset.path}: split {split!r} has no frames")
@@ -168,7 +172,9 @@ def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None)
         return dataset.views(
             split,
             names,
-            lambda done, count: status.update(f"reading {dataset.path.name}/{split}: {done}/{count}"),
+            lambda done, count: status.update(
+                Text(printable(f"reading {dataset.path.name}/{split}: {done}/{count}"))
+            ),
         )
 
 
@@ -211,14 +217,16 @@ def _make_writable(out: Path) -> None:
 
 
 def chosen_method(arguments: Sequence[str], usual: str) -> Method:
-    """What ``--method`` names."""
+    """Return the method that ``--method`` names."""
+    from bidnerf_core.localization import find_method
+
     with wrong_usage():
         return find_method(value_of("--method", arguments) or usual)
 
 
 @contextlib.contextmanager
 def wrong_usage() -> Iterator[None]:
-    """What is found in here is wrong with the arguments by themselves, whatever is in the files."""
+    """Turn an ``InputError`` into a ``UsageError``: the arguments are wrong, whatever the files hold."""
     try:
         yield
     except InputError as error:
@@ -226,7 +234,7 @@ def wrong_usage() -> Iterator[None]:
 
 
 def value_of(option: str, arguments: Sequence[str]) -> str | None:
-    """The value of an option before the parser that needs it exists; the last one counts, as for the parser."""
+    """Return the value of an option, on which the parser itself depends; the last one counts, as for the parser."""
     found = None
     for place, argument in enumerate(arguments):
         if argument.startswith(option + "="):

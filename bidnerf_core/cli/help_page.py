@@ -1,0 +1,96 @@
+"""Help pages: wrapped to the terminal, grouped as the settings are, and without what only experts need."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import io
+import re
+import sys
+import textwrap
+import typing
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+from bidnerf_core.settings import is_expert, to_flat
+
+T = TypeVar("T")
+
+
+def without_expert_settings(function: Callable[..., T]) -> tuple[Callable[..., T], int]:
+    """Return a function for whose options a help page is short, and the number of the options that it leaves out.
+
+    Settings are the parameters whose default is a dataclass. The parser removes what it is to hide, so this function is
+    for the page alone: arguments are parsed with ``function`` itself.
+    """
+    signature, hints, left_out = inspect.signature(function), dict(function.__annotations__), 0
+    parameters = dict(signature.parameters)
+    for name, parameter in signature.parameters.items():
+        if dataclasses.is_dataclass(parameter.default):
+            short, hidden = _short(parameter.default)
+            hints[name], left_out = type(short), left_out + hidden
+            parameters[name] = parameter.replace(default=short, annotation=type(short))
+
+    @functools.wraps(function)
+    def shown(*arguments: Any, **options: Any) -> T:
+        return function(*arguments, **options)
+
+    shown.__annotations__ = hints
+    shown.__signature__ = signature.replace(parameters=list(parameters.values()))  # type: ignore[attr-defined]
+    return shown, left_out
+
+
+def _short(settings: Any) -> tuple[Any, int]:
+    """Return the same settings as an instance of a type that hides those for experts, and the number of these."""
+    kind, hidden = type(settings), 0
+    hints = typing.get_type_hints(kind, include_extras=True)
+    notes, values = dict[str, Any](), dict[str, Any]()
+    for field in dataclasses.fields(kind):
+        value = getattr(settings, field.name)
+        if is_expert(kind, field.name):
+            notes[field.name] = Annotated[hints[field.name], tyro.conf.Suppress]
+            hidden += len(to_flat(value)) if dataclasses.is_dataclass(value) else 1
+        elif dataclasses.is_dataclass(value):
+            value, inside = _short(value)
+            notes[field.name], hidden = type(value), hidden + inside
+        values[field.name] = value
+    if not hidden:
+        return settings, 0
+    members = {"__annotations__": notes, "__doc__": kind.__doc__, "__module__": kind.__module__}
+    short = type(kind.__name__, (kind,), members | {name: values[name] for name in notes})
+    return dataclasses.dataclass(frozen=True)(short)(**values), hidden
+
+
+class Page(io.StringIO):
+    """A help page as the parser prints it, which leaves running text and usage on one long line each."""
+
+    def isatty(self) -> bool:  # what decides on colours
+        return sys.__stdout__ is not None and sys.__stdout__.isatty()
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]  # what decides on the lines of boxes
+        return getattr(sys.__stdout__, "encoding", None) or "ascii"
+
+    def wrapped(self, width: int) -> str:
+        """Return the page with lines of ``width`` characters at most, and short headings."""
+        lines = self.getvalue().splitlines()
+        return "".join(f"{_wrapped(_headed(line.rstrip()), width)}\n" for line in lines)
+
+
+def _headed(line: str) -> str:
+    """Return the head of a box without the names of the outer groups: ``config.by-colour.steps options``."""
+    found = re.search(r"\bconfig\.([\w-]+\.)*(?=[\w-]+ options )", line)
+    if found is None:
+        return line
+    edge = line.rindex("options ") + len("options ")
+    return line[: found.start()] + line[found.end() : edge] + line[edge] * len(found[0]) + line[edge:]
+
+
+def _wrapped(line: str, width: int) -> str:
+    unseen = sum(map(len, re.findall(r"\x1b\[[0-9;]*m", line)))
+    if len(line) - unseen <= width:
+        return line
+    return textwrap.fill(line, width + unseen, subsequent_indent="  " if "usage:" in line else "")

@@ -1,0 +1,13 @@
+"""Text for a terminal, with the standard library alone: the commands that need no torch start with it at once."""
+
+from __future__ import annotations
+
+
+def printable(text: str) -> str:
+    """Return ``text`` with a backslash escape in place of each character that could control the terminal.
+
+    These are what Unicode calls control, format and unassigned characters, such as ESC or the marks that reverse the
+    direction of writing, separators other than the blank, and bytes that are not UTF-8. Names of files and of frames may
+    hold any of them.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
