@@ -107,4 +107,8 @@ def _discard(stream: TextIO) -> None:
 def _usage() -> str:
     width = max(map(len, COMMANDS))
     lines = [f"  {name.ljust(width)}  {what}" for name, what in COMMANDS.items()]
-    return "usage: bidnerf COMMAND ...\n\n" + "\n".join(lines) + "\n\n'bidnerf COMMAND --help' describes a command."
+    return (
+        "usage: bidnerf COMMAND ...\n\n"
+        + "\n".join(lines)
+        + "\n\n'bidnerf COMMAND --help' describes a command."
+    )

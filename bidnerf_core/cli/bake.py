@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-from bidnerf_core.cli.common import MapFolder, console, option, parse, read_views, say
+from bidnerf_core.cli.common import MapFolder, option, parse, read_views, say
+from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.storage import cameras_of, load_info, load_map, save_surface
 
-SPEAK_EVERY = 10.0
-"""Seconds, where nobody sees a bar."""
-
 
 def run(arguments: list[str]) -> None:
-    """Parse."""
+    """Parse and bake."""
     parse("bake", _bake, arguments)
 
 
@@ -55,34 +50,13 @@ def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
         measured = []  # a few points are no surface
     cameras = [] if measured else cameras_of(stored.info) or places
     if not (measured or cameras):
-        raise InputError(f"{folder}: knows no place to see it from; say by --data where it was seen from")
-    with _progress() as report:
+        raise InputError(
+            f"{folder}: holds no cameras to render it from; give a dataset of its views by --data"
+        )
+    with counted("baking", "views") as report:
         surface = bake(stored.field, stored.bounds, cameras, measured, config, report)
     save_surface(folder, stored.info, surface)
     source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
     say(
         f"{folder}: surface of {len(surface.surfels)} pieces from {source} views, {time.monotonic() - began:.1f} s"
     )
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int], None]]:
-    """A bar, or a line now and then."""
-    columns = (
-        TextColumn("baking"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total} views"),
-        TimeRemainingColumn(),
-    )
-    spoke = time.monotonic()
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("baking", total=None)
-
-        def report(done: int, total: int) -> None:
-            nonlocal spoke
-            bar.update(task, completed=done, total=total)
-            if not console.is_terminal and time.monotonic() - spoke > SPEAK_EVERY:
-                spoke = time.monotonic()
-                say(f"baking: view {done}/{total}")
-
-        yield report

@@ -82,9 +82,7 @@ def parse(command: str, function: Callable[..., T], arguments: list[str]) -> T:
 
 
 def _called(command: str, function: Callable[..., T], arguments: list[str]) -> T:
-    return tyro.cli(
-        function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,)
-    )
+    return tyro.cli(function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,))
 
 
 def _show_help(command: str, function: Callable[..., T], hidden: int) -> T:
@@ -142,7 +140,9 @@ def print_table(table: Table) -> None:
         part if part.text.strip("\n") == "" else Segment(printable(part.text), part.style, part.control)
         for part in screen.render(table)
     ]
-    with screen.capture() as drawn:  # written below, since rich handles a reader that goes away in its own way
+    with (
+        screen.capture() as drawn
+    ):  # written below, since rich handles a reader that goes away in its own way
         screen.print(Segments(parts), end="")
     sys.stdout.write(drawn.get())
 

@@ -1,4 +1,4 @@
-"""``bidnerf demo``: the whole way in two minutes, with nothing but this package."""
+"""``bidnerf demo``: training, localization and pictures of a closed-form scene, in about a minute."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import imageio.v3 as iio
+import numpy as np
+from jaxtyping import UInt8
 from rich.table import Table
 
 from bidnerf_core.backend import Backend, quick_config
@@ -25,17 +27,18 @@ from bidnerf_core.cli.common import (
     print_table,
     require,
     say,
+    show,
 )
+from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.progress import timed
 from bidnerf_core.cli.train import train_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import PoseError, pose_error
-from bidnerf_core.evaluation.figures import blend, convergence_plot, overlay, save_gif
+from bidnerf_core.evaluation.figures import convergence_plot, save_gif
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames import View
-from bidnerf_core.localization import BidConfig, Localization, localize, single
+from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.registry import load_backend
-from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
@@ -46,21 +49,27 @@ from bidnerf_core.training import TrainingStopped
 CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 TRAINING_VIEWS, RADIUS = 60, 3.5
 START_ERROR = (0.55, 13.0)  # scene units (the object fills a 2x2x2 cube) and degrees
-DESCENT = BidConfig(rays=768, max_steps=150, decay_steps=60)  # quicker than the defaults, for small images
+DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # quicker than the defaults, for small images
 ANIMATED = 14  # frames of the animation
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One unseen frame, where its search began, and what came of it."""
+    """An unseen frame, a start that is far off, and what two methods find: one without the start, one from it."""
 
     view: View
     start: SE3
-    found: Localization
+    without_start: Localization  # by method auto
+    from_start: Localization  # by method bid
 
     @property
     def trace(self) -> PoseError:
-        return pose_error(self.found.poses, self.view.T_ref_camera)
+        """Errors of the start and after each step from it."""
+        return self.off(self.from_start.poses)
+
+    def off(self, poses: SE3) -> PoseError:
+        """Return how far poses are from the true one."""
+        return pose_error(poses, self.view.T_ref_camera)
 
 
 def run(arguments: list[str]) -> None:
@@ -77,7 +86,8 @@ def demo(
 ) -> None:
     """Train a closed-form scene, localize unseen frames in it, draw the result.
 
-    The frames are RGB-D images from poses that the training has not seen; the search for each begins far from its pose.
+    The frames are RGB-D images from poses that are not in the training. Each is localized twice: by method auto with no
+    start, and by method bid from a start far from its pose.
     """
     require("--frames", frames, 1)
     require("--steps", 1 if steps is None else steps, 1)
@@ -100,49 +110,48 @@ def _demonstrated(
         config = config if steps is None else dataclasses.replace(config, steps=steps)
     except TypeError as error:
         raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has") from error
-    with timed(f"trained on {len(seen)} views of the closed-form scene"):
+    with timed(f"trained on {len(seen)} views of the closed-form scene, and baked"):
         try:
-            train_map(
-                chosen, backend, seen, config, out / "map", scene.name, scene.bounds.background, baked=False
-            )
+            train_map(chosen, backend, seen, config, out / "map", scene.name, scene.bounds.background)
         except TrainingStopped as stopped:
             raise KeyboardInterrupt from stopped
     stored = load_map(out / "map")
-    return [_trial(stored, view, number, seed) for number, view in enumerate(unseen)], stored
-
-
-def _trial(stored: Map, view: View, number: int, seed: int) -> Trial:
-    start = perturb(view.T_ref_camera, *START_ERROR, seed=seed + number)
-    with console.status(f"localizing frame {number + 1}"):
-        found = localize(single(stored.field, stored.bounds, view.frame, start), "bid", DESCENT, seed)
-    return Trial(view, start, found)
+    auto, bid = Localizer(stored), Localizer(stored, "bid", settings_of("bid", DESCENT))
+    trials = []
+    for number, view in enumerate(unseen):
+        start = perturb(view.T_ref_camera, *START_ERROR, seed=seed + number)
+        with console.status(f"localizing frame {number + 1}"):
+            found = auto(view.frame, seed=seed), bid(view.frame, start, seed=seed)
+        trials.append(Trial(view, start, *found))
+    return trials, stored
 
 
 def _print(trials: Sequence[Trial]) -> None:
     table = Table(title="Pose errors before and after", title_justify="left", box=None, pad_edge=False)
-    for column in ("frame", "start", "", "found", "", "steps", "seconds", "converged"):
-        table.add_column(column, justify="left" if column == "frame" else "right")
+    for column in ("frame", "method", "start", "", "found", "", "steps", "seconds", "converged"):
+        table.add_column(column, justify="left" if column in ("frame", "method") else "right")
     for trial in trials:
-        before, after = trial.trace[0], trial.trace[-1]
-        table.add_row(
-            trial.view.frame.name, f"{float(before.translation):.3f} m", f"{float(before.rotation_deg):.1f} deg",
-            f"{float(after.translation):.4f} m", f"{float(after.rotation_deg):.2f} deg",
-            str(trial.found.steps), f"{trial.found.seconds:.1f}", "yes" if trial.found.converged else "NO",
-        )  # fmt: skip
+        start = _shown(trial.off(trial.start), 3, 1)
+        for found, begin in ((trial.without_start, ("none", "")), (trial.from_start, start)):
+            error = _shown(trial.off(found.T_world_camera), 4, 2)
+            verdict = "yes" if found.converged else "NO"
+            row = (trial.view.frame.name, found.method, *begin, *error, str(found.steps))
+            table.add_row(*row, f"{found.seconds:.1f}", verdict)
     print_table(table)
+
+
+def _shown(error: PoseError, digits: int, digits_of_angle: int) -> tuple[str, str]:
+    return f"{float(error.translation):.{digits}f} m", f"{float(error.rotation_deg):.{digits_of_angle}f} deg"
 
 
 def _draw(stored: Map, trials: Sequence[Trial], out: Path) -> None:
     for trial in trials:
-        name = trial.view.frame.name
-        pair = [_rendered(stored, trial, T) for T in (trial.start, trial.found.T_world_camera)]
-        iio.imwrite(out / f"overlay-{name}.png", overlay(trial.view.frame.rgb, *pair))
+        painter = Painter(stored, trial.view.frame)
+        iio.imwrite(out / f"overlay-{trial.view.frame.name}.png", _overlay(painter, trial))
     first = trials[0]
-    shown = _moments(first.found.steps)
+    painter, path = Painter(stored, first.view.frame), first.from_start.poses
     with console.status("drawing the animation"):
-        pictures = [
-            blend(first.view.frame.rgb, _rendered(stored, first, first.found.poses[i])) for i in shown
-        ]
+        pictures = [painter.blended(path[i]) for i in _moments(first.from_start.steps)]
     save_gif(out / "localization.gif", pictures)
     drawn = ["overlay-*.png", "localization.gif"]
     try:
@@ -150,13 +159,19 @@ def _draw(stored: Map, trials: Sequence[Trial], out: Path) -> None:
         drawn.append("convergence.png")
     except InputError as error:  # matplotlib is an extra
         say(str(error))
-    print(f"look at {', '.join(str(out / name) for name in drawn)}")
+    show(f"look at {', '.join(str(out / name) for name in drawn)}")
+
+
+def _overlay(painter: Painter, trial: Trial) -> UInt8[np.ndarray, "H W 3"]:
+    """Return two rows: what is found without a start, and from one."""
+    auto, bid = trial.without_start.T_world_camera, trial.from_start.T_world_camera
+    rows = (
+        painter.row(painter.observed, "observed", auto, "found by auto, no start"),
+        painter.row(painter.rendered(trial.start), "rendered at the start", bid, "found by bid from there"),
+    )
+    return np.concatenate(rows, axis=0)
 
 
 def _moments(steps: int) -> list[int]:
-    """Steps to show: close together at the beginning, where most happens."""
+    """Return the steps to show, close together at the beginning, where most happens."""
     return sorted({round(steps * (i / (ANIMATED - 1)) ** 2) for i in range(ANIMATED)})
-
-
-def _rendered(stored: Map, trial: Trial, T_world_camera: SE3) -> Any:
-    return render_image(stored.field, trial.view.frame.intrinsics, T_world_camera, stored.bounds).rgb

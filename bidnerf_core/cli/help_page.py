@@ -60,8 +60,9 @@ def _short(settings: Any) -> tuple[Any, int]:
     if not hidden:
         return settings, 0
     members = {"__annotations__": notes, "__doc__": kind.__doc__, "__module__": kind.__module__}
-    short = type(kind.__name__, (kind,), members | {name: values[name] for name in notes})
-    return dataclasses.dataclass(frozen=True)(short)(**values), hidden
+    defaults = {name: values[name] for name in notes}
+    short: Any = dataclasses.dataclass(frozen=True)(type(kind.__name__, (kind,), members | defaults))
+    return short(**values), hidden
 
 
 class Page(io.StringIO):

@@ -1,10 +1,11 @@
-"""A training's progress on stderr, its checkpoints on disk, and Ctrl-C."""
+"""Progress on stderr, a training's checkpoints on disk, and Ctrl-C."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +36,7 @@ Bar = TypeVar("Bar", bound="StoppableBar")
 
 
 class StoppableBar:
-    """A context that shows a bar and hears Ctrl-C by ``_interrupt``, and leaves the terminal and the signal as they were."""
+    """A context that shows a bar and handles Ctrl-C by ``_interrupt``; both are restored at its end."""
 
     _bar: Progress
 
@@ -64,7 +65,7 @@ class StoredTraining(StoppableBar):
         self.stopping = False
         self._checkpoint_seconds = checkpoint_seconds
         self._resumed, self._first_step = state, info.step
-        self._step, self._complete, self._told = info.step, False, False
+        self._step, self._complete, self._announced = info.step, False, False
         self._began = self._saved = self._spoke = time.monotonic()
         self._bar = Progress(
             TextColumn("training"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[numbers]}"),
@@ -88,8 +89,8 @@ class StoredTraining(StoppableBar):
             done = progress.step - self._first_step
             left = (now - self._began) / max(1, done) * (progress.total - progress.step)
             say(f"step {progress.step}/{progress.total}  {numbers}  {left:.0f} s left")
-        if self.stopping and not self._told:  # not in the signal's handler, which may interrupt a print
-            self._told = True
+        if self.stopping and not self._announced:  # not in the signal's handler, which may interrupt a print
+            self._announced = True
             say("stopping after this step (Ctrl-C again: at once, back to the last checkpoint)")
 
     def due(self, step: int) -> bool:
@@ -103,7 +104,7 @@ class StoredTraining(StoppableBar):
         self._saved, self._complete = time.monotonic(), complete
 
     def finish(self, field: RadianceField) -> None:
-        """Save once more if the backend came to its end without saying so."""
+        """Save once more if the backend ended without reporting its last step."""
         if not self._complete and isinstance(field, nn.Module):
             self.total = self._step
             self.save(TrainingState(self._step, field.state_dict(), {}))
@@ -115,7 +116,39 @@ class StoredTraining(StoppableBar):
 
 
 @contextmanager
+def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable[[int, int], None]]:
+    """Show how many of ``unit`` are done, their rate and the time left: a bar on a terminal, else a line now and then.
+
+    Yields a function of the number done and of the total. Nothing is shown for a total of 1.
+    """
+    columns = (
+        TextColumn(what), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit),
+        TextColumn("{task.fields[rate]}"), TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    began = spoke = time.monotonic()
+    with Progress(
+        *columns, console=console, disable=not console.is_terminal or total == 1, transient=True,
+        redirect_stdout=sys.stdout.isatty(),  # results on the same terminal go above the bar
+    ) as bar:  # fmt: skip
+        task = bar.add_task("", total=total, rate="")
+
+        def report(done: int, of: int) -> None:
+            nonlocal spoke
+            now = time.monotonic()
+            each = (now - began) / max(1, done)
+            rate = f"{each:.1f} s each" if each >= 1 else f"{1 / max(each, 1e-9):.1f} a second"
+            bar.update(task, completed=done, total=of, rate=rate)
+            last_of_a_long_run = done == of and spoke > began
+            if not console.is_terminal and of > 1 and (now - spoke > LINE_EVERY or last_of_a_long_run):
+                spoke = now
+                say(f"{what}: {done}/{of} {unit}, {rate}, {each * (of - done):.0f} s left")
+
+        yield report
+
+
+@contextmanager
 def timed(what: str) -> Iterator[None]:
+    """Print how long the work inside took."""
     began = time.monotonic()
     yield
     say(f"{what}: {time.monotonic() - began:.1f} s")

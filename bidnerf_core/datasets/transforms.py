@@ -93,6 +93,11 @@ class TransformsDataset:
                 progress(done, len(places))
         return views
 
+    def image_file(self, split: str, name: str) -> Path:
+        """Return the image file of a frame. Raises ``InputError`` where there is none."""
+        frames, known = self._frames[split], self._names[split]
+        return self._image_file(frames[known.index(name)])
+
     def _known(self, split: str) -> None:
         if split not in self._frames:
             raise InputError(f"{self._path}: no split {split!r}, expected one of {', '.join(self.splits)}")

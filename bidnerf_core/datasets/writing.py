@@ -49,7 +49,7 @@ def _written(folder: Path, split: str, view: View, background: tuple[float, floa
     entry: dict[str, Any] = {
         "file_path": f"images/{split}/{frame.name}.png",
         "transform_matrix": (T_world_camera * T_world_camera.new_tensor(OPENCV_TO_OPENGL)).tolist(),
-        **_camera(frame),
+        **camera_entry(frame.intrinsics, frame.name),
     }
     _write(folder / entry["file_path"], _colours(frame, background))
     if frame.depth is not None:
@@ -60,11 +60,11 @@ def _written(folder: Path, split: str, view: View, background: tuple[float, floa
     return entry
 
 
-def _camera(frame: Frame) -> dict[str, float]:
-    camera: Intrinsics = frame.intrinsics
+def camera_entry(camera: Intrinsics, name: str) -> dict[str, float]:
+    """Return the entries of ``transforms.json`` that describe a camera. Raises ``InputError`` for a lens that it lacks."""
     if len(camera.distortion) > len(LENS):
         found = len(camera.distortion)
-        raise InputError(f"frame {frame.name}: lens of {found} coefficients, expected at most {len(LENS)}")
+        raise InputError(f"frame {name}: lens of {found} coefficients, expected at most {len(LENS)}")
     sizes = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
     return {
         **sizes,

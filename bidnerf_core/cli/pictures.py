@@ -1,0 +1,56 @@
+"""Pictures of a localization: the photo beside the map as it is rendered from the pose found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from bidnerf_core.evaluation.figures import blend, overlay, tile
+from bidnerf_core.frames import Frame
+from bidnerf_core.images import reduced
+from bidnerf_core.rendering import render_image
+from bidnerf_core.se3 import SE3
+from bidnerf_core.storage import Map
+
+LARGEST = 320
+"""Pixels of the longer side; larger photos are reduced, since rendering takes time for each pixel."""
+
+
+class Painter:
+    """Draws overlays of one photo with renderings of a map."""
+
+    def __init__(self, map: Map, frame: Frame) -> None:
+        scale = LARGEST / max(frame.intrinsics.width, frame.intrinsics.height)
+        self._map = map
+        self._camera = frame.intrinsics if scale >= 1 else frame.intrinsics.scaled(scale)
+        size = (self._camera.width, self._camera.height)
+        self.observed: Float[Tensor, "h w 3"] = frame.rgb if scale >= 1 else reduced(frame.rgb, *size)
+
+    def rendered(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
+        """Render the map as the photo's camera would see it."""
+        return render_image(self._map.field, self._camera, T_world_camera, self._map.bounds).rgb
+
+    def blended(self, T_world_camera: SE3) -> UInt8[np.ndarray, "h w 3"]:
+        """Return photo and rendering on top of each other, with the edges of each."""
+        return blend(self.observed, self.rendered(T_world_camera))
+
+    def overlay(self, start: SE3 | None, found: SE3) -> UInt8[np.ndarray, "H W 3"]:
+        """Return the photo, the rendering and both blended; below, the same for the start where there is one."""
+        if start is not None:
+            return overlay(self.observed, self.rendered(start), self.rendered(found))
+        return self.row(self.observed, "observed", found, "rendered at the pose found")
+
+    def row(
+        self, left: Float[Tensor, "h w 3"], left_caption: str, found: SE3, caption: str
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """Return an image, the rendering at the pose found, and this blended with the photo, side by side."""
+        rendered = self.rendered(found)
+        tiles: Sequence[tuple[object, str]] = (
+            (left, left_caption),
+            (rendered, caption),
+            (blend(self.observed, rendered), "edges: observed green, found pink"),
+        )
+        return np.concatenate([tile(image, text) for image, text in tiles], axis=1)  # type: ignore[arg-type]

@@ -1,0 +1,253 @@
+"""What ``bidnerf localize`` is asked: photos of the user's own, or frames of a dataset."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+from bidnerf_core.cli.common import UsageError, read_views, require, require_different, say
+from bidnerf_core.datasets import READERS, Dataset, open_dataset
+from bidnerf_core.datasets.colmap import SparsePoints
+from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets.points import read_depth_points
+from bidnerf_core.datasets.transforms import TransformsDataset
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization import window as windowed
+from bidnerf_core.observations import Observations
+from bidnerf_core.photos import DEPTH_STEM, photos_in
+from bidnerf_core.se3 import SE3
+
+NAMED = 5
+"""How many of many files a message names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """An image, or several with known relative poses, of which the last one's pose is sought."""
+
+    name: str
+    views: tuple[View, ...]
+    truth: SE3 | None = None  # T_world_camera, where a dataset has it; used for errors and --perturb alone
+    depth_rays: Observations | None = None
+    file: Path | None = None  # of the last image
+
+    @property
+    def frame(self) -> Frame:
+        """The image whose pose is sought."""
+        return self.views[-1].frame
+
+
+class QuerySource(Protocol):
+    """Queries by name, read one at a time."""
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+    def read(self, place: int) -> Query:
+        """Read a query. Raises ``InputError`` where a file of it is missing or not usable."""
+        ...
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """How photos are read."""
+
+    depth: tuple[Path, ...] = ()
+    camera: Path | None = None
+    focal: float | None = None  # pixels of the image file
+    hfov: float | None = None  # degrees
+    depth_unit: float | None = None  # metres a step
+
+    @property
+    def given(self) -> list[str]:
+        """The options that were given, as they are written."""
+        values = {"--depth": self.depth or None, "--camera": self.camera, "--focal": self.focal,
+                  "--hfov": self.hfov, "--depth-unit": self.depth_unit}  # fmt: skip
+        return [option for option, value in values.items() if value is not None]
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """Which frames of a dataset are queries."""
+
+    split: str = "test"
+    names: tuple[str, ...] = ()  # a rig; none: each frame of the split on its own
+    window: int = 1
+
+    def check(self) -> None:
+        """Raise ``UsageError`` for names and a window that contradict each other."""
+        require_different("--frame", self.names)
+        require("--window", self.window, 1)
+        if self.window > 1 and len(self.names) > 1:
+            raise UsageError(
+                f"--window {self.window} with {len(self.names)} frames, expected one: the last of the window"
+            )
+
+
+@dataclass(frozen=True)
+class DepthPoints:
+    """The argument of ``--depth-points``: a file of points, or a COLMAP model with the points that frames observe."""
+
+    path: Path
+    sparse: SparsePoints | None
+
+    def rays(self, views: Sequence[View], split: str) -> Observations:
+        """Return the measured points as rays in the last camera's frame."""
+        return read_depth_points(self.path) if self.sparse is None else self.sparse.rays(views, split)
+
+
+class Photos:
+    """Image files, each a query."""
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        options: PhotoOptions,
+        background: tuple[float, float, float],
+        points: DepthPoints | None = None,
+    ) -> None:
+        self._files, self._options, self._background, self._points = files, options, background, points
+        self._names = unique_names([(*file.parts[:-1], file.stem) for file in files])
+        self._depth = _depth_files(files, options.depth)
+        self._remarks: set[str] = set()
+
+    @property
+    def names(self) -> Sequence[str]:
+        return self._names
+
+    def read(self, place: int) -> Query:
+        file, options = self._files[place], self._options
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", InputWarning)
+            frame = Frame.open(
+                file, depth=self._depth.get(file), camera=options.camera, focal=options.focal,
+                hfov=options.hfov, depth_unit=options.depth_unit, background=self._background,
+            )  # fmt: skip
+        name = self._names[place]
+        for warning in caught:
+            self._remark(name, str(warning.message).partition(": ")[2] or str(warning.message))
+        self._remark(name, f"{frame.camera_source}")
+        views = (View(replace(frame, name=name), SE3.identity()),)
+        rays = None if self._points is None else self._points.rays(views, "")
+        return Query(name, views, depth_rays=rays, file=file)
+
+    def _remark(self, name: str, text: str) -> None:
+        """Print where a camera comes from, or what was assumed; photos of which the same holds are not repeated."""
+        if text not in self._remarks:
+            self._remarks.add(text)
+            say(f"{name}: {text}")
+
+
+class DatasetFrames:
+    """Frames of a dataset: each frame of a split with the window before it, or one rig."""
+
+    def __init__(self, dataset: Dataset, options: FrameOptions, points: DepthPoints | None = None) -> None:
+        self._dataset, self._split, self._points = dataset, options.split, points
+        listed = dataset.frame_names(options.split)
+        if not listed:
+            raise InputError(f"{dataset.path}: split {options.split!r} has no frames")
+        if options.window > 1:
+            require("--window", options.window, 1, len(listed))
+        asked = [options.names] if options.names else [(name,) for name in listed]
+        self._rigs = [self._with_window(rig, listed, options.window) for rig in asked]
+
+    @property
+    def names(self) -> Sequence[str]:
+        return [rig[-1] for rig in self._rigs]
+
+    def read(self, place: int) -> Query:
+        rig = self._rigs[place]
+        views = tuple(read_views(self._dataset, self._split, rig))
+        file = None
+        if isinstance(self._dataset, TransformsDataset):
+            file = self._dataset.image_file(self._split, views[-1].frame.name)
+        rays = None if self._points is None else self._points.rays(views, self._split)
+        return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, file)
+
+    def _with_window(self, rig: tuple[str, ...], listed: list[str], size: int) -> tuple[str, ...]:
+        if size == 1 or rig[0] not in listed:  # an unknown name is refused when it is read
+            return rig
+        names = windowed(listed, listed.index(rig[0]), size)
+        if len(names) < size:
+            before = f"{names[-1]} has {len(names) - 1} before it in split {self._split!r}"
+            say(f"--window {size}: {before}; a rig of {len(names)}")
+        return names
+
+
+def open_queries(
+    paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float],
+    points: DepthPoints | None,
+) -> QuerySource:  # fmt: skip
+    """Return the queries that QUERY stands for: image files and folders of them, or one dataset.
+
+    Raises ``InputError`` where there is nothing of either kind, and ``UsageError`` for options of the other kind.
+    """
+    datasets = [path for path in paths if path.is_dir() and any(r.recognises(path) for r in READERS)]
+    if frames.names or datasets:
+        return _dataset(paths, photos, frames, background, points)
+    if frames.window > 1:
+        raise UsageError(f"--window {frames.window} needs known relative poses, expected a dataset")
+    files = _photo_files(paths, photos.depth)
+    if points is not None and points.sparse is None and len(files) > 1:
+        raise UsageError(f"{points.path}: points of one camera, but {len(files)} photos; expected one photo")
+    return Photos(files, photos, background, points)
+
+
+def _dataset(
+    paths: Sequence[Path], photos: PhotoOptions, frames: FrameOptions, background: tuple[float, float, float],
+    points: DepthPoints | None,
+) -> QuerySource:  # fmt: skip
+    if len(paths) > 1:
+        raise UsageError(f"{len(paths)} queries with a dataset among them, expected the dataset alone")
+    if photos.given:
+        raise UsageError(
+            f"{photos.given[0]} is for photos, but {paths[0]} is a dataset, which has its own; to take its images as"
+            " photos, name the files"
+        )
+    source = DatasetFrames(open_dataset(paths[0], background), frames, points)
+    if points is not None and points.sparse is None and len(source.names) > 1:
+        raise UsageError(
+            f"{points.path}: points of one camera, but {len(source.names)} frames; name one by --frame"
+        )
+    return source
+
+
+def _photo_files(paths: Sequence[Path], depth: Sequence[Path]) -> list[Path]:
+    """Return the image files among ``paths`` and in folders among them; other files in folders are named and skipped."""
+    files = list[Path]()
+    for path in paths:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        found, others = photos_in(path)
+        others = [file for file in others if file not in depth]
+        if not found:
+            formats = " or ".join(reader.expected for reader in READERS)
+            raise InputError(f"{path}: no photos in it, and no dataset ({formats})")
+        if others:
+            named = ", ".join(file.name for file in others[:NAMED])
+            more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+            say(f"{path}: skipped {named}{more}: not photos by their names")
+        files += found
+    return files
+
+
+def _depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Path]:
+    """Return the depth file of each photo: by name where names agree (``NAME.png``, ``NAME.depth.png``), else in order.
+
+    Raises ``UsageError`` where neither assigns every depth file.
+    """
+    by_stem = {photo.stem: photo for photo in photos}
+    stems = [file.stem.removesuffix(DEPTH_STEM) for file in depth]
+    if len(by_stem) == len(photos) and len(set(stems)) == len(stems) and set(stems) <= set(by_stem):
+        return {by_stem[stem]: file for stem, file in zip(stems, depth, strict=True)}
+    if len(depth) != len(photos):
+        raise UsageError(
+            f"--depth names {len(depth)} files for {len(photos)} photos, expected one for each in their order, or files"
+            " of the same names"
+        )
+    return dict(zip(photos, depth, strict=True))

@@ -1,0 +1,66 @@
+"""The start of ``bidnerf localize``: a pose of a file, the true pose moved, or none."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from bidnerf_core.cli.common import UsageError
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import protocols
+from bidnerf_core.files import open_binary
+from bidnerf_core.localization import pose_from_matrix
+from bidnerf_core.se3 import SE3
+
+EXPECTED = 'expected {"T_world_camera": 4x4 rows}'
+
+
+@dataclass(frozen=True)
+class StartSpec:
+    """A start as the arguments give it: one of the two, or none."""
+
+    fixed: SE3 | None = None  # T_world_camera
+    perturb: tuple[float, float] | None = None  # metres, degrees
+
+    def check(self) -> None:
+        """Raise ``UsageError`` for a perturbation out of range."""
+        if self.perturb is not None:
+            limits = (("T", "metres", protocols.FARTHEST), ("R", "degrees", 180.0))
+            for (what, unit, most), value in zip(limits, self.perturb, strict=True):
+                if not 0 <= value <= most:
+                    raise UsageError(f"--perturb: {what} is {value:g}, expected {unit} from 0 to {most:g}")
+
+    @property
+    def given(self) -> bool:
+        return self.fixed is not None or self.perturb is not None
+
+    def pose(self, truth: SE3 | None, seed: int) -> SE3 | None:
+        """Return T_world_camera to start from. ``seed`` draws the direction in which the true pose is moved."""
+        if self.perturb is None:
+            return self.fixed
+        if truth is None:
+            raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")
+        return protocols.perturb(truth, *self.perturb, seed)
+
+
+def read_pose(path: Path) -> SE3:
+    """Read a 4x4 camera-to-world matrix, alone or under "T_world_camera", as ``localize --json`` prints it.
+
+    Raises ``InputError`` where the file holds no rigid transform by rows.
+    """
+    try:
+        with open_binary(path, "a pose file") as file:
+            found = json.loads(file.read())
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not JSON ({error}), {EXPECTED}") from error
+    rows = found.get("T_world_camera") if isinstance(found, dict) else found
+    try:
+        matrix = torch.tensor(rows, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(f"{path}: no matrix of numbers in it, {EXPECTED}") from error
+    return pose_from_matrix(matrix, f"{path}: T_world_camera")

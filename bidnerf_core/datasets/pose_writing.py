@@ -1,0 +1,111 @@
+"""Files of estimated poses: TUM trajectories, and ``transforms.json`` as nerfstudio reads it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.conversions import rotation_matrix_to_quaternion
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets.writing import OPENCV_TO_OPENGL, camera_entry
+from bidnerf_core.errors import InputError
+from bidnerf_core.exif import read_exif
+from bidnerf_core.files import write_file
+from bidnerf_core.orientation import UPRIGHT, Orientation
+from bidnerf_core.se3 import SE3
+
+TUM_HEAD = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes)\n"
+NUMBER = re.compile(r"\d+(\.\d+)?")
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image with its camera and an estimated pose."""
+
+    name: str
+    number: int  # among the images of the same run, from 0; it is the timestamp where names are not times
+    intrinsics: Intrinsics  # of the upright image
+    T_world_camera: SE3  # OpenCV axes
+    file: Path | None = None
+
+
+def tum_trajectory(images: Sequence[PosedImage]) -> str:
+    """Return rows ``timestamp tx ty tz qx qy qz qw`` (metres, unit quaternions with the scalar last).
+
+    The timestamp is the image's name where all names are numbers, such as those of the TUM RGB-D datasets, else the image's
+    number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
+    """
+    timed = all(NUMBER.fullmatch(image.name) for image in images)
+    rows = (_tum_row(image.name if timed else str(image.number), image.T_world_camera) for image in images)
+    return TUM_HEAD + "".join(rows)
+
+
+def _tum_row(timestamp: str, T_world_camera: SE3) -> str:
+    pose = T_world_camera.to("cpu", torch.float64)
+    w, x, y, z = _quaternion(pose.rotation).tolist()
+    numbers = (*pose.translation.tolist(), x, y, z, w)
+    return " ".join((timestamp, *(f"{number:.12g}" for number in numbers))) + "\n"
+
+
+def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+    """Return the unit quaternion (w, x, y, z) of a rotation with w >= 0."""
+    quaternion = torch.nn.functional.normalize(rotation_matrix_to_quaternion(rotation), dim=-1)
+    return -quaternion if float(quaternion[0]) < 0 else quaternion
+
+
+def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
+    """Return a ``transforms.json`` for ``folder``: poses with OpenGL axes, a camera each, and ``file_path`` relative to it.
+
+    It describes the image files as they are stored, so poses and cameras of photos with an EXIF orientation are turned.
+    Raises ``InputError`` for a photo that is stored as a mirror image, for which no rigid pose exists.
+    """
+    frames = [_transforms_entry(image, folder) for image in images]
+    return json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1, allow_nan=False) + "\n"
+
+
+def _transforms_entry(image: PosedImage, folder: Path) -> dict[str, Any]:
+    orientation = UPRIGHT if image.file is None else read_exif(image.file).orientation
+    intrinsics, pose = _as_stored(image, orientation)
+    matrix = pose.matrix()
+    place = image.name if image.file is None else os.path.relpath(image.file.resolve(), folder.resolve())
+    return {
+        "file_path": Path(place).as_posix(),
+        "transform_matrix": (matrix * matrix.new_tensor(OPENCV_TO_OPENGL)).tolist(),
+        **camera_entry(intrinsics, image.name),
+    }
+
+
+def _as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, SE3]:
+    """Return the camera and the pose (float64) of the image as its file stores it."""
+    pose = image.T_world_camera.to("cpu", torch.float64)
+    if orientation == UPRIGHT:
+        return image.intrinsics, pose
+    # The columns are the stored image's axes in the upright camera's frame.
+    x, y = (-1.0 if flips else 1.0 for flips in (orientation.mirrors_columns, orientation.mirrors_rows))
+    axes = [[0.0, y, 0.0], [x, 0.0, 0.0]] if orientation.transposes else [[x, 0.0, 0.0], [0.0, y, 0.0]]
+    turn = torch.tensor([*axes, [0.0, 0.0, 1.0]], dtype=torch.float64)
+    if float(torch.linalg.det(turn)) < 0:
+        raise InputError(f"{image.file}: is stored as a mirror image, which no transforms.json can describe")
+    inverse = Orientation(orientation.mirrors_columns, orientation.mirrors_rows)
+    if orientation.transposes:
+        inverse = Orientation(orientation.mirrors_rows, orientation.mirrors_columns, True)
+    return image.intrinsics.upright(inverse), pose @ SE3(turn, torch.zeros(3, dtype=torch.float64))
+
+
+def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write ``tum_trajectory``, whole or not at all."""
+    write_file(path, tum_trajectory(images).encode())
+
+
+def write_pose_transforms(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write ``transforms_json``, whole or not at all."""
+    write_file(path, transforms_json(images, path.parent).encode())
