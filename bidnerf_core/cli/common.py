@@ -25,10 +25,8 @@ from bidnerf_core.cli.help_page import Page, without_expert_settings
 from bidnerf_core.cli.text import printable
 from bidnerf_core.errors import InputError
 
-try:
+if sys.platform != "win32":
     import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Dataset
@@ -217,7 +215,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
     Raises ``FolderInUse`` where another process holds it. File systems without locks, and Windows, do without.
     """
-    if fcntl is None:
+    if sys.platform == "win32":
         yield
         return
     number = os.open(folder, os.O_RDONLY)
