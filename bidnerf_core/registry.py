@@ -15,6 +15,7 @@ import importlib.util
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from email import message_from_string
 from functools import reduce
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, distributions
@@ -143,7 +144,9 @@ def _with_rivals(infos: list[BackendInfo]) -> Iterator[BackendInfo]:
 
 def _metadata(dist: AnyDistribution, key: str) -> str | None:
     try:
-        values = dist.metadata.get_all(key)
+        head, _, readme = (dist.read_text("METADATA") or "").partition("\n\n")
+        # A README, which takes nearly all the time of parsing, follows the headers.
+        values = (message_from_string(head) if readme else dist.metadata).get_all(key)
     except Exception:
         return None
     return str(values[0]) if values else None

@@ -71,7 +71,8 @@ def test_a_baked_map_needs_no_start(shared: Path, folder: Path, bidnerf: Run) ->
     points = folder / "points.txt"
     points.write_text("0 0 3\n0.1 0 3\n")
     place = ["localize", folder, data, "--frame", "t_0000", "--no-start"]
-    assert "took the depth of the images instead" in bidnerf(*place, "--depth-points", points)[2]
+    with_points = json.loads(bidnerf(*place, "--depth-points", points, "--json")[1])
+    assert with_points["loss"] != found["loss"]  # they are used beside the image's own depth
     shown = bidnerf("localize", folder, data, "--frame", "t_0000", "--no-start")[1]
     assert "start error  no start" in shown
     assert "one standard deviation" in shown

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 import math
+import os
 import shutil
 import sys
 from collections import Counter
@@ -23,6 +24,9 @@ from rich.text import Text
 from bidnerf_core.cli.help_page import Page, without_expert_settings
 from bidnerf_core.cli.text import printable
 from bidnerf_core.errors import InputError
+
+if sys.platform != "win32":
+    import fcntl
 
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Dataset
@@ -178,23 +182,55 @@ def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None)
         )
 
 
+class FolderInUse(InputError):
+    """Another process writes into the folder."""
+
+
 @contextlib.contextmanager
 def output_folder(out: Path, overwrite: bool) -> Iterator[None]:
-    """Create a folder and make sure, before hours of work, that it can be written.
+    """Create a folder, and check before hours of work that it can be written and that no other process writes into it.
 
-    One that holds something already is left alone unless the user says otherwise. If the work fails before anything is
-    in the folder, it goes away again, with the parents that were made for it.
+    A folder that is not empty is refused unless ``overwrite`` is set. If the work fails before anything is in the folder, it
+    is removed again, with the parents that were made for it. Raises ``InputError``.
     """
     _check_free(out, overwrite)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         _make_writable(out)
-        yield
+        with _locked(out):
+            _check_free(out, overwrite)  # another process may have finished meanwhile
+            yield
+    except FolderInUse:  # the folder is the other's to remove
+        raise
     except BaseException:
         with contextlib.suppress(OSError):  # not empty, or never made
             for folder in made:
                 folder.rmdir()
         raise
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold a lock on a folder, which the system releases even where the process is killed.
+
+    Raises ``FolderInUse`` where another process holds it. File systems without locks, and Windows, do without.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise FolderInUse(
+                f"{folder}: another bidnerf writes into it, expected another --out, or to wait for its end"
+            ) from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(number)
 
 
 def _check_free(out: Path, overwrite: bool) -> None:

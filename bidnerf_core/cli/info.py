@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json
+from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json, show
 from bidnerf_core.field import levels
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import load_map
@@ -16,17 +16,17 @@ def run(arguments: list[str]) -> None:
 
 
 def info(map: MapFolder, json: Annotated[Flag, option(None, "print one JSON object", "")] = False) -> None:
-    """Describe a map; it is loaded whole, so that a damaged one is told here."""
+    """Describe a map. It is loaded whole, so that damage is found here."""
     facts = describe(map)
     if json:
         print_json(facts)
         return
     for key, value in facts.items():
-        print(f"{key + ':':<12} {_shown(value)}")
+        show(f"{key + ':':<12} {_shown(value)}")
 
 
 def describe(folder: Path) -> dict[str, Any]:
-    """What a user may want to know."""
+    """Return what ``bidnerf info`` shows of the map in ``folder``."""
     stored = load_map(folder)
     info = stored.info
     parameters = sum(p.numel() for p in stored.field.parameters())  # type: ignore[attr-defined]

@@ -25,6 +25,7 @@ from bidnerf_core.cli.queries import (
     DepthPoints,
     FrameOptions,
     PhotoOptions,
+    Photos,
     QuerySource,
     open_queries,
 )
@@ -124,6 +125,8 @@ def run(arguments: list[str]) -> None:
         are points, unless a .npz has T_camera_sensor beside them.
         """
         require("--seed", seed, 0, LARGEST_SEED)
+        if frame and not any(frame):
+            raise UsageError("--frame names no frame, expected the stem of an image file")
         photos = PhotoOptions(depth, camera, focal, hfov, depth_unit)
         frames = FrameOptions(split, tuple(name for group in frame for name in group), window)
         output = OutputSpec(out, draw, json)
@@ -138,6 +141,8 @@ def run(arguments: list[str]) -> None:
         stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, choice)
         source = open_queries(query, photos, frames, stored.bounds.background, points)
+        if perturb is not None and isinstance(source, Photos):
+            raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")
         localizer = Localizer(stored, method, config, warm_up=len(source.names) > 1)
         _localize(source, localizer, begin, seed, Answers(stored, output, len(source.names)))
 

@@ -15,7 +15,7 @@ from bidnerf_core.rendering import render_image
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map
 
-LARGEST = 320
+LARGEST = 240
 """Pixels of the longer side; larger photos are reduced, since rendering takes time for each pixel."""
 
 

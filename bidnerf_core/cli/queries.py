@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from bidnerf_core.cli.common import UsageError, read_views, require, require_different, say
 from bidnerf_core.datasets import READERS, Dataset, open_dataset
@@ -41,6 +41,7 @@ class Query:
         return self.views[-1].frame
 
 
+@runtime_checkable
 class QuerySource(Protocol):
     """Queries by name, read one at a time."""
 
@@ -97,7 +98,13 @@ class DepthPoints:
 
     def rays(self, views: Sequence[View], split: str) -> Observations:
         """Return the measured points as rays in the last camera's frame."""
-        return read_depth_points(self.path) if self.sparse is None else self.sparse.rays(views, split)
+        if self.sparse is None:
+            return read_depth_points(self.path)
+        rays = self.sparse.rays(views, split)
+        names = [view.frame.name for view in views]
+        blind = ", ".join(name for name in names if len(self.sparse.seen(name, split)) == 0)
+        say(f"{names[-1]}: {len(rays)} points seen{blind and f', none by {blind}'}")
+        return rays
 
 
 class Photos:

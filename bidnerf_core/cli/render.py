@@ -11,6 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 from kornia.metrics import psnr
+from rich.text import Text
 
 from bidnerf_core.cli.common import (
     DataFolder,
@@ -23,7 +24,9 @@ from bidnerf_core.cli.common import (
     parse,
     read_views,
     say,
+    show,
 )
+from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
@@ -73,19 +76,21 @@ def _render(field: RadianceField, bounds: SceneBounds, views: Sequence[View], ou
     rows = []
     with console.status("") as status:
         for number, view in enumerate(views):
-            status.update(f"rendering {number + 1}/{len(views)}: {view.frame.name}")
+            status.update(Text(printable(f"rendering {number + 1}/{len(views)}: {view.frame.name}")))
             image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds)
             write_images(out, view.frame.name, image)
             rows.append((view.frame.name, *_scores(image, view.frame)))
-            print(f"{rows[-1][0]}  PSNR {rows[-1][1]:.2f} dB  depth error {_metres(rows[-1][2])} m")
+            show(f"{rows[-1][0]}  PSNR {rows[-1][1]:.2f} dB  depth error {_metres(rows[-1][2])} m")
     errors = torch.cat([row[3] for row in rows])
     median = float(errors.median()) if len(errors) else None
-    print(f"mean of {len(rows)}: PSNR {statistics.fmean(row[1] for row in rows):.2f} dB", end="")
-    print(f"; median depth error over all pixels {_metres(median)} m")
+    quality = statistics.fmean(row[1] for row in rows)
+    show(
+        f"mean of {len(rows)}: PSNR {quality:.2f} dB; median depth error over all pixels {_metres(median)} m"
+    )
 
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
-    """``NAME.png`` and ``NAME.depth.png``."""
+    """Write ``NAME.png`` and ``NAME.depth.png``."""
     write_file(out / f"{name}.png", _as_png((image.rgb * 255).round().to(torch.uint8).numpy()))
     if float(image.depth.max()) > DEEPEST:
         say(f"{name}: depth beyond {DEEPEST} m does not fit a 16-bit image of millimetres and is cut off")
@@ -98,7 +103,7 @@ def _as_png(pixels: np.ndarray) -> bytes:
 
 
 def _scores(image: RenderedImage, frame: Frame) -> tuple[float, float | None, torch.Tensor]:
-    """PSNR, median absolute depth error where depth was measured, and those errors."""
+    """Return PSNR, the median absolute depth error where depth was measured, and the errors themselves."""
     quality = float(psnr(image.rgb, frame.rgb, 1.0))
     if frame.depth is None or not frame.has_depth:
         return quality, None, torch.zeros(0)

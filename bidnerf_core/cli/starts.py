@@ -39,10 +39,8 @@ class StartSpec:
 
     def pose(self, truth: SE3 | None, seed: int) -> SE3 | None:
         """Return T_world_camera to start from. ``seed`` draws the direction in which the true pose is moved."""
-        if self.perturb is None:
+        if self.perturb is None or truth is None:
             return self.fixed
-        if truth is None:
-            raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")
         return protocols.perturb(truth, *self.perturb, seed)
 
 

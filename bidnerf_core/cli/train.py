@@ -39,7 +39,7 @@ from bidnerf_core.training import TrainingStopped
 
 @dataclass(frozen=True)
 class Source:
-    """What the user says of where the views come from."""
+    """Where the views come from, as the arguments say."""
 
     data: Path
     split: str
@@ -48,7 +48,7 @@ class Source:
     choice: SparseChoice
 
     def views(self, dataset: Dataset) -> tuple[list[View], int]:
-        """Views of the split, and how many pixels of them have their depth from points."""
+        """Return the views of the split, and how many pixels of them have their depth from points."""
         plain = read_views(dataset, self.split)
         if self.depth_points is None:
             return plain, 0
@@ -67,7 +67,7 @@ class Source:
 
 
 def run(arguments: list[str]) -> None:
-    """Parse with the options of the backend that the arguments name."""
+    """Parse with the options of the backend that the arguments name, and train."""
     named = value_of("--backend", arguments)
     resumed = None if named else _resumed_map(arguments)
     name = named or (resumed[1].backend if resumed else DEFAULT_BACKEND)
@@ -82,23 +82,24 @@ def run(arguments: list[str]) -> None:
         background: Annotated[
             str | None, option("COLOUR", "white or black, under images with alpha", "as the dataset has it")
         ] = None,
-        resume: Annotated[Flag, option(None, "go on with the interrupted training in --out", "")] = False,
+        resume: Annotated[Flag, option(None, "continue the interrupted training in --out", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace the map in --out", "")] = False,
         checkpoint_every: Annotated[
-            float, option("SECONDS", "how much work an interruption may cost")
+            float, option("SECONDS", "save so often; at most this much work is lost if the program is killed")
         ] = CHECKPOINT_SECONDS,
         depth_points: Annotated[
             Path | None,
             option("MODEL", "COLMAP sparse model: its points are the depth of images that have none", ""),
         ] = None,
-        no_bake: Annotated[Flag, option(None, "do without the surface; 'bidnerf bake' adds it", "")] = False,
+        no_bake: Annotated[Flag, option(None, "leave the surface to 'bidnerf bake'", "")] = False,
         choice: SparseChoice = SparseChoice(),
         config: Any = kind(),
     ) -> None:
         """Make a map of a dataset.
 
-        Ctrl-C stops after a step and keeps what is there; --resume goes on from it, or from the last checkpoint if the
-        program was killed, and arrives where an uninterrupted training would have.
+        Ctrl-C stops after a step and saves the map; --resume continues from there, or from the last checkpoint if the
+        program was killed, with the same result as an uninterrupted training. It also bakes a map that is trained but not
+        baked.
         """
         require("--checkpoint-every", checkpoint_every, 0)
         if resume and overwrite:
@@ -109,9 +110,10 @@ def run(arguments: list[str]) -> None:
         source = Source(data, split, background, depth_points, choice)
         try:
             if resume:
-                info = load_interrupted(out)
+                info = load_interrupted(out, not no_bake)
                 _check_unchanged(out, info, named, kind(), config)
-                _resume(info, source, out, checkpoint_every, not no_bake)
+                with output_folder(out, overwrite=True):
+                    _resume(info, source, out, checkpoint_every, not no_bake)
             else:
                 with output_folder(out, overwrite):
                     _start(chosen, name, source, out, config, checkpoint_every, not no_bake)
@@ -128,40 +130,43 @@ def train_map(
     background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS, baked: bool = True,
     sparse_depth: int = 0,
 ) -> None:  # fmt: skip
-    """A new map in folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
+    """Train a new map into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
     bounds = estimate_bounds(views, background)
     settings = to_plain(config, "config")
     info = MapInfo(
         name, settings, bounds, 0, False, data, cameras=stored_cameras(views), sparse_depth=sparse_depth
     )
-    with output_folder(out, overwrite=True):
-        _run(backend, info, out, views, checkpoint_seconds, baked)
+    _run(backend, info, out, views, checkpoint_seconds, baked)
 
 
-def load_interrupted(out: Path) -> MapInfo:
-    """The description of the map in ``out``, whose training did not come to its end."""
+def load_interrupted(out: Path, baking: bool) -> MapInfo:
+    """Return the description of the map in ``out``, of which the training or, with ``baking``, the surface is not complete.
+
+    Raises ``InputError`` where there is nothing left to do.
+    """
     try:
         info = load_info(out)
     except InputError as error:
         raise InputError(f"{error}; nothing to resume, train without --resume") from error
-    if info.complete:
-        raise InputError(f"{out}: training is complete ({info.step} steps), nothing to resume")
+    if info.complete and not (baking and info.surface is None):
+        baked = " and baked" if info.surface is not None else ""
+        raise InputError(f"{out}: training is complete ({info.step} steps){baked}, nothing to resume")
     return info
 
 
 def _resumed_map(arguments: list[str]) -> tuple[Path, MapInfo] | None:
-    """The map that is to be resumed, if it can be known already."""
+    """Return the map that is to be resumed, where the arguments name one that can be read."""
     out = value_of("--out", arguments)
     if "--resume" not in arguments or out is None:
         return None
     try:
         return Path(out), load_info(Path(out))
-    except InputError:  # told later, if the arguments are otherwise right
+    except InputError:  # reported later, if the arguments are otherwise right
         return None
 
 
 def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any, config: Any) -> None:
-    """A training goes on as it began: settings that would be ignored are refused."""
+    """Raise ``UsageError`` for settings that differ from those of the interrupted training, which would be ignored."""
     if backend not in (None, info.backend):
         raise UsageError(f"{out}: is of backend {info.backend!r}, cannot resume it with {backend!r}")
     stored, given, usual = info.config, to_plain(config), to_plain(default)
@@ -203,8 +208,11 @@ def _resume(
             f"{out}: was begun with the depth of {info.sparse_depth} pixels from points, got {sparse_depth}; "
             "--resume keeps --depth-points and what goes with it"
         )
-    with output_folder(out, overwrite=True):
-        _run(load_backend(info.backend, str(out)), info, out, views, checkpoint_seconds, baked)
+    if info.complete:  # stopped between training and baking
+        say(f"{out}: training is complete ({info.step} steps); baking its surface")
+        bake_map(out, views, BakeConfig())
+        return
+    _run(load_backend(info.backend, str(out)), info, out, views, checkpoint_seconds, baked)
 
 
 def _run(

@@ -1,0 +1,83 @@
+"""Files of poses: what is written is what the readers and scipy make of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets.pose_writing import PosedImage, tum_trajectory, write_pose_transforms, write_tum
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame
+from bidnerf_core.se3 import SE3
+from photo_files import noise, write_photo
+
+CAMERA = Intrinsics(20.0, 21.0, 7.0, 5.5, 16, 12, (0.01, -0.02, 0.003, 0.004))
+
+
+def poses(count: int) -> list[SE3]:
+    generator = torch.Generator().manual_seed(3)
+    tangents = torch.randn((count, 6), generator=generator, dtype=torch.float64)
+    half_turn = SE3.exp(torch.tensor([1.0, 2.0, 3.0, torch.pi, 0.0, 0.0], dtype=torch.float64))
+    return [SE3.identity().to("cpu", torch.float64), half_turn, *(SE3.exp(tangent) for tangent in tangents)]
+
+
+def images(names: list[str]) -> list[PosedImage]:
+    return [
+        PosedImage(name, number, CAMERA, pose)
+        for number, (name, pose) in enumerate(zip(names, poses(len(names) - 2), strict=True))
+    ]
+
+
+def test_a_tum_trajectory_is_what_scipy_reads(tmp_path: Path) -> None:
+    written = images([f"r_{i}" for i in range(12)])
+    write_tum(tmp_path / "poses.txt", written)
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    assert rows[:, 0].tolist() == list(range(12))
+    for row, image in zip(rows, written, strict=True):
+        np.testing.assert_allclose(row[1:4], image.T_world_camera.translation, atol=1e-10)
+        matrix = Rotation.from_quat(row[4:]).as_matrix()  # x y z w
+        np.testing.assert_allclose(matrix, image.T_world_camera.rotation, atol=1e-10)
+    assert np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1)
+
+
+def test_names_that_are_times_are_the_timestamps() -> None:
+    text = tum_trajectory(images(["1305031102.175304", "1305031102.211214"]))
+    assert [line.split()[0] for line in text.splitlines()[1:]] == ["1305031102.175304", "1305031102.211214"]
+    assert tum_trajectory(images(["7", "x"])).splitlines()[1].startswith("0 ")
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_reader_finds_the_poses_and_cameras_again(orientation: int, tmp_path: Path) -> None:
+    """Photos are read upright, but ``transforms.json`` describes their files as stored: both see each point alike."""
+    stored = noise(12, 16)
+    file = write_photo(tmp_path / "photos" / "one.png", stored, orientation)
+    upright = Frame.open(file, camera=CAMERA)
+    T_world_camera = poses(1)[2]
+    (tmp_path / "out").mkdir()
+    write_pose_transforms(
+        tmp_path / "out" / "transforms.json",
+        [PosedImage("one", 0, upright.intrinsics, T_world_camera, file)],
+    )
+    (view,) = open_dataset(tmp_path / "out").views("test")
+    assert torch.equal(view.frame.rgb, torch.from_numpy(stored) / 255)
+    point = T_world_camera.apply(torch.tensor([0.2, -0.1, 1.5], dtype=torch.float64))
+    here, there = (
+        frame.intrinsics.project(pose.inverse().apply(point)).floor().long().tolist()
+        for frame, pose in ((upright, T_world_camera), (view.frame, view.T_ref_camera))
+    )
+    assert torch.equal(upright.rgb[here[1], here[0]], view.frame.rgb[there[1], there[0]])
+    assert view.frame.intrinsics.distortion == pytest.approx(CAMERA.distortion)
+
+
+def test_a_mirror_image_has_no_pose(tmp_path: Path) -> None:
+    file = write_photo(tmp_path / "one.png", noise(12, 16), 2)
+    mirrored = PosedImage("one", 0, CAMERA, SE3.identity(), file)
+    with pytest.raises(InputError, match="mirror image"):
+        write_pose_transforms(tmp_path / "transforms.json", [mirrored])
+    assert not (tmp_path / "transforms.json").exists()
