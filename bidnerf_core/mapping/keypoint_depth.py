@@ -1,0 +1,99 @@
+"""Points placed by the depth that was measured at their keypoints."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.frames import Frame
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping.triangulation import Sightings
+
+EDGE = 0.05
+"""Share of the depth by which it may change about a keypoint; with more, it lies on the edge of something."""
+HEARD = 6
+"""Pixels of the nine about a keypoint that must have measured depth."""
+DEFAULT_NOISE = 0.01
+"""Share of the depth: its standard deviation where nothing tells of it."""
+ENOUGH = 30
+"""Triangulated observations with depth from which on its noise is estimated."""
+APART = 3.0
+"""Standard deviations from the mean of its track beyond which a depth does not count."""
+
+
+def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+    """Median of the depth of the 3x3 pixels about each of ``pixels`` (u, v), metres; 0 at edges and where too little was
+    measured.
+    """
+    if frame.depth is None or not len(pixels):
+        return torch.zeros(len(pixels), dtype=torch.float64)
+    depth = frame.depth.detach().cpu().double()
+    height, width = depth.shape
+    u, v = pixels.floor().long().unbind(-1)
+    step = torch.tensor([-1, 0, 1])
+    rows = (v[:, None, None] + step[:, None]).clamp(0, height - 1)
+    columns = (u[:, None, None] + step).clamp(0, width - 1)
+    around = depth[rows, columns].flatten(1)
+    around = torch.where(around.isfinite() & (around > 0), around, torch.nan)
+    median = around.nanmedian(dim=1).values
+    known = around.isfinite()
+    low = torch.where(known, around, torch.inf).amin(1)
+    high = torch.where(known, around, 0).amax(1)
+    flat = (known.sum(1) >= HEARD) & (high - low <= EDGE * median)
+    return torch.where(flat, median, 0)
+
+
+def depth_noise(sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]) -> float:
+    """Standard deviation of measured depth as a share of it, robustly, from points that were triangulated."""
+    known = depth > 0
+    if int(known.sum()) < ENOUGH:
+        return DEFAULT_NOISE
+    off = depth[known] / sightings.in_camera(points)[known, 2] - 1
+    return max(1e-4, 1.4826 * float(off.abs().median()))
+
+
+def placed(
+    observations: TrackedKeypoints, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
+) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """Weighted mean of the back-projected points of each track without those that disagree, and its covariance.
+
+    ``depth`` is what was measured at each observation, 0 where nothing was; ``relative`` its noise as a share.
+    Tracks most of whose depths disagree are dropped.
+    """
+    observations, _ = observations[depth > 0].compacted()
+    sightings, depth = observations.sightings, depth[depth > 0]
+    ray = torch.cat([sightings.image, torch.ones_like(sightings.image[:, :1])], dim=-1) * depth[:, None]
+    world = (sightings.rotation.mT @ ray[..., None])[..., 0] + sightings.centre
+    information = _information(sightings, depth, relative, pixel_noise)
+    mean, _ = _weighted(world, information, observations.point)
+    off = (world - mean[observations.point])[..., None]
+    agree = (off.mT @ information @ off)[:, 0, 0] <= APART**2
+    tracks = torch.bincount(observations.point)
+    majority = 2 * torch.bincount(observations.point[agree], minlength=len(tracks)) > tracks
+    kept = agree & majority[observations.point]
+    observations, _ = observations[kept].compacted()
+    return observations, *_weighted(world[kept], information[kept], observations.point)
+
+
+def _information(
+    sightings: Sightings, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
+) -> Float[Tensor, "m 3 3"]:
+    """Inverse covariance of back-projected points: of the depth along the ray, of the keypoint across it."""
+    d = sightings.directions()
+    along = d[:, :, None] * d[:, None]
+    across = torch.eye(3, dtype=d.dtype) - along
+    sideways = (pixel_noise * depth / sightings.focal) ** -2
+    return along * ((relative * depth) ** -2)[:, None, None] + across * sideways[:, None, None]
+
+
+def _weighted(
+    values: Float[Tensor, "m 3"], information: Float[Tensor, "m 3 3"], point: Int[Tensor, "m"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """Weighted mean by point, and its covariance."""
+    count = int(point.max()) + 1 if len(point) else 0
+    total = torch.zeros((count, 3, 3), dtype=values.dtype).index_add_(0, point, information)
+    weighted = (information @ values[..., None])[..., 0]
+    summed = torch.zeros((count, 3), dtype=values.dtype).index_add_(0, point, weighted)
+    covariance = torch.linalg.inv(total)
+    return (covariance @ summed[..., None])[..., 0], covariance

@@ -1,0 +1,178 @@
+"""Building landmarks: keypoints of posed images, matched, joined into tracks, and triangulated or placed by depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from math import radians
+from typing import TypeVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+from bidnerf_core.mapping.features import Features, Sift
+from bidnerf_core.mapping.keypoint_depth import depth_noise, measured_depth, placed
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused
+from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
+from bidnerf_core.mapping.pose_scatter import pose_scatter
+from bidnerf_core.mapping.tracks import PosedKeypoints, epipolar_matches, joined
+from bidnerf_core.mapping.triangulation import (
+    Sightings,
+    fitting,
+    intersected,
+    noise,
+    observations_per_point,
+    parallax,
+    refined,
+)
+from bidnerf_core.mapping.view_pairs import likely_pairs
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+SIFT = Sift()
+TOLERANCES = (10.0, 4.0, 2.0)
+"""Pixels from the projection beyond which an observation leaves its track, round by round."""
+TWO_VIEWS = 1.5
+"""Pixels, where only two images testify."""
+
+
+@dataclass(frozen=True)
+class LandmarkConfig:
+    """How landmarks are built."""
+
+    neighbours: int = 8  # images that each image is matched with
+    parallax: float = 2.0  # degrees between the rays, at least; with less, measured depth places a point
+    singles: bool = (
+        True  # whether keypoints of a single image become landmarks where their depth was measured
+    )
+    most: int = 200_000  # landmarks; 168 bytes each with SIFT
+
+    def __post_init__(self) -> None:
+        for name, least, most in (("neighbours", 1, 1000), ("most", 1, 10**8)):
+            if not least <= getattr(self, name) <= most:
+                raise InputError(f"{name} is {getattr(self, name)}, expected {least} to {most}")
+        if not 0 < self.parallax < 90:
+            raise InputError(f"parallax is {self.parallax} degrees, expected more than 0 and less than 90")
+
+
+def build_landmarks(
+    views: Sequence[View],
+    features: Features = SIFT,
+    config: LandmarkConfig = LandmarkConfig(),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    report: Callable[[str], None] = lambda sentence: None,
+) -> LandmarkMap:
+    """Build landmarks from ``views``, whose poses are those of the world; their depth is used where there is any.
+
+    ``progress`` gets the images and pairs of images that are done, and how many there are; ``report`` a sentence where
+    landmarks had to be dropped. Raises ``InputError`` where not one landmark was found.
+    """
+    if not views:
+        raise InputError("nothing to build landmarks from: expected at least one view")
+    pairs = likely_pairs(views, config.neighbours).tolist() if len(views) > 1 else []
+    counter = _Counter(progress, len(views) + len(pairs))
+    images = counter.over(_mapped(lambda view: _detected(view, features), views))
+    matches = counter.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
+    label = joined(
+        [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)], [len(p.keypoints) for p in images]
+    )
+    observations = TrackedKeypoints(images, label, torch.arange(len(label)))
+    depth = torch.cat(
+        [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
+    )
+    found = _located(observations, depth, config)
+    if not len(found):
+        raise InputError(
+            f"no landmark found in {len(views)} images: expected texture that several images show from different places"
+        )
+    return _bounded(found, config.most, report)
+
+
+def _detected(view: View, features: Features) -> PosedKeypoints:
+    intrinsics = view.frame.intrinsics
+    keypoints = features(view.frame.rgb)
+    rays = intrinsics.unproject(keypoints.pixels.double())
+    focal = (intrinsics.fx * intrinsics.fy) ** 0.5
+    return PosedKeypoints(keypoints, rays, focal, view.T_ref_camera.to("cpu", torch.float64))
+
+
+def _located(
+    observations: TrackedKeypoints, depth: Float[Tensor, "m"], config: LandmarkConfig
+) -> LandmarkMap:
+    """Landmarks that are triangulated; then those placed by depth, of the keypoints that are left."""
+    tracked = torch.bincount(observations.point)[observations.point] > 1
+    kept, positions, covariance = _triangulated(observations[tracked], radians(config.parallax))
+    sightings = kept.sightings
+    pixel_noise = noise(sightings, positions)
+    triangulated = replace(
+        fused(kept, positions, pixel_noise**2 * covariance, pixel_noise),
+        pose_covariance=pose_scatter(kept, positions, pixel_noise),
+    )
+    relative = depth_noise(sightings, positions, depth[kept.number])
+    left = torch.ones_like(tracked).index_fill_(0, kept.number, False)
+    left &= tracked | config.singles
+    rest, positions, covariance = placed(observations[left], depth[left], relative, pixel_noise)
+    return concatenated([triangulated, fused(rest, positions, covariance, pixel_noise)])
+
+
+def _triangulated(
+    observations: TrackedKeypoints, least: float
+) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """TrackedKeypoints that agree, the points they show, and the points' covariance for a noise of one pixel.
+
+    ``least`` is the parallax (radians) that a point needs.
+    """
+    observations, _ = observations.compacted()
+    count = observations.count
+    points = intersected(observations.sightings, count)
+    covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
+    for tolerance in TOLERANCES:
+        points, covariance = refined(observations.sightings, points, tolerance / 2)
+        observations = observations[_believable(observations.sightings, points, tolerance)]
+    wide = parallax(observations.sightings, points) >= least
+    observations, numbers = observations[wide[observations.point]].compacted()
+    return observations, points[numbers], covariance[numbers]
+
+
+def _believable(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
+    """TrackedKeypoints that fit, of points that fit in at least two images."""
+    fit = fitting(sightings, points, tolerance)
+    seen = observations_per_point(sightings[fit], len(points))
+    pairs = seen[sightings.point] == 2
+    fit &= ~pairs | fitting(sightings, points, min(tolerance, TWO_VIEWS))
+    return fit & (observations_per_point(sightings[fit], len(points)) >= 2)[sightings.point]
+
+
+def _bounded(landmarks: LandmarkMap, most: int, report: Callable[[str], None]) -> LandmarkMap:
+    """At most ``most`` landmarks: those that the most images saw."""
+    if len(landmarks) <= most:
+        return landmarks
+    report(f"{len(landmarks)} landmarks found, {most} kept: those that the most images show")
+    order = landmarks.views.argsort(descending=True, stable=True)[:most]
+    return landmarks[order.sort().values]
+
+
+def _mapped(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """Results in the order of ``items``, made by as many threads as torch has been given."""
+    with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
+        yield from pool.map(work, items)
+
+
+class _Counter:
+    """Counts what is done in several loops towards one total."""
+
+    def __init__(self, progress: Callable[[int, int], None], total: int) -> None:
+        self._progress, self._total, self._done = progress, total, 0
+
+    def over(self, results: Iterable[Result]) -> list[Result]:
+        found = []
+        for result in results:
+            self._done += 1
+            self._progress(self._done, self._total)
+            found.append(result)
+        return found

@@ -1,0 +1,115 @@
+"""One landmark from the keypoints that show it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.tracks import PosedKeypoints
+from bidnerf_core.mapping.triangulation import Sightings
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedKeypoints:
+    """Keypoints and the points that they show; the keypoints of all images, image by image, have one numbering."""
+
+    images: Sequence[PosedKeypoints]
+    point: Int[Tensor, "m"]
+    number: Int[Tensor, "m"]  # of the keypoint
+
+    def __getitem__(self, index: Tensor) -> TrackedKeypoints:
+        return TrackedKeypoints(self.images, self.point[index], self.number[index])
+
+    def compacted(self) -> tuple[TrackedKeypoints, Int[Tensor, "n"]]:
+        """Number the points that are left from 0; also returns their numbers of before."""
+        found, point = self.point.unique(return_inverse=True)
+        return TrackedKeypoints(self.images, point, self.number), found
+
+    @property
+    def count(self) -> int:
+        """How many points there are."""
+        return int(self.point.max()) + 1 if len(self.point) else 0
+
+    @property
+    def image(self) -> Int[Tensor, "m"]:
+        last = torch.tensor([len(image.keypoints) for image in self.images]).cumsum(0)
+        return torch.searchsorted(last, self.number, right=True)
+
+    @property
+    def sightings(self) -> Sightings:
+        image = self.image
+        rotation = torch.stack([p.T_world_camera.rotation.mT for p in self.images])
+        centre = torch.stack([p.T_world_camera.translation for p in self.images])
+        focal = torch.tensor([p.focal for p in self.images], dtype=torch.float64)
+        rays = torch.cat([p.rays for p in self.images])[self.number]
+        return Sightings(self.point, rotation[image], centre[image], rays[:, :2], focal[image])
+
+    @property
+    def sizes(self) -> Float[Tensor, "m"]:
+        """Pixels: diameters of the keypoints."""
+        return torch.cat([p.keypoints.sizes for p in self.images])[self.number]
+
+    @property
+    def descriptors(self) -> UInt8[Tensor, "m d"]:
+        return torch.cat([p.keypoints.descriptors for p in self.images])[self.number]
+
+
+def fused(
+    observations: TrackedKeypoints,
+    positions: Float[Tensor, "n 3"],
+    covariance: Float[Tensor, "n 3 3"],
+    noise: float,
+) -> LandmarkMap:
+    """Landmarks at ``positions`` (metres, world) with their covariance; every one of them has an observation.
+
+    Their images are taken to be where they are said to be.
+    """
+    count, sightings = len(positions), observations.sightings
+    away = sightings.centre - positions[sightings.point]
+    towards = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
+    mean = _mean(towards, sightings.point, count)
+    directions = mean / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-300)
+    cosine = (towards * directions[sightings.point]).sum(-1).clamp(-1, 1)
+    least = torch.ones(count, dtype=cosine.dtype).scatter_reduce(0, sightings.point, cosine, "amin")
+    metres = observations.sizes * sightings.in_camera(positions)[:, 2].clamp(min=0) / sightings.focal
+    return LandmarkMap(
+        positions.float(),
+        _across_and_along(covariance, directions).float(),
+        _mean_descriptors(observations.descriptors, sightings.point, count),
+        directions.float(),
+        least.acos().float(),
+        _mean(metres[:, None], sightings.point, count)[:, 0].float(),
+        torch.bincount(sightings.point, minlength=count).int(),
+        noise,
+        torch.zeros((6, 6), dtype=torch.float64),
+    )
+
+
+def _across_and_along(
+    covariance: Float[Tensor, "n 3 3"], directions: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 2"]:
+    """Standard deviations: the mean one across a direction, and the one along it."""
+    along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
+    across = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along) / 2
+    return torch.stack([across, along], dim=-1).clamp(min=0).sqrt()
+
+
+def _mean_descriptors(
+    descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int
+) -> UInt8[Tensor, "n d"]:
+    """Means, brought to the mean length of the descriptors: a mean is shorter, hence nearer to any other descriptor."""
+    values = descriptors.float()
+    mean = _mean(values, point, count)
+    length = _mean(torch.linalg.vector_norm(values, dim=-1, keepdim=True), point, count)
+    scaled = mean * length / torch.linalg.vector_norm(mean, dim=-1, keepdim=True).clamp(min=1e-9)
+    return scaled.round().clamp(0, 255).to(torch.uint8)
+
+
+def _mean(values: Float[Tensor, "m c"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n c"]:
+    total = torch.zeros((count, values.shape[1]), dtype=values.dtype).index_add_(0, index, values)
+    return total / torch.bincount(index, minlength=count).clamp(min=1)[:, None]

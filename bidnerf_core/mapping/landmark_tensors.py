@@ -1,0 +1,74 @@
+"""Landmarks as named tensors, for storage, and back."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.mapping.landmarks import PER_LANDMARK, LandmarkMap
+
+KINDS = {
+    "positions": ((-1, 3), torch.float32),
+    "deviations": ((-1, 2), torch.float32),
+    "descriptors": ((-1, -1), torch.uint8),
+    "directions": ((-1, 3), torch.float32),
+    "cones": ((-1,), torch.float32),
+    "sizes": ((-1,), torch.float32),
+    "views": ((-1,), torch.int32),
+    "noise": ((), torch.float64),
+    "pose_covariance": ((6, 6), torch.float64),
+}
+"""Shape, -1 for any length, and dtype."""
+
+
+def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
+    """Return copies of the parts of ``landmarks`` by name."""
+    found = {name: torch.as_tensor(getattr(landmarks, name), dtype=kind) for name, (_, kind) in KINDS.items()}
+    return {name: value.contiguous().clone() for name, value in found.items()}
+
+
+def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
+    """Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, kind or content."""
+    for name, (shape, kind) in KINDS.items():
+        value = tensors[name]
+        fits = value.dim() == len(shape) and all(
+            a in (-1, b) for a, b in zip(shape, value.shape, strict=True)
+        )
+        if not fits or value.dtype != kind:
+            raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, expected {kind} {list(shape)}")
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise ValueError(f"{name} holds NaN or infinity")
+    _check_contents(tensors)
+    parts: dict[str, Any] = {name: tensors[name] for name in KINDS}
+    return LandmarkMap(**parts | {"noise": float(tensors["noise"])})
+
+
+def _check_contents(tensors: dict[str, Tensor]) -> None:
+    count = len(tensors["positions"])
+    for name in PER_LANDMARK:
+        if len(tensors[name]) != count:
+            raise ValueError(f"{name} has {len(tensors[name])} landmarks, positions has {count}")
+    if not tensors["descriptors"].shape[1]:
+        raise ValueError("descriptors have no channels")
+    if not float(tensors["noise"]) > 0:
+        raise ValueError(f"noise is {float(tensors['noise'])}, expected a positive number of pixels")
+    for name, least, most in (
+        ("deviations", 0.0, math.inf),
+        ("sizes", 0.0, math.inf),
+        ("cones", 0.0, math.pi + 1e-6),
+        ("views", 1, 2**31),
+    ):
+        value = tensors[name]
+        if count and not (float(value.min()) >= least and float(value.max()) <= most):
+            raise ValueError(
+                f"{name} is {float(value.min())} to {float(value.max())}, expected {least} to {most}"
+            )
+    covariance = tensors["pose_covariance"]
+    if float((covariance - covariance.mT).abs().max()) > 0 or float(torch.linalg.eigvalsh(covariance)[0]) < 0:
+        raise ValueError("pose_covariance is not symmetric and positive semidefinite")
+    length = torch.linalg.vector_norm(tensors["directions"], dim=-1)
+    if count and float((length - 1).abs().max()) > 1e-3:
+        raise ValueError("directions are not of unit length")

@@ -1,0 +1,47 @@
+"""Landmarks: points of the scene that are recognised by their look, and where they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMap:
+    """Points of the world frame (metres) with descriptors, on the CPU."""
+
+    positions: Float[Tensor, "n 3"]
+    deviations: Float[Tensor, "n 2"]  # metres: standard deviation across and along ``directions``
+    descriptors: UInt8[Tensor, "n d"]  # mean over the views; see ``mapping.features``
+    directions: Float[Tensor, "n 3"]  # unit, from the landmark towards the middle of the cameras that saw it
+    cones: Float[Tensor, "n"]  # radians: greatest angle between ``directions`` and such a camera
+    sizes: Float[Tensor, "n"]  # metres: diameter of the keypoint, measured at its distance
+    views: Int[Tensor, "n"]  # how many images saw it, int32
+    noise: float  # pixels: standard deviation of a keypoint along each axis, in the images of the map
+    # How the poses of those images scatter about what the landmarks say, as right updates (translation in metres
+    # first). A pose found by landmarks differs from one that the same source of poses would give by as much.
+    pose_covariance: Float[Tensor, "6 6"]  # float64
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, index: Tensor) -> LandmarkMap:
+        return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
+
+    @property
+    def megabytes(self) -> float:
+        """Size of the tensors, 10^6 bytes."""
+        parts = [getattr(self, name) for name in PER_LANDMARK]
+        return sum(part.numel() * part.element_size() for part in parts) / 1e6
+
+
+PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones", "sizes", "views")
+"""The parts of a map that have a row for each landmark."""
+
+
+def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
+    """All landmarks of ``maps``, which have descriptors of one length; what else there is comes from the first one."""
+    return replace(maps[0], **{name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK})

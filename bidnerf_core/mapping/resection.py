@@ -1,0 +1,198 @@
+"""Resection: the pose of a camera or a rig from points that it sees, by robust Levenberg-Marquardt in pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.se3 import SE3, skew
+
+STEPS = 20
+"""At most; a good start takes four or five."""
+FIRM = 1e-6
+"""Squared step (in standard deviations of the pose) under which nothing changes any more."""
+SETTLED = 0.01
+"""Change of the noise (as a share) under which it counts as found."""
+LEAST_NOISE = 0.05
+"""Pixels: no detector is more exact."""
+SCALE = 2.0
+"""Standard deviations at which Cauchy's loss halves a residual's weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedPoints:
+    """Points of the world and where the cameras of a rig saw them. Float64."""
+
+    points: Float[Tensor, "m 3"]  # metres, world
+    deviations: Float[Tensor, "m 2"]  # metres, of the points, across and along ``directions``
+    directions: Float[Tensor, "m 3"]  # unit, world
+    image: Float[Tensor, "m 2"]  # observed, on the plane z = 1 of the camera
+    focal: Float[Tensor, "m"]  # pixels
+    depth: Float[Tensor, "m"]  # metres, 0 where none was measured
+    rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
+    translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: Tensor) -> ObservedPoints:
+        return ObservedPoints(*(getattr(self, name)[index] for name in (f.name for f in fields(self))))
+
+    def with_focal(self, factor: float) -> ObservedPoints:
+        """The same pixels in cameras whose focal lengths are ``factor`` times those that were given."""
+        return replace(self, image=self.image / factor, focal=self.focal * factor)
+
+    def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
+        """The points in the frame of the camera that shows them."""
+        rig = T_world_rig.inverse().apply(self.points)
+        return (self.rotation @ rig[..., None])[..., 0] + self.translation
+
+    def residuals(self, T_world_rig: SE3) -> Float[Tensor, "m 2"]:
+        """Projection less observation, pixels; infinite for points behind the camera."""
+        local = self.in_camera(T_world_rig)
+        z = local[:, 2:]
+        off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
+        return torch.where(z > 0, off, torch.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class ReprojectionFit:
+    """A pose (and, where it was sought, a factor of the focal length) with its uncertainty."""
+
+    T_world_rig: SE3
+    focal_factor: float  # true focal length as a multiple of the given one; 1 where it was not sought
+    noise: float  # pixels: standard deviation of a residual along each axis, robustly
+    covariance: Float[
+        Tensor, "p p"
+    ]  # of the right update (translation, rotation) and of the logarithm of the factor
+
+
+def fit(
+    data: ObservedPoints, start: SE3, noise: float, free_focal: bool = False, focal_factor: float = 1.0
+) -> ReprojectionFit:
+    """Minimize Cauchy's loss of the residuals in standard deviations; those of the landmarks count too.
+
+    ``noise`` is a first guess (pixels). It is estimated anew after every step, so that the answer does not depend on it.
+    """
+    T, log_factor, damping = start, torch.tensor(focal_factor, dtype=torch.float64).log(), 1e-4
+    system = _linearized(data, T, log_factor, noise, free_focal)
+    for _ in range(STEPS):
+        step = -_solved(system.hessian, damping, system.gradient)
+        T_new = T.retract(step[:6]).normalized()
+        factor_new = log_factor + step[6] if free_focal else log_factor
+        tried = _linearized(data, T_new, factor_new, noise, free_focal)
+        if tried.cost <= system.cost:
+            size = float(step @ system.hessian @ step)
+            T, log_factor, damping, system = T_new, factor_new, max(1e-10, damping / 10), tried
+            better = max(LEAST_NOISE, noise * system.spread)
+            settled = abs(better / noise - 1) < SETTLED
+            if not settled:
+                noise = better
+                system = _linearized(data, T, log_factor, noise, free_focal)
+            elif size < FIRM:
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    covariance = _sandwich(system)
+    return ReprojectionFit(T, float(log_factor.exp()), noise, covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    cost: float
+    gradient: Float[Tensor, "p"]
+    hessian: Float[Tensor, "p p"]
+    curvature: Float[
+        Tensor, "p p"
+    ]  # of the robust cost itself, where the Hessian is that of its reweighted squares
+    scatter: Float[Tensor, "p p"]  # of the single gradients
+    spread: float  # residuals in standard deviations, robustly: 1 where the noise is right
+
+
+def _linearized(data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, free_focal: bool) -> _System:
+    """Residuals and derivatives at ``T``, in standard deviations."""
+    local = data.in_camera(T)
+    front = local[:, 2] > 1e-9
+    z = torch.where(front, local[:, 2], 1)
+    focal = data.focal * log_factor.exp()
+    # Observed are pixels: what was divided by the given focal length is multiplied by it again.
+    off = local[:, :2] / z[:, None] * focal[:, None] - data.image * data.focal[:, None]
+    deviation = (noise**2 + _landmark_variance(data, T) * (focal / z) ** 2).sqrt()
+    residual = torch.where(front[:, None], off / deviation[:, None], 30.0)
+    squared = residual.square().sum(-1)
+    weight = front / (1 + squared / SCALE**2)
+    jacobian = _jacobian(data, T, local, z, focal, free_focal) / deviation[:, None, None]
+    weighted = jacobian * weight[:, None, None]
+    single = (weighted.mT @ residual[..., None])[..., 0]
+    cost = 0.5 * SCALE**2 * torch.log1p(squared / SCALE**2).sum()
+    hessian = (weighted.mT @ jacobian).sum(0)
+    # d(w r)/dr = w I - 2 w^2 r r^T / c^2 for w = 1 / (1 + r^2 / c^2).
+    curvature = hessian - 2 / SCALE**2 * (single.mT @ single)
+    return _System(
+        float(cost),
+        single.sum(0),
+        hessian,
+        curvature,
+        single.mT @ single,
+        _spread(residual, hessian.shape[0]),
+    )
+
+
+def _landmark_variance(data: ObservedPoints, T: SE3) -> Tensor:
+    """Variance (square metres) of the points across the line of sight, the mean of both axes.
+
+    Along the axis that is across the line of sight and ``directions``, it is that across; along the other one it has
+    the share of that along which the angle between them lets be seen.
+    """
+    sight = data.points - T.apply(_centres(data))
+    cosine = (sight * data.directions).sum(-1) / torch.linalg.vector_norm(sight, dim=-1).clamp(min=1e-12)
+    across, along = data.deviations.square().unbind(-1)
+    seen = cosine.square().clamp(max=1)
+    return (across * (1 + seen) + along * (1 - seen)) / 2
+
+
+def _centres(data: ObservedPoints) -> Tensor:
+    """Centres of the cameras in the frame of the rig."""
+    return -(data.rotation.mT @ data.translation[..., None])[..., 0]
+
+
+def _jacobian(
+    data: ObservedPoints, T: SE3, local: Tensor, z: Tensor, focal: Tensor, free_focal: bool
+) -> Tensor:
+    """Derivative of the projection (pixels) by the right update of ``T`` and the logarithm of the focal length."""
+    x, y, zero, inverse = local[:, 0] / z, local[:, 1] / z, torch.zeros_like(z), focal / z
+    rows = torch.stack([inverse, zero, -x * inverse, zero, inverse, -y * inverse], dim=-1).unflatten(
+        -1, (2, 3)
+    )
+    rig = T.inverse().apply(data.points)
+    # A point of the rig's frame moves by -rho + [p]x phi under T exp(rho, phi).
+    moved = torch.cat([-torch.eye(3, dtype=z.dtype).expand(len(z), 3, 3), skew(rig)], dim=-1)
+    jacobian = rows @ data.rotation @ moved
+    if free_focal:
+        jacobian = torch.cat([jacobian, (local[:, :2] / z[:, None] * focal[:, None])[..., None]], dim=-1)
+    return jacobian
+
+
+def _spread(residual: Float[Tensor, "m 2"], unknowns: int) -> float:
+    """Robust standard deviation along an axis, with the pose's own freedom allowed for."""
+    spare = max(1.0, 2 * len(residual) - unknowns) / (2 * len(residual))
+    return 1.4826 * float(residual.abs().median()) / spare**0.5
+
+
+def _solved(hessian: Tensor, damping: float, gradient: Tensor) -> Tensor:
+    diagonal = hessian.diagonal().clamp(min=1e-12)
+    return torch.linalg.solve(hessian + torch.diag(damping * diagonal), gradient)
+
+
+def _sandwich(system: _System) -> Float[Tensor, "p p"]:
+    """Covariance of an M-estimator (Huber 1981, section 6.3): ``A^-1 S A^-1`` of curvature A and scatter S."""
+    # Few or evil residuals can make the curvature indefinite; it is never far below the Hessian of good ones.
+    values, vectors = torch.linalg.eigh(system.curvature)
+    least = 0.2 * torch.linalg.eigvalsh(system.hessian)
+    inverse = vectors @ torch.diag(1 / values.maximum(least).clamp(min=1e-12)) @ vectors.mT
+    return inverse @ system.scatter @ inverse

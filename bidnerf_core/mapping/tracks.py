@@ -1,0 +1,121 @@
+"""Tracks: keypoints of several images that show one point of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.mapping.features import Keypoints, squared_distances
+from bidnerf_core.se3 import SE3
+
+BAND = 2.0
+"""Pixels from the epipolar line within which the partner of a keypoint is sought."""
+RATIO = 0.95
+"""Distance of the descriptors as a share of that to the next best of all keypoints of the image, at most."""
+RATIO_IN_BAND = 0.85
+"""The same share, of the next best one near the epipolar line."""
+APART = 4.0
+"""Pixels from which on two keypoints of an image are different ones: SIFT gives one for each dominant orientation."""
+
+ONE_PLACE = 1e-12
+"""Metres between cameras under which there are no epipolar lines."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedKeypoints:
+    """Keypoints of an image without its distortion, and where its camera is."""
+
+    keypoints: Keypoints
+    rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
+    focal: float  # pixels
+    T_world_camera: SE3  # float64
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Keypoints of two images that look alike and lie on one another's epipolar lines."""
+
+    pairs: Int[Tensor, "p 2"]
+    ambiguity: Float[Tensor, "p"]  # distance of the descriptors as a share of that to the next best
+
+
+def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
+    """Keypoints of ``a`` and ``b`` that are one another's best partner near the epipolar lines.
+
+    A match must stand out among all keypoints of ``b`` as well: what resembles many of them is on the line by chance.
+    """
+    if not len(a.keypoints) or not len(b.keypoints):
+        return Matches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
+    distance = squared_distances(a.keypoints.descriptors, b.keypoints.descriptors)
+    banded = distance.masked_fill(~_on_line(a, b), torch.inf)
+    best, partner = banded.min(dim=1)
+    mutual = banded.argmin(dim=0)[partner] == torch.arange(len(partner))
+    rows = (mutual & best.isfinite()).nonzero()[:, 0]
+    best, partner = best[rows], partner[rows]
+    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < APART
+    next_best = distance[rows].masked_fill(near, torch.inf).amin(dim=1)
+    next_in_band = banded[rows].masked_fill(near, torch.inf).amin(dim=1)
+    good = (best < RATIO_IN_BAND**2 * next_in_band) & (best < RATIO**2 * next_best)
+    ambiguity = (best / next_best.clamp(min=1)).sqrt()
+    return Matches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
+
+
+def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
+    """Whether a keypoint of ``b`` lies within ``BAND`` of the epipolar half-line of one of ``a``.
+
+    The half-line begins at the image of the infinitely far point of the ray; between cameras at one place it is that
+    beginning and nothing else.
+    """
+    T_b_a = b.T_world_camera.inverse() @ a.T_world_camera
+    rays, base = T_b_a.rotate(a.rays), T_b_a.translation
+    front = rays[:, 2:].sign()
+    start = rays[:, :2] / rays[:, 2:].abs().clamp(min=1e-9) * front
+    step = (base[:2] - base[2] * start) * front  # where the image moves as the point comes nearer
+    size = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
+    forward = step / size.clamp(min=1e-300)
+    sideways = torch.stack([-forward[:, 1], forward[:, 0]], dim=-1)
+    seen = torch.cat([b.rays[:, :2], torch.ones_like(b.rays[:, :1])], dim=-1).float().mT
+    band = BAND / b.focal
+    if float(torch.linalg.vector_norm(base)) < ONE_PLACE:
+        return torch.cdist(start.float(), seen[:2].mT) <= band
+    across, along = (
+        torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen
+        for axis in (sideways, forward)
+    )
+    # A ray that points behind the other camera has no beginning in its image; all of the line stays.
+    least = torch.where(front > 0, -band, -torch.inf).float()
+    return (across.abs_() <= band) & (along >= least)
+
+
+def joined(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
+    """Join matches (image, image, keypoints) into tracks: the track of each keypoint, in the numbering of all images.
+
+    The least ambiguous matches come first, and one that would bring two keypoints of an image together is left out: a
+    single wrong match would otherwise spoil two good tracks. ``sizes`` are the numbers of the keypoints of the images.
+    """
+    first = np.concatenate([[0], np.cumsum(sizes)])
+    ends = np.concatenate(
+        [np.zeros((0, 2), np.int64)] + [m.pairs.numpy() + first[[i, j]] for i, j, m in matches]
+    )
+    ambiguity = np.concatenate([np.zeros(0)] + [m.ambiguity.numpy() for _, _, m in matches])
+    parent = list(range(first[-1]))
+    images = [{image} for image, size in enumerate(sizes) for _ in range(size)]
+    for a, b in ends[np.argsort(ambiguity, kind="stable")].tolist():
+        small, large = sorted((_root(parent, a), _root(parent, b)), key=lambda root: len(images[root]))
+        if small != large and images[small].isdisjoint(images[large]):
+            parent[small] = large
+            images[large] |= images[small]
+    return torch.tensor([_root(parent, number) for number in range(first[-1])], dtype=torch.long)
+
+
+def _root(parent: list[int], number: int) -> int:
+    """The representative of a set (union-find with path halving, Tarjan and van Leeuwen 1984)."""
+    while parent[number] != number:
+        parent[number] = parent[parent[number]]
+        number = parent[number]
+    return number
