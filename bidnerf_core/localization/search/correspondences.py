@@ -1,0 +1,94 @@
+"""Pairs of a keypoint and a landmark, in the cameras of a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.mapping.features import Features, Keypoints
+from bidnerf_core.mapping.keypoint_depth import measured_depth
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.resection import ObservedPoints
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class QueryImage:
+    """Keypoints of an image that is to be localized, without its distortion; in the frame of the rig's last camera."""
+
+    keypoints: Keypoints
+    rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
+    depth: Float[Tensor, "n"]  # metres, 0 where none was measured
+    intrinsics: Intrinsics
+    T_rig_camera: SE3  # float64
+
+    @property
+    def focal(self) -> float:
+        """Pixels: geometric mean of the two focal lengths."""
+        return (self.intrinsics.fx * self.intrinsics.fy) ** 0.5
+
+
+def query_images(views: Sequence[View], features: Features) -> list[QueryImage]:
+    """Detect the keypoints of ``views``, whose poses are known in any common frame; the last one is the rig's frame."""
+    T_rig_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
+    return [
+        query_image(
+            view.frame, (T_rig_ref @ view.T_ref_camera.to("cpu", torch.float64)).normalized(), features
+        )
+        for view in views
+    ]
+
+
+def query_image(frame: Frame, T_rig_camera: SE3, features: Features) -> QueryImage:
+    keypoints = features(frame.rgb)
+    rays = frame.intrinsics.unproject(keypoints.pixels.double())
+    depth = measured_depth(frame, keypoints.pixels)
+    return QueryImage(keypoints, rays, depth, frame.intrinsics, T_rig_camera)
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Which keypoint of which view shows which landmark."""
+
+    view: Int[Tensor, "m"]
+    keypoint: Int[Tensor, "m"]
+    landmark: Int[Tensor, "m"]
+    ambiguity: Float[Tensor, "m"]  # 0: nothing else looks like it; 1: something else looks as much like it
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def __getitem__(self, index: Tensor) -> Correspondences:
+        return Correspondences(
+            self.view[index], self.keypoint[index], self.landmark[index], self.ambiguity[index]
+        )
+
+    @staticmethod
+    def cat(parts: Sequence[Correspondences]) -> Correspondences:
+        names = ("view", "keypoint", "landmark", "ambiguity")
+        return Correspondences(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+
+def observed_points(
+    images: Sequence[QueryImage], landmarks: LandmarkMap, found: Correspondences
+) -> ObservedPoints:
+    """Look up what the correspondences refer to."""
+    first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
+    number = first[found.view] + found.keypoint
+    T_camera_rig = SE3.stack([image.T_rig_camera.inverse() for image in images])
+    return ObservedPoints(
+        landmarks.positions[found.landmark].double(),
+        landmarks.deviations[found.landmark].double(),
+        landmarks.directions[found.landmark].double(),
+        torch.cat([image.rays for image in images])[number, :2],
+        torch.tensor([image.focal for image in images], dtype=torch.float64)[found.view],
+        torch.cat([image.depth for image in images])[number],
+        T_camera_rig.rotation[found.view],
+        T_camera_rig.translation[found.view],
+    )

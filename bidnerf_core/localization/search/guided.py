@@ -1,0 +1,132 @@
+"""Guided matching: once a pose is known, a keypoint is compared only with the landmarks that would appear near it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import radians
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from bidnerf_core.localization.search.correspondences import Correspondences, QueryImage
+from bidnerf_core.mapping.features import paired_squared_distances
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.se3 import SE3
+
+CANDIDATES = 6
+"""Landmarks that are compared with a keypoint, at most: the nearest ones in the image."""
+RATIO = 0.9
+"""Distance of the descriptors as a share of that to the next best candidate, at most."""
+OBLIQUE = radians(40)
+"""By how much a landmark may be seen from outside of the cone of directions that it was seen from."""
+OCTAVES = 1.0
+"""By how much (binary logarithm) a keypoint may be larger or smaller than its landmark should appear."""
+
+
+def guided_matches(
+    images: Sequence[QueryImage],
+    landmarks: LandmarkMap,
+    T_world_rig: SE3,
+    radius: float,
+    most_distance: float,
+    focal_factor: float = 1.0,
+    shift: tuple[float, float] = (0.0, 0.0),
+) -> Correspondences:
+    """Correspondences within ``radius`` pixels of the projections under a pose.
+
+    Descriptors may differ by the squared distance ``most_distance``. ``shift`` (pixels) moves all projections: with one
+    larger than the radius, what is found is found by chance.
+    """
+    parts = [
+        _in_view(number, image, landmarks, T_world_rig, radius, most_distance, focal_factor, shift)
+        for number, image in enumerate(images)
+    ]
+    return Correspondences.cat(parts)
+
+
+def _in_view(
+    number: int,
+    image: QueryImage,
+    landmarks: LandmarkMap,
+    T_world_rig: SE3,
+    radius: float,
+    most_distance: float,
+    focal_factor: float,
+    shift: tuple[float, float],
+) -> Correspondences:
+    focal = image.focal * focal_factor
+    T_world_camera = T_world_rig @ image.T_rig_camera
+    local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
+    index = _visible(image, landmarks, T_world_camera, local, focal, radius).nonzero()[:, 0]
+    projected = local[index, :2] / local[index, 2:] * focal + torch.tensor(shift)
+    observed = (image.rays[:, :2] * image.focal).float()
+    keypoint, found = _near(observed, projected, radius)
+    landmark = index[found]
+    size = landmarks.sizes[landmark] * focal / local[landmark, 2]
+    alike = (size / image.keypoints.sizes[keypoint]).log2().abs() <= OCTAVES
+    keypoint, landmark = keypoint[alike], landmark[alike]
+    distance = paired_squared_distances(
+        image.keypoints.descriptors, landmarks.descriptors, keypoint, landmark
+    )
+    best, ambiguity = _best(keypoint, landmark, distance, most_distance)
+    return Correspondences(torch.full_like(best, number), keypoint[best], landmark[best], ambiguity)
+
+
+def _visible(
+    image: QueryImage, landmarks: LandmarkMap, T_world_camera: SE3, local: Tensor, focal: float, margin: float
+) -> Bool[Tensor, "n"]:
+    """Landmarks in front of the camera, in its image, seen from about where they were seen before."""
+    camera = image.intrinsics
+    half = torch.tensor([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
+    # Distortion moves the edges of the image; keypoints say what was seen, so a wide guess does no harm.
+    inside = (local[:, :2].abs() * focal <= (1.3 * half + margin) * local[:, 2:]).all(-1) & (local[:, 2] > 0)
+    towards = T_world_camera.translation.float() - landmarks.positions
+    length = torch.linalg.vector_norm(towards, dim=-1).clamp(min=1e-12)
+    cosine = (towards * landmarks.directions).sum(-1) / length
+    return inside & (cosine >= (landmarks.cones + OBLIQUE).clamp(max=torch.pi).cos())
+
+
+def _near(
+    observed: Float[Tensor, "k 2"], projected: Float[Tensor, "n 2"], radius: float
+) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+    """Pairs of a keypoint and a projection that are within ``radius`` of one another."""
+    if not len(observed) or not len(projected):
+        return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
+    _, found = cKDTree(projected.numpy()).query(observed.numpy(), k=CANDIDATES, distance_upper_bound=radius)
+    index = torch.from_numpy(np.asarray(found, dtype=np.int64))
+    rows, columns = (index < len(projected)).nonzero().unbind(-1)
+    return rows, index[rows, columns]
+
+
+def _best(
+    keypoint: Int[Tensor, "p"], landmark: Int[Tensor, "p"], distance: Float[Tensor, "p"], most: float
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
+    """The most alike pair of each keypoint, where no other is nearly as much alike, once for each landmark."""
+    order = distance.argsort(stable=True)
+    order = order[keypoint[order].argsort(stable=True)]
+    begins = torch.ones(len(order), dtype=torch.bool)
+    begins[1:] = keypoint[order][1:] != keypoint[order][:-1]
+    first = begins.nonzero()[:, 0]
+    following = (first + 1).clamp(max=max(0, len(order) - 1))
+    alone = (first + 1 >= len(order)) | begins[following]
+    nearest = distance[order[first]]
+    next_best = torch.where(alone, most / RATIO**2, distance[order[following]])
+    ambiguity = (nearest / next_best.clamp(min=1)).sqrt()
+    good = (nearest <= most) & (ambiguity <= RATIO)
+    return _once(order[first[good]], landmark, distance, ambiguity[good])
+
+
+def _once(
+    chosen: Int[Tensor, "m"], landmark: Tensor, distance: Tensor, ambiguity: Tensor
+) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
+    """Of the pairs ``chosen`` that share a landmark, the most alike."""
+    order = distance[chosen].argsort(stable=True)
+    order = order[landmark[chosen[order]].argsort(stable=True)]
+    ids = landmark[chosen[order]]
+    begins = torch.ones(len(ids), dtype=torch.bool)
+    begins[1:] = ids[1:] != ids[:-1]
+    kept = order[begins].sort().values
+    return chosen[kept], ambiguity[kept]

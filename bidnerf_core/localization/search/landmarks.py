@@ -1,0 +1,335 @@
+"""Search by landmarks: a pose with its covariance from images alone, without a start."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+from bidnerf_core.localization.search.correspondences import (
+    Correspondences,
+    QueryImage,
+    observed_points,
+    query_images,
+)
+from bidnerf_core.localization.search.guided import guided_matches
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
+from bidnerf_core.mapping.features import Features, Sift, paired_squared_distances
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.resection import ObservedPoints, ReprojectionFit, fit
+from bidnerf_core.se3 import SE3
+
+SIFT = Sift()
+NEIGHBOURS = 4
+"""Landmarks that are looked up for each keypoint: the next best one elsewhere tells how ambiguous the best one is."""
+SAME_PLACE = 2.0
+"""Two landmarks nearer than so many of their diameters are one thing, seen twice."""
+AMBIGUITY = 0.9
+"""Distance of the descriptors as a share of that to the next best landmark elsewhere, at most."""
+LEAST_MATCHES = 60
+"""Fewer unambiguous matches than that are filled up with the least ambiguous others."""
+THRESHOLD = 0.005
+"""Share of the image's diagonal within which a correspondence agrees with a pose; 2 pixels at least."""
+RADII = (2.0, 1.0)
+"""Radii of guided matching, in multiples of 3 pixels (of an image of 400 x 300, larger for larger ones)."""
+ROUNDS = 3
+"""Rounds of guided matching with the last radius, at most; it ends where correspondences no longer change."""
+LOOSE = 1.3
+"""Descriptors of guided matches may be so much more distant than those of nine tenths of the first inliers."""
+DEPTH_OFF = 0.1
+"""Share of the depth by which a landmark may be off the depth that was measured at its keypoint."""
+LEAST_INLIERS = 6
+"""Correspondences under which there is no pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkPose:
+    """A pose found by landmarks, and what speaks for it."""
+
+    T_world_camera: SE3  # of the last view, float64
+    covariance: Float[
+        Tensor, "6 6"
+    ]  # of the right update, translation (metres) first; of keypoints and landmarks
+    map_covariance: Float[Tensor, "6 6"]  # the same, with how the poses of the map's own images scatter
+    noise: float  # pixels: standard deviation of the reprojection errors along each axis, robustly
+    correspondences: Correspondences  # those that the pose was refined on
+    residuals: Float[Tensor, "m 2"]  # pixels, of the correspondences
+    pixels: Float[Tensor, "m 2"]  # where the correspondences were observed, as the image has them
+    matches: int  # by descriptors alone, before there was a pose
+    agreeing: int  # of those, how many agree with the pose
+    log10_nfa: (
+        float  # logarithm of the number of as good agreements expected by chance (Moisan and Stival 2004)
+    )
+    chance: float  # correspondences that guided matching would find at a wrong pose
+    spread: float  # 0 to 1: share of the image that the correspondences lie in
+    focal_factor: float  # true focal length as a multiple of the given one; 1 where it was not sought
+    depth_scale: (
+        float | None
+    )  # by which measured depth has to be multiplied; none where too little was measured
+    seconds: dict[str, float] = field(default_factory=dict)  # by stage
+
+    @property
+    def inliers(self) -> int:
+        """Correspondences within three standard deviations."""
+        return int((torch.linalg.vector_norm(self.residuals, dim=-1) <= 3 * self.noise).sum())
+
+
+def propose(
+    matcher: LandmarkMatcher,
+    views: Sequence[View],
+    features: Features = SIFT,
+    seed: int = 0,
+    unknown_focal: bool = False,
+) -> LandmarkPose | None:
+    """Find the pose of the last of ``views``, whose relative poses are known; ``None`` where landmarks do not tell.
+
+    ``unknown_focal`` takes the focal length of a single view as a guess and finds it too. Raises ``InputError`` for no
+    view, and for several with an unknown focal length.
+    """
+    if not views:
+        raise InputError("nothing to localize: expected at least one view")
+    if unknown_focal and len(views) > 1:
+        raise InputError(f"an unknown focal length with {len(views)} views, expected one view")
+    clock = _Clock()
+    images = query_images(views, features)
+    clock.lap("descriptors")
+    matches = unguided_matches(images, matcher)
+    clock.lap("matching")
+    found = _first_pose(images, matcher.landmarks, matches, seed, unknown_focal)
+    clock.lap("ransac")
+    if found is None:
+        return None
+    answer = _refined(images, matcher.landmarks, matches, found, unknown_focal)
+    clock.lap("refinement")
+    if answer is None:
+        return None
+    correspondences, best, chance = answer
+    return _described(images, matcher.landmarks, matches, correspondences, best, chance, clock.seconds)
+
+
+def unguided_matches(images: Sequence[QueryImage], matcher: LandmarkMatcher) -> Correspondences:
+    """The landmark most alike to each keypoint, where it stands out; the least ambiguous ones first."""
+    parts = []
+    for number, image in enumerate(images):
+        distances, index = matcher.nearest(image.keypoints.descriptors, NEIGHBOURS)
+        ambiguity = _ambiguity(matcher.landmarks, distances, index)
+        keypoint = torch.arange(len(index))[distances[:, 0].isfinite()]
+        part = Correspondences(
+            torch.full_like(keypoint, number), keypoint, index[keypoint, 0], ambiguity[keypoint]
+        )
+        parts.append(part)
+    found = Correspondences.cat(parts)
+    found = found[found.ambiguity.argsort(stable=True)]
+    return found[torch.arange(len(found)) < max(LEAST_MATCHES, int((found.ambiguity <= AMBIGUITY).sum()))]
+
+
+def _ambiguity(
+    landmarks: LandmarkMap, distances: Float[Tensor, "q k"], index: Int[Tensor, "q k"]
+) -> Float[Tensor, "q"]:
+    """Distance to the best landmark as a share of that to the best one elsewhere."""
+    if not len(landmarks):
+        return torch.ones(len(distances))
+    position, size = landmarks.positions[index], landmarks.sizes[index]
+    apart = torch.linalg.vector_norm(position - position[:, :1], dim=-1)
+    near = SAME_PLACE * torch.maximum(size, size[:, :1]) + 3 * landmarks.deviations[index].amax(-1)
+    elsewhere = torch.where(apart > near, distances, torch.inf).amin(1)
+    # Where all that were looked up are in one place, the last of them bounds how near another can be.
+    other = torch.where(elsewhere.isfinite(), elsewhere, distances[:, -1])
+    return torch.where(other.isfinite(), (distances[:, 0] / other.clamp(min=1)).sqrt(), 0.0)
+
+
+def _first_pose(
+    images: Sequence[QueryImage],
+    landmarks: LandmarkMap,
+    matches: Correspondences,
+    seed: int,
+    unknown_focal: bool,
+) -> Hypothesis | None:
+    data = observed_points(images, landmarks, matches)
+    threshold = _pixels(images, THRESHOLD)
+    if unknown_focal:
+        found = focal_consensus(data, threshold, seed)
+    else:
+        found = sample_consensus(data, matches.view, threshold, seed)
+    if found is None or int(found.inliers.sum()) < LEAST_INLIERS:
+        return None
+    return found
+
+
+def _pixels(images: Sequence[QueryImage], share: float) -> float:
+    """A share of the diagonal of the last image; 2 pixels at least."""
+    camera = images[-1].intrinsics
+    return max(2.0, share * math.hypot(camera.width, camera.height))
+
+
+def _refined(
+    images: Sequence[QueryImage],
+    landmarks: LandmarkMap,
+    matches: Correspondences,
+    found: Hypothesis,
+    unknown_focal: bool,
+) -> tuple[Correspondences, ReprojectionFit, float] | None:
+    """Refine on the inliers; then on guided matches, in ever smaller radii, until they no longer change."""
+    threshold = _pixels(images, THRESHOLD)
+    inliers = matches[found.inliers]
+    most = _usual_distance(images, landmarks, inliers)
+    best = fit(
+        observed_points(images, landmarks, inliers),
+        found.T_world_rig,
+        threshold / 2,
+        unknown_focal,
+        found.focal_factor,
+    )
+    correspondences = inliers
+    for radius in (*RADII[:-1], *[RADII[-1]] * ROUNDS):
+        guided = guided_matches(
+            images, landmarks, best.T_world_rig, 1.5 * radius * threshold, most, best.focal_factor
+        )
+        data = observed_points(images, landmarks, guided)
+        guided = guided[_depth_agrees(data, best.T_world_rig)]
+        if len(guided) < LEAST_INLIERS:
+            break
+        unchanged = _same(guided, correspondences)
+        correspondences = guided
+        best = fit(
+            observed_points(images, landmarks, guided),
+            best.T_world_rig,
+            best.noise,
+            unknown_focal,
+            best.focal_factor,
+        )
+        if unchanged:
+            break
+    chance = _chance(images, landmarks, best, 1.5 * RADII[-1] * threshold, most)
+    return correspondences, best, chance
+
+
+def _same(a: Correspondences, b: Correspondences) -> bool:
+    return len(a) == len(b) and torch.equal(a.landmark, b.landmark) and torch.equal(a.keypoint, b.keypoint)
+
+
+def _usual_distance(images: Sequence[QueryImage], landmarks: LandmarkMap, inliers: Correspondences) -> float:
+    """Squared distance of descriptors up to which guided matches are taken."""
+    first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
+    descriptors = torch.cat([image.keypoints.descriptors for image in images])
+    number = first[inliers.view] + inliers.keypoint
+    distance = paired_squared_distances(descriptors, landmarks.descriptors, number, inliers.landmark)
+    return LOOSE**2 * float(distance.quantile(0.9))
+
+
+def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
+    """Correspondences at whose keypoint no depth was measured, or one that fits the landmark."""
+    z = data.in_camera(T_world_rig)[:, 2]
+    known = data.depth > 0
+    ratio = torch.where(known, z / torch.where(known, data.depth, 1), 1)
+    scale = ratio[known].median() if int(known.sum()) >= LEAST_INLIERS else 1.0
+    return (ratio / scale - 1).abs() <= DEPTH_OFF
+
+
+def _chance(
+    images: Sequence[QueryImage], landmarks: LandmarkMap, best: ReprojectionFit, radius: float, most: float
+) -> float:
+    """Mean count of guided matches with the projections moved aside in four directions."""
+    away = 4 * radius
+    counts = [
+        len(guided_matches(images, landmarks, best.T_world_rig, radius, most, best.focal_factor, shift))
+        for shift in ((away, 0.0), (-away, 0.0), (0.0, away), (0.0, -away))
+    ]
+    return sum(counts) / len(counts)
+
+
+def _described(
+    images: Sequence[QueryImage],
+    landmarks: LandmarkMap,
+    matches: Correspondences,
+    correspondences: Correspondences,
+    best: ReprojectionFit,
+    chance: float,
+    seconds: dict[str, float],
+) -> LandmarkPose:
+    data = observed_points(images, landmarks, correspondences)
+    threshold = _pixels(images, THRESHOLD)
+    off = (
+        observed_points(images, landmarks, matches).with_focal(best.focal_factor).residuals(best.T_world_rig)
+    )
+    agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= threshold).sum())
+    known = data.depth > 0
+    ratio = data.in_camera(best.T_world_rig)[known, 2] / data.depth[known]
+    first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
+    pixels = torch.cat([i.keypoints.pixels for i in images])[
+        first[correspondences.view] + correspondences.keypoint
+    ]
+    return LandmarkPose(
+        T_world_camera=best.T_world_rig,
+        covariance=best.covariance[:6, :6],
+        map_covariance=best.covariance[:6, :6] + landmarks.pose_covariance,
+        noise=best.noise,
+        correspondences=correspondences,
+        residuals=data.with_focal(best.focal_factor).residuals(best.T_world_rig),
+        pixels=pixels,
+        matches=len(matches),
+        agreeing=agreeing,
+        log10_nfa=log10_nfa(len(matches), agreeing, _probability(images, threshold)),
+        chance=chance,
+        spread=_spread(images, correspondences, pixels),
+        focal_factor=best.focal_factor,
+        depth_scale=float(ratio.median()) if len(ratio) >= LEAST_INLIERS else None,
+        seconds=seconds,
+    )
+
+
+def log10_nfa(matches: int, agreeing: int, probability: float, sample: int = 3) -> float:
+    """Logarithm of the number of false alarms (Moisan and Stival 2004, eq. 10): how many poses with so much agreement
+    are to be expected among ``matches`` that are all wrong; below 0 it is no chance.
+
+    ``probability`` is that of a wrong match to agree with a pose; ``sample`` correspondences make a pose.
+    """
+    if agreeing <= sample:
+        return 0.0
+    log = (
+        math.log(max(1, matches - sample))
+        + _log_binomial(matches, agreeing)
+        + _log_binomial(agreeing, sample)
+        + (agreeing - sample) * math.log(probability)
+    )
+    return log / math.log(10)
+
+
+def _log_binomial(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+
+
+def _probability(images: Sequence[QueryImage], threshold: float) -> float:
+    """That a place drawn uniformly in the image lies within ``threshold`` of another one."""
+    camera = images[-1].intrinsics
+    return min(0.5, math.pi * threshold**2 / (camera.width * camera.height))
+
+
+def _spread(images: Sequence[QueryImage], found: Correspondences, pixels: Float[Tensor, "m 2"]) -> float:
+    """Share of the cells of an 8 x 8 grid that hold a correspondence, the mean of the views."""
+    shares = []
+    for number, image in enumerate(images):
+        size = torch.tensor([image.intrinsics.width, image.intrinsics.height])
+        cell = (pixels[found.view == number] / size * 8).long().clamp(0, 7)
+        shares.append(len(cell.unique(dim=0)) / 64)
+    return sum(shares) / len(shares)
+
+
+class _Clock:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage], self._last = now - self._last, now

@@ -1,0 +1,130 @@
+"""Which landmarks look like a keypoint: nearest neighbours among descriptors, sublinear in how many there are."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from bidnerf_core.mapping.features import squared_distances
+from bidnerf_core.mapping.landmarks import LandmarkMap
+
+EXACT = 4_000
+"""Landmarks up to which there are no cells."""
+COMPARISONS = 8_000_000
+"""Of keypoints with landmarks, up to which comparing all of them is faster than looking up cells."""
+BLOCK = 64
+"""Neighbouring columns whose least value is found first: sorting all of them would take longer than computing them."""
+PROBED = 12
+"""Cells that are searched for each keypoint."""
+SAMPLE = 40
+"""Landmarks for each cell, of those that the cells are found from."""
+ROUNDS = 6
+"""Of Lloyd's algorithm: cells need not be the best ones, only balanced."""
+ROWS = 256
+"""Keypoints or landmarks that are compared with all others at a time: bounds the memory."""
+
+
+class LandmarkMatcher:
+    """Finds the landmarks whose descriptors are nearest to those of keypoints.
+
+    Above ``EXACT`` landmarks, an inverted file: they are sorted into about sqrt(n) cells by k-means, and only the cells
+    nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). It can be shared between threads.
+    """
+
+    def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
+        self.landmarks = landmarks
+        self._cells: _Cells | None = None
+        if len(landmarks) > EXACT:
+            self._cells = _Cells(landmarks.descriptors, seed)
+
+    def nearest(
+        self, descriptors: UInt8[Tensor, "q d"], count: int
+    ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
+        """Squared distances of the ``count`` nearest landmarks, nearest first, and which they are.
+
+        Where there are fewer, distances are infinite and the landmark's number is 0.
+        """
+        if self._cells is not None and len(descriptors) * len(self.landmarks) > COMPARISONS:
+            return self._cells.nearest(descriptors, count)
+        distances = descriptors.new_full((len(descriptors), count), 0).float() + torch.inf
+        index = torch.zeros(distances.shape, dtype=torch.long)
+        if len(self.landmarks):
+            found = _smallest(squared_distances(descriptors, self.landmarks.descriptors), count)
+            distances[:, : found[0].shape[1]], index[:, : found[0].shape[1]] = found
+        return distances, index
+
+
+class _Cells:
+    """An inverted file: descriptors by cell."""
+
+    def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
+        count = round(math.sqrt(len(descriptors)))
+        generator = torch.Generator().manual_seed(seed)
+        self._centres = _k_means(descriptors, count, generator)
+        cell = _nearest_centre(descriptors, self._centres)
+        order = cell.argsort(stable=True)
+        self._order = order
+        self._descriptors = descriptors[order]
+        self._last = torch.bincount(cell, minlength=count).cumsum(0).tolist()
+
+    def nearest(
+        self, descriptors: UInt8[Tensor, "q d"], count: int
+    ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
+        queries = len(descriptors)
+        probed = _smallest(squared_distances(descriptors, self._centres), PROBED)[1]
+        cell, order = probed.flatten().sort(stable=True)
+        query = order // probed.shape[1]
+        distances = torch.full((probed.numel(), count), torch.inf)
+        index = torch.zeros(distances.shape, dtype=torch.long)
+        values = descriptors.float()
+        bounds = torch.searchsorted(cell, torch.arange(len(self._centres) + 1)).tolist()
+        for number, (begin, end) in enumerate(pairwise(bounds)):
+            first, last = self._last[number - 1] if number else 0, self._last[number]
+            if begin == end or first == last:
+                continue
+            found = _smallest(
+                squared_distances(values[query[begin:end]], self._descriptors[first:last]), count
+            )
+            width = found[0].shape[1]
+            distances[order[begin:end], :width] = found[0]
+            index[order[begin:end], :width] = found[1] + first
+        best = distances.view(queries, -1).topk(count, dim=1, largest=False)
+        return best.values, self._order[index.view(queries, -1).gather(1, best.indices)]
+
+
+def _k_means(
+    descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
+) -> Float[Tensor, "c d"]:
+    """Centres of cells (Lloyd 1982), from a sample; a centre that loses all of its members stays where it is."""
+    sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLE * count]
+    values = descriptors[sample].float()
+    centres = values[:count].clone()
+    for _ in range(ROUNDS):
+        cell = _nearest_centre(values, centres)
+        sizes = torch.bincount(cell, minlength=count)
+        total = torch.zeros_like(centres).index_add_(0, cell, values)
+        centres = torch.where(sizes[:, None] > 0, total / sizes.clamp(min=1)[:, None], centres)
+    return centres
+
+
+def _nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
+    return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(16 * ROWS)])
+
+
+def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
+    """The ``count`` least of each row (or all, where there are fewer), least first, and their columns."""
+    columns = distances.shape[1]
+    if columns <= 4 * BLOCK * count:
+        found = distances.topk(min(count, columns), dim=1, largest=False)
+        return found.values, found.indices
+    blocks = torch.nn.functional.pad(distances, (0, -columns % BLOCK), value=torch.inf).unflatten(
+        1, (-1, BLOCK)
+    )
+    block = blocks.amin(-1).topk(count, dim=1, largest=False).indices
+    candidates = blocks.gather(1, block[..., None].expand(-1, -1, BLOCK)).flatten(1)
+    best = candidates.topk(count, dim=1, largest=False)
+    return best.values, block.gather(1, best.indices // BLOCK) * BLOCK + best.indices % BLOCK

@@ -1,0 +1,154 @@
+"""A first pose from correspondences most of which may be wrong: minimal solvers in LO-RANSAC, by poselib.
+
+One camera: P3P (Persson and Nordberg 2018). Several with known relative poses: generalized P3P (Kukelova et al. 2016).
+Unknown focal length: P4Pf, which poselib has as a solver only; the loop about it is ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.mapping.resection import ObservedPoints
+from bidnerf_core.se3 import SE3
+
+SUCCESS = 0.9999
+"""Probability of having drawn a sample without outliers at which drawing ends."""
+LEAST_DRAWS, MOST_DRAWS = 50, 20_000
+MOST_DRAWS_WITH_FOCAL = 1500
+"""One draw costs some hundred microseconds there."""
+FOCAL_RANGE = (0.2, 5.0)
+"""Multiples of the given focal length that are tried."""
+ONE_PLACE = 1e-6
+"""Of the points' distance: cameras nearer to one another than that have no generalized solution of their own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A pose and the correspondences that agree with it."""
+
+    T_world_rig: SE3
+    inliers: Bool[Tensor, "m"]
+    draws: int
+    focal_factor: float = 1.0
+
+
+def sample_consensus(
+    data: ObservedPoints, view: Int[Tensor, "m"], threshold: float, seed: int
+) -> Hypothesis | None:
+    """The pose that the most correspondences agree with, within ``threshold`` pixels; they are in the order of trust.
+
+    A rig also tries each of its cameras alone: the generalized solver is unstable where the cameras are all but in one
+    place. ``None`` where there are too few correspondences, or nothing agrees.
+    """
+    views = view.unique().tolist()
+    found = [_single(data, (view == v).nonzero()[:, 0], threshold, seed) for v in views]
+    if len(views) > 1:
+        found.append(_generalized(data, [(view == v).nonzero()[:, 0] for v in views], threshold, seed))
+    hypotheses = [_judged(data, T, threshold, draws) for T, draws in filter(None, found)]
+    return max(hypotheses, key=lambda h: int(h.inliers.sum()), default=None)
+
+
+def _judged(data: ObservedPoints, T: SE3, threshold: float, draws: int) -> Hypothesis:
+    within = torch.linalg.vector_norm(data.residuals(T), dim=-1) <= threshold
+    return Hypothesis(T, within, draws)
+
+
+def _options(threshold: float, seed: int) -> dict[str, object]:
+    return {
+        "max_reproj_error": threshold, "seed": seed, "success_prob": SUCCESS, "progressive_sampling": True,
+        "min_iterations": LEAST_DRAWS, "max_iterations": MOST_DRAWS, "max_prosac_iterations": MOST_DRAWS,
+    }  # fmt: skip
+
+
+def _camera(focal: float) -> dict[str, object]:
+    """A pinhole whose pixels are counted from the principal point."""
+    return {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+
+
+def _single(data: ObservedPoints, index: Tensor, threshold: float, seed: int) -> tuple[SE3, int] | None:
+    if len(index) < 4:
+        return None
+    part, focal = data[index], float(data.focal[index[0]])
+    pose, info = poselib.estimate_absolute_pose(
+        (part.image * focal).numpy(), part.points.numpy(), _camera(focal), _options(threshold, seed), {}
+    )
+    T_camera_rig = SE3(part.rotation[0], part.translation[0])
+    T = _transform(pose)
+    return (T.inverse() @ T_camera_rig, int(info["iterations"])) if _sound(T) else None
+
+
+def _generalized(
+    data: ObservedPoints, parts: list[Tensor], threshold: float, seed: int
+) -> tuple[SE3, int] | None:
+    pixels = [(data.image[index] * data.focal[index, None]).numpy() for index in parts]
+    points = [data.points[index].numpy() for index in parts]
+    cameras = [_camera(float(data.focal[index[0]])) for index in parts]
+    poses = [_camera_pose(SE3(data.rotation[index[0]], data.translation[index[0]])) for index in parts]
+    if sum(map(len, pixels)) < 4:
+        return None
+    options = _options(threshold, seed) | {"progressive_sampling": False}
+    pose, info = poselib.estimate_generalized_absolute_pose(pixels, points, poses, cameras, options, {})
+    T_rig_world = _transform(pose)
+    return (T_rig_world.inverse(), int(info["iterations"])) if _sound(T_rig_world) else None
+
+
+def focal_consensus(data: ObservedPoints, threshold: float, seed: int) -> Hypothesis | None:
+    """The pose and focal length of one camera that the most correspondences agree with; those are in the order of trust.
+
+    Its focal length is sought within ``FOCAL_RANGE`` of the given one; the principal point is known.
+    """
+    if len(data) < 5:
+        return None
+    random = np.random.default_rng(seed)
+    pixels, points = (data.image * data.focal[:, None]).numpy(), data.points.numpy()
+    given, best, needed, draws = float(data.focal[0]), None, MOST_DRAWS_WITH_FOCAL, 0
+    while draws < needed:
+        draws += 1
+        pool = min(len(points), max(20, len(points) * draws // 200))  # PROSAC: the surest ones first
+        sample = random.choice(pool, 4, replace=False)
+        for pose, focal in zip(*poselib.p4pf(pixels[sample], points[sample], True), strict=True):
+            if not FOCAL_RANGE[0] <= focal / given <= FOCAL_RANGE[1]:
+                continue
+            off = np.linalg.norm(_projected(pose, points) * focal - pixels, axis=1)
+            within = off <= threshold
+            if best is None or within.sum() > best[2].sum():
+                best = (pose, focal / given, within)
+                needed = min(needed, _draws_needed(float(within.mean())))
+    if best is None or not _sound(_transform(best[0])):
+        return None
+    T_camera_rig = SE3(data.rotation[0], data.translation[0])
+    T = _transform(best[0]).inverse() @ T_camera_rig
+    return Hypothesis(T, torch.from_numpy(best[2]), draws, best[1])
+
+
+def _projected(pose: poselib.CameraPose, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 2"]:
+    local = points @ np.asarray(pose.R).T + np.asarray(pose.t).reshape(3)
+    return np.where(local[:, 2:] > 0, local[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], 1), np.inf)
+
+
+def _draws_needed(inliers: float) -> int:
+    """Draws of four after which one without outliers has most likely been among them (Fischler and Bolles 1981)."""
+    clean = min(max(inliers, 1e-3) ** 4, 1 - 1e-9)
+    return max(LEAST_DRAWS, int(3 * np.log(1 - SUCCESS) / np.log1p(-clean)))
+
+
+def _transform(pose: poselib.CameraPose) -> SE3:
+    rotation = torch.from_numpy(np.array(pose.R, dtype=np.float64))
+    return SE3(rotation, torch.from_numpy(np.array(pose.t, dtype=np.float64).reshape(3)))
+
+
+def _camera_pose(T_camera_rig: SE3) -> poselib.CameraPose:
+    pose = poselib.CameraPose()
+    pose.R = T_camera_rig.rotation.numpy()
+    pose.t = T_camera_rig.translation.numpy()
+    return pose
+
+
+def _sound(T: SE3) -> bool:
+    return bool(T.is_rigid())
