@@ -26,8 +26,8 @@ KINDS = {
 
 def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
     """Return copies of the parts of ``landmarks`` by name."""
-    found = {name: torch.as_tensor(getattr(landmarks, name)) for name in KINDS}
-    return {name: found[name].to(kind).contiguous().clone() for name, (_, kind) in KINDS.items()}
+    found = {name: torch.as_tensor(getattr(landmarks, name), dtype=kind) for name, (_, kind) in KINDS.items()}
+    return {name: value.contiguous().clone() for name, value in found.items()}
 
 
 def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:

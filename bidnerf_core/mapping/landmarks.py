@@ -44,4 +44,4 @@ PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones",
 
 def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
     """All landmarks of ``maps``, which have descriptors of one length; what else there is comes from the first one."""
-    return replace(maps[0], **{name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK})  # type: ignore[arg-type]
+    return replace(maps[0], **{name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK})

@@ -1,0 +1,63 @@
+"""Landmarks as named tensors: there and back, and what is not a map is refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core.mapping.landmark_building import build_landmarks
+from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from landmark_scene import Points, ring
+
+
+@pytest.fixture(scope="module")
+def landmarks() -> LandmarkMap:
+    points = Points(count=60, noise=0.2)
+    return build_landmarks(ring(points), points)
+
+
+def test_there_and_back(landmarks: LandmarkMap) -> None:
+    tensors = landmark_tensors(landmarks)
+    again = landmark_tensors(landmarks_from_tensors(tensors))
+    assert tensors.keys() == again.keys()
+    assert all(torch.equal(tensors[name], again[name]) for name in tensors)
+    assert landmarks_from_tensors(tensors).noise == landmarks.noise
+
+
+def test_no_landmarks_at_all_are_a_map(landmarks: LandmarkMap) -> None:
+    assert len(landmarks_from_tensors(landmark_tensors(landmarks[torch.tensor([], dtype=torch.long)]))) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("positions", lambda v: torch.full_like(v, torch.nan), "positions holds NaN"),
+        ("positions", lambda v: v[:, :2], "positions is"),
+        ("positions", lambda v: v.double(), "float64"),
+        ("deviations", lambda v: v[1:], "deviations has"),
+        ("deviations", lambda v: -v, "deviations is"),
+        ("descriptors", lambda v: v[:, :0], "no channels"),
+        ("descriptors", lambda v: v.float(), "descriptors is torch.float32"),
+        ("directions", lambda v: 2 * v, "unit length"),
+        ("cones", lambda v: v + 4, "cones is"),
+        ("sizes", lambda v: -1 - v, "sizes is"),
+        ("views", lambda v: v - v, "views is"),
+        ("noise", torch.zeros_like, "noise is 0"),
+        ("pose_covariance", lambda v: v - torch.eye(6), "positive semidefinite"),
+        ("pose_covariance", lambda v: v + torch.arange(6.0), "symmetric"),
+    ],
+)
+def test_what_is_no_map_is_refused(landmarks: LandmarkMap, name: str, change, said: str) -> None:
+    tensors = landmark_tensors(landmarks)
+    with pytest.raises(ValueError, match=said):
+        landmarks_from_tensors(tensors | {name: change(tensors[name])})
+
+
+@pytest.mark.parametrize("name", ["positions", "noise", "views"])
+def test_a_missing_tensor_is_named(landmarks: LandmarkMap, name: str) -> None:
+    tensors: dict[str, Tensor] = landmark_tensors(landmarks)
+    del tensors[name]
+    with pytest.raises(KeyError, match=name):
+        landmarks_from_tensors(tensors)
