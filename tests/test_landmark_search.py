@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
-from bidnerf_core.localization.search.landmarks import LandmarkPose, log10_nfa, propose
+from bidnerf_core.localization.search.chance import log10_nfa
+from bidnerf_core.localization.search.landmarks import LandmarkPose, propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.features import squared_distances
 from bidnerf_core.mapping.landmark_building import build_landmarks

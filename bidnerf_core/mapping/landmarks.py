@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -44,4 +45,5 @@ PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones",
 
 def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
     """All landmarks of ``maps``, which have descriptors of one length; what else there is comes from the first one."""
-    return replace(maps[0], **{name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK})
+    joined: dict[str, Any] = {name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK}
+    return replace(maps[0], **joined)

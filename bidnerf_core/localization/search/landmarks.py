@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import (
     Correspondences,
     QueryImage,
@@ -284,27 +285,6 @@ def _described(
         depth_scale=float(ratio.median()) if len(ratio) >= LEAST_INLIERS else None,
         seconds=seconds,
     )
-
-
-def log10_nfa(matches: int, agreeing: int, probability: float, sample: int = 3) -> float:
-    """Logarithm of the number of false alarms (Moisan and Stival 2004, eq. 10): how many poses with so much agreement
-    are to be expected among ``matches`` that are all wrong; below 0 it is no chance.
-
-    ``probability`` is that of a wrong match to agree with a pose; ``sample`` correspondences make a pose.
-    """
-    if agreeing <= sample:
-        return 0.0
-    log = (
-        math.log(max(1, matches - sample))
-        + _log_binomial(matches, agreeing)
-        + _log_binomial(agreeing, sample)
-        + (agreeing - sample) * math.log(probability)
-    )
-    return log / math.log(10)
-
-
-def _log_binomial(n: int, k: int) -> float:
-    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
 
 
 def _probability(images: Sequence[QueryImage], threshold: float) -> float:

@@ -14,7 +14,7 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 
 EXACT = 4_000
 """Landmarks up to which there are no cells."""
-COMPARISONS = 8_000_000
+COMPARISONS = 30_000_000
 """Of keypoints with landmarks, up to which comparing all of them is faster than looking up cells."""
 BLOCK = 64
 """Neighbouring columns whose least value is found first: sorting all of them would take longer than computing them."""
