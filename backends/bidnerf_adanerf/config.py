@@ -37,14 +37,12 @@ class AdaNerfConfig(Settings):
     learning_rate: NotNegative = 3e-3
     depth_weight: NotNegative = 0.1
     sparsity_weight: NotNegative = 0.01  # of the mean score, once the soft phase is half over
-    oracle_weight: NotNegative = (
-        0.1  # of the oracle's own loss, with measured depth and shaded bins as targets
-    )
+    # of the oracle's own loss, with measured depth and shaded bins as targets
+    oracle_weight: NotNegative = 0.1
     empty_weight: NotNegative = 0.1  # of the opacity of bins that are known to be empty
     carve: bool = True  # in training, treat bins as empty where depth and silhouettes leave no matter
-    room_resolution: Annotated[int, Range(2, 1024)] = (
-        64  # cells along the scene's longest side, for ``carve``
-    )
+    # cells along the scene's longest side, for ``carve``
+    room_resolution: Annotated[int, Range(2, 1024)] = 64
     seed: Annotated[int, Range(0)] = 0
 
     def __post_init__(self) -> None:

@@ -29,9 +29,8 @@ class FieldConfig(Settings):
     width: Count = 64  # of the hidden layers
     colour_layers: Count = 2  # hidden layers of the colour network
     geometry_features: Count = 15  # that the density network passes on to the colour network
-    grid_resolution: Annotated[int, Range(2, 1024)] = (
-        128  # cells of the occupancy grid along the longest side of the scene
-    )
+    # cells of the occupancy grid along the longest side of the scene
+    grid_resolution: Annotated[int, Range(2, 1024)] = 128
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 
 

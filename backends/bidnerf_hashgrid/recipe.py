@@ -33,9 +33,8 @@ class HashGridConfig(FieldConfig):
     prune_every: Count = 16  # steps from one update of the occupied cells to the next
     prune_fade: Annotated[float, Range(0, 1)] = 0.95  # factor on a cell's weight when rays visit it
     prune_threshold: NotNegative = 0.01  # rendering weight up to which a cell is empty
-    grow_until: NotNegative = (
-        0.6  # fraction of the steps in which neighbours of occupied cells are sampled too
-    )
+    # fraction of the steps in which neighbours of occupied cells are sampled too
+    grow_until: NotNegative = 0.6
     carve: bool = True  # begin with the cells that the views' depth and silhouettes leave
 
     def __post_init__(self) -> None:

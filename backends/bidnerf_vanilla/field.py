@@ -28,9 +28,8 @@ class FieldConfig(NetworkConfig):
 
     coarse_samples: Count = 64  # intervals of a ray at which the coarse network is evaluated
     fine_samples: Count = 32  # further intervals of the fine network, placed by the coarse one
-    room_resolution: Annotated[int, Range(2, 1024)] = (
-        64  # cells along the longest side of the scene; those that views show to be empty are skipped
-    )
+    # cells along the longest side of the scene; those that views show to be empty are skipped
+    room_resolution: Annotated[int, Range(2, 1024)] = 64
 
 
 class Level(nn.Module):

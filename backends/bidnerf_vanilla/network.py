@@ -21,9 +21,8 @@ class NetworkConfig(Settings):
     layers: Count = 4  # hidden layers before the density
     width: Count = 128  # of each; the layer that takes the direction has half of it
     skip: Annotated[int, Range(0)] = 2  # number of layers before the position is fed in once more; 0: never
-    position_frequencies: Annotated[int, Range(0, 64)] = (
-        8  # octaves of sines and cosines; the first has the scene's longest side as its period
-    )
+    # octaves of sines and cosines; the first has the scene's longest side as its period
+    position_frequencies: Annotated[int, Range(0, 64)] = 8
     direction_frequencies: Annotated[int, Range(0, 64)] = 2
     include_input: bool = True  # feed positions and directions themselves in, beside their sines
 

@@ -51,7 +51,7 @@ def run(arguments: list[str]) -> None:
         query: Annotated[
             tuple[Path, ...],
             tyro.conf.Positional,
-            option("QUERY...", "image files, folders of photos, or one folder of a dataset"),
+            option("QUERY...", "image files, folders of photos, or one folder of a dataset (required)", ""),
         ],
         *,
         depth: Annotated[
@@ -114,7 +114,7 @@ def run(arguments: list[str]) -> None:
         ] = None,
         seed: Annotated[int, option("N", "seed of all that is drawn at random")] = 0,
         json: Annotated[Flag, option(None, "print one JSON object a query, each on a line", "")] = False,
-        choice: SparseChoice = SparseChoice(),
+        model_points: SparseChoice = SparseChoice(),
         config: Any = kind(),
     ) -> None:
         """Find the poses of photos, or of frames of a dataset, in a map.
@@ -139,7 +139,7 @@ def run(arguments: list[str]) -> None:
             raise InputError(f"method {method!r} needs a start; give one, or take method 'auto'")
         output.prepare()
         stored = load_map(map)
-        points = None if depth_points is None else _depth_points(depth_points, stored, choice)
+        points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
         source = open_queries(query, photos, frames, stored.bounds.background, points)
         if perturb is not None and isinstance(source, Photos):
             raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")

@@ -92,7 +92,7 @@ def run(arguments: list[str]) -> None:
             option("MODEL", "COLMAP sparse model: its points are the depth of images that have none", ""),
         ] = None,
         no_bake: Annotated[Flag, option(None, "leave the surface to 'bidnerf bake'", "")] = False,
-        choice: SparseChoice = SparseChoice(),
+        model_points: SparseChoice = SparseChoice(),
         config: Any = kind(),
     ) -> None:
         """Make a map of a dataset.
@@ -107,7 +107,7 @@ def run(arguments: list[str]) -> None:
         if background is not None:
             with wrong_usage():
                 background_colour(background)
-        source = Source(data, split, background, depth_points, choice)
+        source = Source(data, split, background, depth_points, model_points)
         try:
             if resume:
                 info = load_interrupted(out, not no_bake)

@@ -45,12 +45,10 @@ class BidLmStages(Settings):
     fine_steps: Steps = 6  # of the best one, in full detail
     fine_rays: Rays = 1024
     blur: Annotated[int, Range(1, 10**4), EXPERT] = 8  # colours of coarse steps are means over so many pixels
-    centring: Annotated[int, Range(0, 100), EXPERT] = (
-        2  # times that poses are first centred on what was measured
-    )
-    depth_window: Annotated[NotNegative, EXPERT] = (
-        0.0  # metres about the depth that fine steps sample; 0: all
-    )
+    # times that poses are first centred on what was measured
+    centring: Annotated[int, Range(0, 100), EXPERT] = 2
+    # metres about the depth that fine steps sample; 0: all
+    depth_window: Annotated[NotNegative, EXPERT] = 0.0
 
 
 @dataclass(frozen=True)

@@ -30,9 +30,8 @@ from bidnerf_core.settings import EXPERT, Range, Settings
 class ColourRefinementSettings(Settings):
     """The last steps on colour alone."""
 
-    coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = (
-        4  # of each pose that the search left, coarsest level
-    )
+    # of each pose that the search left, coarsest level
+    coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = 4
     coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256  # for each of them
     fine_steps: Annotated[int, Range(1, 10**5)] = 8  # of the best one, in full detail
     fine_rays: Annotated[int, Range(7, 10**7)] = 1024

@@ -31,9 +31,8 @@ class DescentSettings(Settings):
     level: int | None = None  # of the field: 0 is the coarsest, None the field itself
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
     pivot: PivotName = "camera"  # what an update turns about: camera, world, or the middle of the scene
-    wide: Annotated[float, Above(0.0, 100.0)] = (
-        1.0  # sampled interval over [near, far]; the paper's "wide" is 2
-    )
+    # sampled interval over [near, far]; the paper's "wide" is 2
+    wide: Annotated[float, Above(0.0, 100.0)] = 1.0
     renew: Annotated[bool, EXPERT] = True  # draw pixels anew at each step; else once
 
 

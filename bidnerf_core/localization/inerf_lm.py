@@ -38,9 +38,8 @@ class ImageSearchSettings(Settings):
     middle_poses: Count = 6  # the best of these, which take more on larger ones
     middle_steps: Count = 6
     last_steps: Count = 4  # of the best two, on the largest renderings
-    width: Annotated[int, Range(4, 1000)] = (
-        16  # pixels along the first renderings' longer side; the last have 3 times
-    )
+    # pixels along the first renderings' longer side; the last have 3 times
+    width: Annotated[int, Range(4, 1000)] = 16
 
     def stages(self) -> tuple[ImageStage, ...]:
         return (

@@ -72,15 +72,12 @@ class AdamSettings(Settings):
     learning_rate: Annotated[float, Above(0.0, 1e3)] = 0.01  # metres and radians a step, at first
     decay: Annotated[float, Above(0.0, 1.0)] = 0.8  # factor on the learning rate ...
     decay_steps: Count = 100  # ... after so many steps
-    stop_loss: NotNegative = (
-        0.0  # stop once the mean loss of 20 steps is below it (epsilon of Alg. 1); 0: never
-    )
-    stop_step: Annotated[float, Range(0.0), EXPERT] = (
-        0.0  # stop once the mean length of 20 steps is; 0: never
-    )
-    answer: Annotated[AnswerName, EXPERT] = (
-        "last"  # the last pose, or that after the 20 steps of least mean loss
-    )
+    # stop once the mean loss of 20 steps is below it (epsilon of Alg. 1); 0: never
+    stop_loss: NotNegative = 0.0
+    # stop once the mean length of 20 steps is; 0: never
+    stop_step: Annotated[float, Range(0.0), EXPERT] = 0.0
+    # the last pose, or that after the 20 steps of least mean loss
+    answer: Annotated[AnswerName, EXPERT] = "last"
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
 
 
@@ -98,16 +95,14 @@ class RefinementSettings(Settings):
     """Second-order steps on rendered rays."""
 
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
-    pivot: Annotated[PivotName, EXPERT] = (
-        "scene"  # what an update turns about: middle of the scene, camera, world
-    )
+    # what an update turns about: middle of the scene, camera, world
+    pivot: Annotated[PivotName, EXPERT] = "scene"
     exposure: bool = False  # estimate a gain and a bias of each colour channel
     surface_sigma: NotNegative = 0.03  # metres by which the map's surfaces may be off, in coarse steps
     least_weight: Annotated[float, Range(0.0, 0.999999), EXPERT] = 0.01  # samples below it have no derivative
     stop_step: Annotated[float, Range(0.0), EXPERT] = 1e-4  # a stage ends at a shorter step (metres, radians)
-    window_samples: Annotated[int, Range(1, 10**4), EXPERT] = (
-        12  # within the depth window of a stage that has one
-    )
+    # within the depth window of a stage that has one
+    window_samples: Annotated[int, Range(1, 10**4), EXPERT] = 12
 
 
 @dataclass(frozen=True)
@@ -132,6 +127,5 @@ class RefinementStage:
     surface_sigma: float = 0.0  # metres by which surfaces may be off: steep residuals count for less
     window: float = 0.0  # metres about the measured depth that are sampled; 0: the whole ray
     damping: float = 1e-3  # at first
-    centring: int = (
-        0  # times that each pose is first shifted to bring what it renders to the middle of what was measured
-    )
+    # times that each pose is first shifted to bring what it renders to the middle of what was measured
+    centring: int = 0
