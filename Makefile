@@ -19,7 +19,7 @@ PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
 INSTALL = $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test check lint format types arrows clean
+.PHONY: help demo test check lint format types arrows docs clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
@@ -46,8 +46,11 @@ format: $(VENV)/.installed-dev ## put the code into shape
 	@$(BIN)/ruff check --fix --quiet || true
 	@$(BIN)/ruff format
 
+docs: $(VENV)/.installed-docs ## the documentation as a web site, in site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet && echo "open site/index.html"
+
 clean: ## remove what these targets made
-	rm -rf $(VENV) $(DEMO_OUT) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
+	rm -rf $(VENV) $(DEMO_OUT) site build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/pip:
@@ -61,7 +64,12 @@ $(VENV)/.installed-plots: $(REQUIREMENTS) | $(BIN)/pip
 	@$(INSTALL) -e '.[plots]' | $(SHOW_LONG)
 	@touch $@
 
+$(VENV)/.installed-docs: $(REQUIREMENTS) | $(BIN)/pip
+	@echo "installing bidnerf and what its documentation needs (minutes, the first time)"
+	@$(INSTALL) -e '.[docs]' | $(SHOW_LONG)
+	@touch $@
+
 $(VENV)/.installed-dev: $(REQUIREMENTS) | $(BIN)/pip
 	@echo "installing bidnerf, what it needs and what its tests need (minutes, the first time)"
 	@$(INSTALL) -e '.[dev]' | $(SHOW_LONG)
-	@touch $@ $(VENV)/.installed-plots
+	@touch $@ $(VENV)/.installed-plots $(VENV)/.installed-docs

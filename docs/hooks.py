@@ -1,0 +1,88 @@
+"""MkDocs hook: tables of settings, made from the dataclasses, so that the documentation cannot contradict the code.
+
+A line ``<!-- settings of METHOD -->`` in a page becomes the table of that method's settings.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import io
+import math
+import re
+import textwrap
+import tokenize
+import typing
+from typing import Any
+
+from bidnerf_core.localization import METHODS
+from bidnerf_core.settings import Above, OneOf, Range, is_expert
+
+MARKER = re.compile(r"^<!-- settings of ([a-z-]+) -->$", re.MULTILINE)
+HEAD = "| setting | default | values | meaning |\n| --- | --- | --- | --- |\n"
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Replace each marker by its table."""
+    return MARKER.sub(lambda found: settings_table(found[1]), markdown)
+
+
+def settings_table(method: str) -> str:
+    """Return the settings of a method, in the order of the code; those for experts are marked with an asterisk."""
+    return HEAD + "\n".join(_rows(METHODS[method].config_type()))
+
+
+def _rows(settings: Any, inside_expert: bool = False) -> typing.Iterator[str]:
+    """Yield a row for each setting, those of nested groups in their place."""
+    kind = type(settings)
+    comments, hints = field_comments(kind), typing.get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        expert = inside_expert or is_expert(kind, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _rows(value, expert)
+            continue
+        shown = f"`{field.name}`" + (" \\*" if expert else "")
+        cells = (shown, f"`{value}`", _allowed(hints[field.name]), comments.get(field.name, ""))
+        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _allowed(hint: Any) -> str:
+    """Return the values that an annotation allows, in words."""
+    for note in getattr(hint, "__metadata__", ()):
+        if isinstance(note, OneOf):
+            return ", ".join(note.table)
+        if isinstance(note, Range):
+            return _interval(note)
+    for part in (hint, *typing.get_args(hint)):
+        if typing.get_origin(part) is typing.Literal:
+            return ", ".join(typing.get_args(part))
+    return {bool: "true or false"}.get(hint, "")
+
+
+def _interval(allowed: Range) -> str:
+    least, most = f"{allowed.least:,g}", f"{allowed.most:,.0f}" if allowed.most >= 1 else f"{allowed.most:g}"
+    if isinstance(allowed, Above):
+        return f"above {least}"
+    return f"{least} or more" if math.isinf(allowed.most) else f"{least} to {most}"
+
+
+def field_comments(kind: type) -> dict[str, str]:
+    """Return the comments that stand on the lines of each field of a dataclass."""
+    source = textwrap.dedent(inspect.getsource(kind))
+    comments = {
+        token.start[0]: token.string.lstrip("# ").strip()
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    }
+    body = typing.cast(ast.ClassDef, ast.parse(source).body[0]).body
+    fields = [node for node in body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)]
+    return {
+        typing.cast(ast.Name, node.target).id: " ".join(
+            comments[line]
+            for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+            if line in comments
+        )
+        for node in fields
+    }

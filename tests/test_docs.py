@@ -1,0 +1,270 @@
+"""The documentation is true: its programs run, its commands parse, its tables are complete, and it builds without a warning."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import tyro
+
+import bidnerf_core
+import docs_workspace
+import tiny
+from bidnerf_core import Localization, Localizer, Map, Outcome, residuals
+from bidnerf_core.cli import COMMANDS, main
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.localization import METHODS, AutoConfig, settings_of
+from bidnerf_core.localization.auto import auto
+from bidnerf_core.localization.by_colour import ByColourConfig, ColourRefinementSettings
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.se3 import SE3
+from bidnerf_core.storage import MapInfo
+from bidnerf_core.training import Silent
+from tiny import backends_listed_once  # noqa: F401
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+NOT_RUN: dict[tuple[str, str], str] = {}
+"""Python blocks that are not executed, by page and first line, each with the reason."""
+TOO_SLOW = {"train", "demo", "evaluate", "compare", "report"}
+"""Commands that are only parsed: they take minutes, or the results of one that does."""
+OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest"}
+"""Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""
+LANGUAGES = {"python", "sh", "toml", "bibtex"}
+
+every_page = pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+
+
+@dataclass(frozen=True)
+class Block:
+    language: str
+    text: str
+    line: int  # of its first line in the page
+
+
+def blocks(page: Path, language: str | None = None) -> list[Block]:
+    """Return the fenced blocks of a page."""
+    text = page.read_text(encoding="utf-8")
+    found = [Block(m[1], m[2], text[: m.start(2)].count("\n") + 1) for m in FENCE.finditer(text)]
+    return [block for block in found if language is None or block.language == language]
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """Yield the words of each command in the page's shell blocks, without comments."""
+    for block in blocks(page, "sh"):
+        for line in block.text.replace("\\\n", " ").splitlines():
+            for part in line.split("&&"):
+                if words := shlex.split(part, comments=True):
+                    yield words
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("docs")
+    docs_workspace.fill(folder)
+    return folder
+
+
+@pytest.fixture
+def inside(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the workspace as the current folder, so that no page depends on the files of another."""
+    copy = shutil.copytree(workspace, tmp_path / "workspace")
+    monkeypatch.chdir(copy)
+    return Path(copy)
+
+
+@pytest.fixture
+def quick_auto(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Method ``auto`` with few hypotheses and one round: that it finds poses is tested elsewhere."""
+    steps = ColourRefinementSettings(coarse_steps=1, coarse_rays=32, fine_steps=1, fine_rays=64)
+
+    def quick(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
+        few = dataclasses.replace(
+            config, points=200, hypotheses=8, rounds=1, refine_rays=64, by_colour=ByColourConfig(steps)
+        )
+        return auto(problem, few, seed)
+
+    monkeypatch.setitem(METHODS, "auto", dataclasses.replace(METHODS["auto"], run=quick))
+
+
+def given(page: Path) -> dict[str, Any]:
+    """Return what a page says that its reader has: for the loop, a sensor and its camera."""
+    if page.stem != "embedding":
+        return {}
+    moments = [
+        (v.frame.rgb, (v.frame.depth * 1000).int().numpy().astype("uint16"), SE3.identity())
+        for v in tiny.views(2)
+    ]
+    return {"sensor": moments, "camera": tiny.CAMERA}
+
+
+def executed(page: Path) -> dict[str, Any]:
+    """Run the page's Python blocks one after the other in one namespace, and return it."""
+    module = ModuleType(f"docs_{page.stem.replace('-', '_')}")
+    sys.modules[module.__name__] = module  # where dataclasses look for the names of annotations
+    namespace = vars(module)
+    namespace.update(given(page))
+    for block in blocks(page, "python"):
+        if (page.name, block.text.splitlines()[0]) not in NOT_RUN:
+            padded = "\n" * (block.line - 1) + block.text  # errors then name the line of the page
+            exec(compile(padded, str(page), "exec"), namespace)
+    return namespace
+
+
+@every_page
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.usefixtures("backends_listed_once", "quick_auto")
+def test_python_blocks_run(page: Path, inside: Path) -> None:
+    before = dict(residuals.DEPTH_RESIDUALS)
+    try:
+        executed(page)
+    finally:
+        residuals.DEPTH_RESIDUALS.clear()
+        residuals.DEPTH_RESIDUALS.update(before)
+
+
+def test_blocks_that_are_not_run_exist() -> None:
+    found = {(page.name, block.text.splitlines()[0]) for page in PAGES for block in blocks(page, "python")}
+    assert set(NOT_RUN) <= found
+
+
+@every_page
+def test_blocks_are_of_known_languages(page: Path) -> None:
+    assert {block.language for block in blocks(page)} <= LANGUAGES
+    for block in blocks(page, "toml"):
+        tomllib.loads(block.text)
+
+
+@every_page
+@pytest.mark.usefixtures("backends_listed_once", "quick_auto")
+def test_bidnerf_commands_work(page: Path, inside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that are quick are run on tiny files; the others are parsed."""
+    parsers = {True: tyro.cli, False: parsed_only(tyro.cli)}
+    for program, *arguments in commands(page):
+        if program == "bidnerf":
+            monkeypatch.setattr(tyro, "cli", parsers[arguments[0] not in TOO_SLOW])
+            assert main(arguments) == 0, shlex.join([program, *arguments])
+
+
+def parsed_only(parser: Any) -> Any:
+    """Return tyro's parser such that it does not call what it parsed the arguments for."""
+
+    def cli(function: Any, *rest: Any, **options: Any) -> Any:
+        @functools.wraps(function)
+        def nothing(*_: Any, **__: Any) -> None:
+            return None
+
+        return parser(nothing, *rest, **options)
+
+    return cli
+
+
+@every_page
+def test_other_commands_name_what_exists(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for program, *arguments in commands(page):
+        if program == "make":
+            assert set(arguments) <= targets
+        elif program == "pip":
+            assert extras(arguments) <= {*PROJECT["optional-dependencies"], "test"}
+        elif program == "cp":
+            assert (ROOT / arguments[1]).exists()
+        else:
+            assert program in {"bidnerf", *OTHER_PROGRAMS}
+
+
+def extras(arguments: list[str]) -> set[str]:
+    return {name for word in arguments for name in re.findall(r"\[([\w,]+)\]", word)}
+
+
+@pytest.mark.usefixtures("backends_listed_once", "quick_auto")
+def test_the_backend_of_the_readme_trains_and_localizes(inside: Path) -> None:
+    namespace = executed(ROOT / "README.md")
+    backend, scene, views = namespace["backend"], demo_object(), tiny.views(16)
+    config = namespace["FogConfig"](cells=24, steps=120)
+    field = backend.build(config, scene.bounds)
+    backend.train(field, views, config, Silent())
+    stored = Map(MapInfo("fog", {}, scene.bounds, config.steps, complete=True), field.requires_grad_(False))
+    (unseen,) = tiny.views(1, seed=5)
+    start = perturb(unseen.T_ref_camera, 0.3, 8.0, seed=0)
+    settings = settings_of("bid", {"rays": 512, "max_steps": 80})
+    found = Localizer(stored, "bid", settings)(unseen.frame, start)
+    before, after = (
+        float(pose_error(T, unseen.T_ref_camera).translation) for T in (start, found.T_world_camera)
+    )
+    assert after < 0.5 * before
+
+
+def test_readme_is_short() -> None:
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    program = blocks(ROOT / "README.md", "python")[0].text
+    assert len(program.splitlines()) <= 8
+
+
+def test_links_of_the_readme_lead_somewhere() -> None:
+    targets = re.findall(r"\]\(([^)#]+)", (ROOT / "README.md").read_text())
+    assert targets
+    assert [target for target in targets if not (ROOT / target).exists()] == []
+
+
+@pytest.mark.parametrize(
+    "record", sorted((ROOT / "benchmarks" / "results").glob("*.json")), ids=lambda path: path.stem
+)
+def test_every_record_is_on_the_page_of_results(record: Path) -> None:
+    assert f"`{record.stem}`" in (ROOT / "docs" / "results.md").read_text()
+
+
+@pytest.mark.parametrize("outcome", [outcome for outcome in Outcome if outcome is not Outcome.CONVERGED])
+def test_every_outcome_has_advice(outcome: Outcome) -> None:
+    assert f"\n### {outcome}\n" in (ROOT / "docs" / "troubleshooting.md").read_text()
+
+
+def test_commands_and_methods_are_documented() -> None:
+    table = set(re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "cli.md").read_text(), re.MULTILINE))
+    assert set(COMMANDS) <= table
+    methods = (ROOT / "docs" / "methods.md").read_text()
+    assert [name for name in METHODS if f"<!-- settings of {name} -->" not in methods] == []
+
+
+def test_public_names_are_in_the_reference() -> None:
+    listed = re.findall(r"^::: [\w.]*?(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    assert sorted(set(bidnerf_core.__all__) - set(listed)) == []
+
+
+def test_site_builds_strictly_and_needs_no_network(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="the documentation's tools are not installed")
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--quiet",
+        "--site-dir",
+        str(tmp_path / "site"),
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) >= len(PAGES) - 1
+    fetched = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=\"?(?:https?:)?//[^\s\">]+")
+    assert {hit for page in pages for hit in fetched.findall(page.read_text())} == set()
+    assert "settings of" not in (tmp_path / "site" / "methods.html").read_text()
