@@ -67,6 +67,7 @@ class AutoConfig(Settings):
     refine_steps: Annotated[int, Range(0, 1000)] = 2  # on rendered rays, of an answer by depth; 0: none
     refine_rays: Annotated[int, Range(64, 10**6)] = 512
     landmarks: bool = True  # match image features with the map's landmarks first, where it has some
+    fused_rays: Annotated[int, Range(0, 10**6)] = 1024  # rendered, and fused with landmarks; 0: none
     by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
 
 
@@ -77,9 +78,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     """
     began, answer = time.perf_counter(), None
     if problem.matcher is not None and config.landmarks:
-        answer = answer_by_landmarks(
-            problem, problem.matcher, config.refine_rays if config.refine_steps else 0, seed
-        )
+        answer = answer_by_landmarks(problem, problem.matcher, config.fused_rays, seed)
     if answer is not None and landmark_verdict(answer.found).accepted:
         return localization_by_landmarks(problem, answer, began)
     if answer is not None and problem.start is None:
