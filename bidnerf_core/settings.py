@@ -51,9 +51,8 @@ class Above(Range):
         return f"more than {self.least:,}" + ("" if self.most == math.inf else f", at most {self.most:,}")
 
 
-@dataclass(
-    frozen=True, eq=False
-)  # hashed by identity, as the command line's parser needs: a table has no hash
+# Compared and hashed by identity, since the command line's parser hashes it and a table has no hash.
+@dataclass(frozen=True, eq=False)
 class OneOf:
     """The names that a setting may take, where they are those of a table that users may extend."""
 
