@@ -56,7 +56,13 @@ class Sift:
         0.01  # under which an extremum is no keypoint; OpenCV's default of 0.04 leaves few indoors
     )
 
+    # Pixels along the longer side above which an image is reduced first: a phone's twelve megapixels hold no more
+    # keypoints of the sizes that maps are made of, and take half a minute.
+    largest: int = 800
+
     def __post_init__(self) -> None:
+        if self.largest < 16:
+            raise InputError(f"largest side of an image is {self.largest} pixels, expected at least 16")
         if self.count < 1:
             raise InputError(f"count of keypoints is {self.count}, expected at least 1")
         if not 0 <= self.contrast < 1:
@@ -68,11 +74,12 @@ class Sift:
         sift = cv2.SIFT.create(
             nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True
         )
-        found, descriptors = sift.detectAndCompute(_grey(rgb), None)
+        grey, scale = _reduced(_grey(rgb), self.largest)
+        found, descriptors = sift.detectAndCompute(grey, None)
         if descriptors is None or not len(found):
             return Keypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros((0, 128), dtype=torch.uint8))
-        pixels = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32) + FIRST_CENTRE
-        sizes = np.array([keypoint.size for keypoint in found], dtype=np.float32)
+        pixels = (np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32) + FIRST_CENTRE) / scale
+        sizes = np.array([keypoint.size for keypoint in found], dtype=np.float32) / scale.mean()
         root = root_normalized(torch.from_numpy(np.asarray(descriptors, dtype=np.float32)))
         return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantized(root))
 
@@ -111,3 +118,14 @@ def paired_squared_distances(
 def _grey(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
     clean = rgb.detach().cpu().float().nan_to_num(0.0).clamp(0, 1)
     return cv2.cvtColor((clean * 255).round().to(torch.uint8).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
+
+
+def _reduced(grey: np.ndarray, largest: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the image with at most ``largest`` pixels along its longer side, and its scale (x, y)."""
+    height, width = grey.shape
+    factor = largest / max(height, width)
+    if factor >= 1:
+        return grey, np.ones(2, dtype=np.float32)
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    scale = np.array([size[0] / width, size[1] / height], dtype=np.float32)
+    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA), scale
