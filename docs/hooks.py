@@ -69,7 +69,7 @@ def _interval(allowed: Range) -> str:
 
 
 def field_comments(kind: type) -> dict[str, str]:
-    """Return the comments that stand on the lines of each field of a dataclass."""
+    """Return the comments on the lines of each field of a dataclass, or else those in the lines right above it."""
     source = textwrap.dedent(inspect.getsource(kind))
     comments = {
         token.start[0]: token.string.lstrip("# ").strip()
@@ -79,10 +79,15 @@ def field_comments(kind: type) -> dict[str, str]:
     body = typing.cast(ast.ClassDef, ast.parse(source).body[0]).body
     fields = [node for node in body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)]
     return {
-        typing.cast(ast.Name, node.target).id: " ".join(
-            comments[line]
-            for line in range(node.lineno, (node.end_lineno or node.lineno) + 1)
-            if line in comments
-        )
+        typing.cast(ast.Name, node.target).id: _comment(node, source.splitlines(), comments)
         for node in fields
     }
+
+
+def _comment(field: ast.AnnAssign, lines: list[str], comments: dict[int, str]) -> str:
+    beside = range(field.lineno, (field.end_lineno or field.lineno) + 1)
+    first = field.lineno
+    while lines[first - 2].lstrip().startswith("#"):
+        first -= 1
+    found = [comments[line] for line in beside if line in comments]
+    return " ".join(found or [comments[line] for line in range(first, field.lineno)])

@@ -37,13 +37,13 @@ class BidLmStages(Settings):
 
     search_rays: ExpertRays = 128  # for each of the poses about the start
     coarse_poses: Poses = 6  # the best of these, which take steps at the coarsest level
-    coarse_steps: ExpertSteps = 4
+    coarse_steps: ExpertSteps = 4  # that each of them takes
     coarse_rays: ExpertRays = 128  # for each of them
     middle_poses: Poses = 2  # the best of these, which take more
-    middle_steps: ExpertSteps = 4
-    middle_rays: ExpertRays = 256
+    middle_steps: ExpertSteps = 4  # that each of them takes
+    middle_rays: ExpertRays = 256  # for each of them
     fine_steps: Steps = 6  # of the best one, in full detail
-    fine_rays: Rays = 1024
+    fine_rays: Rays = 1024  # rendered for each of these steps
     blur: Annotated[int, Range(1, 10**4), EXPERT] = 8  # colours of coarse steps are means over so many pixels
     # times that poses are first centred on what was measured
     centring: Annotated[int, Range(0, 100), EXPERT] = 2

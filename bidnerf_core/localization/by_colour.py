@@ -34,7 +34,7 @@ class ColourRefinementSettings(Settings):
     coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = 4
     coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256  # for each of them
     fine_steps: Annotated[int, Range(1, 10**5)] = 8  # of the best one, in full detail
-    fine_rays: Annotated[int, Range(7, 10**7)] = 1024
+    fine_rays: Annotated[int, Range(7, 10**7)] = 1024  # rendered for each of these steps
 
 
 @dataclass(frozen=True)

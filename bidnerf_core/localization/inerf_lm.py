@@ -34,9 +34,9 @@ class ImageSearchSettings(Settings):
     """Small renderings of the poses about the start, ever larger and of ever fewer."""
 
     search_poses: Count = 24  # the best of the poses, which take steps on small renderings
-    search_steps: Count = 8
+    search_steps: Count = 8  # that each of them takes
     middle_poses: Count = 6  # the best of these, which take more on larger ones
-    middle_steps: Count = 6
+    middle_steps: Count = 6  # that each of them takes
     last_steps: Count = 4  # of the best two, on the largest renderings
     # pixels along the first renderings' longer side; the last have 3 times
     width: Annotated[int, Range(4, 1000)] = 16
