@@ -33,11 +33,9 @@ class Range:
         return math.isfinite(value) and self.least <= value <= self.most
 
     def __str__(self) -> str:
-        return (
-            f"a number from {self.least:,} up"
-            if self.most == math.inf
-            else f"{self.least:,} to {self.most:,}"
-        )
+        if self.most == math.inf:
+            return f"a number from {_written(self.least)} up"
+        return f"{_written(self.least)} to {_written(self.most)}"
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,13 @@ class Above(Range):
         return super().__contains__(value) and value != self.least
 
     def __str__(self) -> str:
-        return f"more than {self.least:,}" + ("" if self.most == math.inf else f", at most {self.most:,}")
+        least = f"more than {_written(self.least)}"
+        return least if self.most == math.inf else f"{least}, at most {_written(self.most)}"
+
+
+def _written(limit: float) -> str:
+    """Return a limit as a message shows it: 1 and 1.0 alike, since ``Annotated`` takes equal ranges for the same one."""
+    return f"{int(limit) if float(limit).is_integer() else limit:,}"
 
 
 # Compared and hashed by identity, since the command line's parser hashes it and a table has no hash.

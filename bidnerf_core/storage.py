@@ -121,7 +121,9 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     """Write a map, and remove the files of an earlier one once the new one is complete."""
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
     training = None if info.complete else f"training-{name}"
-    info = replace(info, weights=f"weights-{name}", training=training, surface=None, landmarks=None)
+    info = replace(
+        info, weights=f"weights-{name}", training=training, surface=None, landmarks=None, colour_noise=None
+    )
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     folder.mkdir(parents=True, exist_ok=True)
     try:

@@ -157,7 +157,7 @@ def test_best_is_no_worse_than_last_by_its_own_measure(problem: Problem) -> None
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"stop_step": -1.0}, "stop_step is -1.0, expected a number from 0.0 up"),
+        ({"stop_step": -1.0}, "stop_step is -1.0, expected a number from 0 up"),
         ({"stop_loss": -1.0}, "stop_loss is -1.0"),
         ({"colour_scale": 0.0}, "colour_scale is 0.0"),
         ({"rays": 0}, "rays is 0"),
@@ -171,7 +171,7 @@ def test_bad_settings_are_named(settings: dict[str, float], message: str) -> Non
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_thresholds_are_finite(value: float) -> None:
-    with pytest.raises(InputError, match=f"stop_loss is {value}, expected a number from 0.0 up"):
+    with pytest.raises(InputError, match=f"stop_loss is {value}, expected a number from 0 up"):
         AdamSettings(stop_loss=value)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.localization.normal_equations import Cost, NormalEquations, Sum
+from bidnerf_core.localization.normal_equations import Cost, NormalEquations, Scaled, Sum
 from bidnerf_core.se3 import SE3
 
 
@@ -62,6 +62,20 @@ def test_a_sum_of_costs_is_a_cost(generator: Generator) -> None:
         expected = sum(getattr(part, name) for part in parts)
         torch.testing.assert_close(getattr(found, name), expected, rtol=0, atol=0)
     assert Sum((lambda T: parts[0],))(SE3.identity()[None]) is parts[0]
+
+
+@pytest.mark.parametrize("factor", [0.25, 1.0, 1000.0])
+def test_a_scaled_cost_takes_the_same_steps_and_weighs_more_in_a_sum(
+    factor: float, generator: Generator
+) -> None:
+    parts, here = random(3, generator), SE3.identity()[None]
+    scaled = Scaled(lambda T: parts, factor)
+    assert isinstance(scaled, Cost)
+    found, damping = scaled(here), torch.full((3,), 1e-3, dtype=torch.float64)
+    for name in ("cost", "gradient", "hessian"):
+        torch.testing.assert_close(getattr(found, name), factor * getattr(parts, name))
+    torch.testing.assert_close(found.solve(damping), parts.solve(damping), rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(Sum((scaled, lambda T: parts))(here).cost, (factor + 1) * parts.cost)
 
 
 def test_equations_are_chosen_pose_by_pose(generator: Generator) -> None:

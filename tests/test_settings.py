@@ -42,7 +42,7 @@ def test_both_ends_of_a_range_are_allowed(value: float) -> None:
 
 @pytest.mark.parametrize("value", [-1e-12, 1.0 + 1e-12, math.nan, math.inf, -math.inf])
 def test_values_beyond_a_range_are_refused(value: float) -> None:
-    with pytest.raises(InputError, match=rf"^share is {value}, expected 0.0 to 1.0$"):
+    with pytest.raises(InputError, match=rf"^share is {value}, expected 0 to 1$"):
         Inner(share=value)
 
 
@@ -50,14 +50,22 @@ def test_above_leaves_out_its_lower_end_only() -> None:
     assert Inner(scale=5e-324).scale == 5e-324
     assert Inner(scale=10.0).scale == 10.0
     for value in (0.0, -0.0, 10.1, math.nan):
-        with pytest.raises(InputError, match=r"expected more than 0.0, at most 10.0"):
+        with pytest.raises(InputError, match=r"expected more than 0, at most 10"):
             Inner(scale=value)
+
+
+def test_a_message_is_the_same_whichever_equal_range_was_declared_first() -> None:
+    """``Annotated`` caches by equality, so that the limits shown may be those of another module's declaration."""
+    assert str(Range(0, 1)) == str(Range(0.0, 1.0)) == "0 to 1"
+    assert str(Above(0, 0.5)) == "more than 0, at most 0.5"
+    assert str(Above(0.25)) == "more than 0.25"
+    assert str(Range(1, 1e7)) == "1 to 10,000,000"
 
 
 def test_a_range_without_an_upper_end_is_finite() -> None:
     assert Inner(any_size=1e300).any_size == 1e300
     for value in (math.inf, math.nan, -1.0):
-        with pytest.raises(InputError, match=r"^any_size is .*, expected a number from 0.0 up$"):
+        with pytest.raises(InputError, match=r"^any_size is .*, expected a number from 0 up$"):
             Inner(any_size=value)
 
 
@@ -90,7 +98,7 @@ def test_flat_names_set_what_is_nested() -> None:
         ({"shar": 0.1}, "^here: Outer has no setting 'shar', did you mean 'share'[?]$"),
         ({"zzz": 0.1}, "^here: Outer has no setting 'zzz', expected some of share, scale, .*free$"),
         ({"inner": {}}, "^here: Outer has no setting 'inner'"),
-        ({"share": 2.0}, "^here: .*share is 2.0, expected 0.0 to 1.0$"),
+        ({"share": 2.0}, "^here: .*share is 2.0, expected 0 to 1$"),
         ({"share": "much"}, "^here: .*share: found 'much', expected float$"),
         ({"rays": 1.5}, "^here: .*rays: found 1.5, expected int$"),
         ({"rays": 0}, "^here: .*rays is 0, expected 1 to 10,000,000$"),

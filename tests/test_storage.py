@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import itertools
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -161,7 +162,7 @@ def outcomes(attempt: Callable[[], object], error: BaseException) -> Iterator[Ba
     for number in itertools.count():
         calls: list[object] = []
         with pytest.MonkeyPatch.context() as patch:
-            for owner, name in ((Path, "open"), (Path, "replace"), (storage.os, "fsync")):
+            for owner, name in ((Path, "open"), (Path, "replace"), (os, "fsync")):
                 patch.setattr(owner, name, _striking(getattr(owner, name), calls, number, error))
             try:
                 attempt()
@@ -318,7 +319,7 @@ def test_a_surface_comes_back_as_it_was(tmp_path: Path) -> None:
     assert isinstance(loaded.field, nn.Module)
     assert_equal(loaded.field.state_dict(), state().field)
     assert names(tmp_path) == {"map.json", saved.weights, saved.training, saved.surface}
-    assert load_map(tmp_path, surface=False).surface is None
+    assert load_map(tmp_path, baked=False).surface is None
 
 
 def test_a_new_surface_replaces_the_old_one_and_training_drops_it(tmp_path: Path) -> None:
@@ -373,6 +374,6 @@ def test_a_damaged_surface_is_named(content: Any, said: str, tmp_path: Path) -> 
         load_map(tmp_path)
     assert str(path) in str(told.value)
     assert "\n" not in str(told.value)
-    assert load_map(tmp_path, surface=False).surface is None
+    assert load_map(tmp_path, baked=False).surface is None
     save_surface(tmp_path, load_info(tmp_path), baked.patch())  # which mends it
     assert load_map(tmp_path).surface is not None

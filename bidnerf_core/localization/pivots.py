@@ -47,9 +47,12 @@ class Pivot:
 
     def at_camera(self, T: SE3, covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
         """Convert the covariance of an update at the pivot to that of a right update of ``T`` (Sola et al. 2018, eq. 54)."""
-        T_camera_pivot = T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot
-        carried = T_camera_pivot.adjoint()
+        carried = self.update_at_camera(T)
         return carried @ covariance @ carried.mT
+
+    def update_at_camera(self, T: SE3) -> Float[Tensor, "*h 6 6"]:
+        """Return the matrix that converts an update at the pivot to the right update of ``T`` that moves it alike."""
+        return (T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot).adjoint()
 
 
 def pivot(name: PivotName, problem: Problem) -> Pivot:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.se3 import SE3
+from bidnerf_core.se3 import SE3, se3_right_jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,21 +18,18 @@ class GaussianPrior:
     """The squared Mahalanobis distance of poses from a mean; updates turn about ``pivot``."""
 
     mean: SE3  # T_world_camera
-    covariance: Float[
-        Tensor, "6 6"
-    ]  # of a right update of the mean: translation (metres), rotation (radians)
+    covariance: Float[Tensor, "6 6"]  # of a right update of the mean (metres, radians); float64
     pivot: Pivot
 
     def __call__(self, T: SE3) -> NormalEquations:
         inverse = self.mean.inverse()
         off = (SE3(inverse.rotation[None], inverse.translation[None]) @ T).log()
+        # log(exp(off) exp(d)) = off + J_r(off)^-1 d to first order (Sola et al. 2018, eq. 76).
+        off_by_update = torch.linalg.inv(se3_right_jacobian(off)) @ self.pivot.update_at_camera(T)
         information = torch.linalg.inv(self.covariance)
-        # To first order in the distance from the mean an update at the pivot is Ad(T_camera_pivot) times it at the camera.
-        T_camera_pivot = self.pivot.T_camera_pivot
-        by_update = (self.mean.inverse() if T_camera_pivot is None else T_camera_pivot).adjoint()
-        pulled = information @ by_update
+        pulled = information @ off_by_update
         return NormalEquations(
             torch.einsum("hi,ij,hj->h", off, information, off),
-            off @ pulled,
-            (by_update.mT @ pulled).expand(len(off), 6, 6),
+            torch.einsum("hi,hij->hj", off, pulled),
+            off_by_update.mT @ pulled,
         )

@@ -1,0 +1,94 @@
+"""A textured hilly ground in closed form, whose images have keypoints: what tests of landmarks beside a field share."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
+from bidnerf_core.mapping.landmark_building import build_landmarks
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.rendering import render_image
+from bidnerf_core.sampling import Stratified
+from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.se3 import SE3
+
+BOUNDS = SceneBounds((-1.2, -1.2, -0.3), (1.2, 1.2, 0.3), 0.1, 6.0)
+CAMERA = Intrinsics(130.0, 130.0, 64.0, 48.0, 128, 96)
+DENSITY = 120.0  # per metre, well below the ground
+SOFTNESS = 0.01  # metres over which the density rises
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedGround:
+    """A ground of height ``h(x, y)`` whose colours are sums of random waves; infinitely differentiable."""
+
+    seed: int = 0
+    sampler: RaySampler = field(default_factory=lambda: Stratified(64))
+    waves: Float[Tensor, "2 w"] = field(init=False)  # radians per metre
+    phases: Float[Tensor, "w"] = field(init=False)
+    weights: Float[Tensor, "w 3"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        generator = torch.Generator().manual_seed(self.seed)
+        values = {
+            "waves": 18 * torch.randn((2, 24), generator=generator),
+            "phases": 6.3 * torch.rand(24, generator=generator),
+            "weights": 0.3 * torch.randn((24, 3), generator=generator),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        x, y, z = positions.unbind(-1)
+        height = 0.12 * (3 * x).sin() * (2.5 * y + 1).sin()
+        density = DENSITY * torch.sigmoid((height - z) / SOFTNESS)
+        signal = (positions[..., :2] @ self.waves.to(positions) + self.phases.to(positions)).sin()
+        return FieldValues(density, torch.sigmoid(2 * signal @ self.weights.to(positions)))
+
+
+@dataclass(frozen=True, eq=False)
+class MapWithLandmarks:
+    """A field as a map with everything that is baked beside it."""
+
+    field: TexturedGround
+    bounds: SceneBounds
+    landmarks: LandmarkMap | None
+    surface: SurfaceMap | None = None
+    colour_noise: float | None = 0.0
+
+
+@functools.cache
+def ground(seed: int = 0) -> TexturedGround:
+    return TexturedGround(seed)
+
+
+def view(T: SE3, name: str = "", seed: int = 0) -> View:
+    """Return an image of the ground with its depth."""
+    image = render_image(ground(seed), CAMERA, T, BOUNDS)
+    return View(Frame(name, image.rgb, CAMERA, torch.where(image.opacity > 0.95, image.depth, 0)), T)
+
+
+@functools.cache
+def training_views(count: int = 10) -> tuple[View, ...]:
+    poses = orbit(1.8, count, elevation=(45.0, 75.0), seed=0)
+    return tuple(view(T, f"{number:04d}") for number, T in enumerate(poses))
+
+
+@functools.cache
+def unseen() -> View:
+    """Return an image that gave no landmark."""
+    return view(orbit(1.7, 3, elevation=(50.0, 70.0), seed=5)[1], "unseen")
+
+
+@functools.cache
+def textured_map(surface: bool = False) -> MapWithLandmarks:
+    baked = bake(ground(), BOUNDS, [], training_views(), BakeConfig(cells=200_000)) if surface else None
+    return MapWithLandmarks(ground(), BOUNDS, build_landmarks(training_views()), baked)
