@@ -34,7 +34,7 @@ Json = dict[str, Any]
 def pose_of(number: int) -> np.ndarray:
     """Camera to world, OpenGL axes: near the origin and looking along -z, slightly turned."""
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("xyz", [0.02 * number, -0.03 * number, 0.05 * number]).as_matrix()
+    pose[:3, :3] = Rotation.from_euler("xyz", (number + 1) * np.array([0.02, -0.03, 0.05])).as_matrix()
     pose[:3, 3] = [0.05 * number, 0.02 * number, 0.1]
     return pose
 
@@ -115,7 +115,7 @@ def test_pixels_and_depth_reproject_to_the_scene(scan: Path) -> None:
     for view in every_view(open_dataset(scan)).values():
         assert edge_error(view) < 3e-4
         for shift in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)):
-            assert edge_error(moved(view, *shift)) > 2 * edge_error(view)
+            assert edge_error(moved(view, *shift)) > 1.5 * edge_error(view)
 
 
 def moved(view: View, right: float, down: float) -> View:
@@ -138,7 +138,8 @@ def test_poses_have_opencv_axes(scan: Path) -> None:
     view = every_view(open_dataset(scan))["frame_10"]
     pose = pose_of(3)
     ahead, down = view.T_ref_camera.rotate(torch.tensor([[0.0, 0, 1], [0, 1, 0]], dtype=torch.float64))
-    assert np.allclose(ahead, -pose[:3, 2]) and np.allclose(down, -pose[:3, 1])
+    assert np.allclose(ahead, -pose[:3, 2])
+    assert np.allclose(down, -pose[:3, 1])
     assert np.allclose(view.T_ref_camera.translation, pose[:3, 3])
 
 
@@ -206,8 +207,18 @@ def truncate(file: Path, size: int) -> None:
     file.write_bytes(file.read_bytes()[:size])
 
 
-def confidence(folder: Path, value: int, shape: tuple[int, ...] = SMALL[::-1]) -> None:
+def write_confidence(folder: Path, value: int, shape: tuple[int, ...] = SMALL[::-1]) -> None:
     iio.imwrite(folder / "conf_2.png", np.full(shape, value, np.uint8))
+
+
+def square_depth(folder: Path) -> None:
+    iio.imwrite(folder / "depth_2.png", np.ones((9, 9), np.uint16))
+    write_confidence(folder, 2, (9, 9))
+
+
+def remove_photos(folder: Path) -> None:
+    for photo in folder.glob("*.jpg"):
+        photo.unlink()
 
 
 BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
@@ -218,12 +229,15 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "cut depth": (lambda f: truncate(f / "depth_2.png", 90), r"depth_2\.png: not readable as an image"),
     "cut json": (lambda f: truncate(f / "frame_2.json", 90), r"frame_2\.json: broken JSON at line 1"),
     "conf of 255": (
-        lambda f: confidence(f, 255),
+        lambda f: write_confidence(f, 255),
         r"conf_2\.png: has values up to 255, expected .* 0, 1 and 2",
     ),
-    "conf size": (lambda f: confidence(f, 2, (4, 5)), r"conf_2\.png: is 5x4, expected 64x48 as depth_2"),
+    "conf size": (
+        lambda f: write_confidence(f, 2, (4, 5)),
+        r"conf_2\.png: is 5x4, expected 64x48 as depth_2",
+    ),
     "depth shape": (
-        lambda f: (iio.imwrite(f / "depth_2.png", np.ones((9, 9), np.uint16)), confidence(f, 2, (9, 9))),
+        square_depth,
         r"depth_2\.png: depth is 9x9, its image 960x720; expected the same aspect ratio",
     ),
     "scaled pose": (
@@ -255,7 +269,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda f: iio.imwrite(f / "frame_2.jpg", np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8)),
         r"intrinsics are not of its photo of 480x360; expected intrinsics scaled with the photo",
     ),
-    "no photos": (lambda f: [p.unlink() for p in f.glob("*.jpg")], r"scan: has frame_N.json but no photo"),
+    "no photos": (remove_photos, r"scan: has frame_N.json but no photo"),
     "number twice": (
         lambda f: (f / "frame_02.jpg").write_bytes((f / "frame_2.jpg").read_bytes()),
         r"frame_02\.jpg and frame_2\.jpg have one number",
@@ -299,7 +313,8 @@ def test_depth_of_neighbouring_frames_of_a_real_scan_agrees() -> None:
 
 def _disagreement(a: View, b: View) -> float:
     """Return the median difference (metres) between ``a``'s depth, seen from ``b``, and the depth measured there."""
-    assert a.frame.depth is not None and b.frame.depth is not None
+    assert a.frame.depth is not None
+    assert b.frame.depth is not None
     camera = a.frame.intrinsics
     z = a.frame.depth.double()
     points = camera.unproject(camera.pixel_centres(torch.float64)) * z[..., None]

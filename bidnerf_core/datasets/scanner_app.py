@@ -20,6 +20,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -161,7 +162,7 @@ def read_frames(folder: Path) -> list[ScannerFrame]:
     photos = sorted((int(found[1]), path) for path, found in numbered.items() if found)
     if not photos:
         raise InputError(f"{folder}: has frame_N.json but no photo, expected frame_N.jpg beside some of them")
-    for (number, path), (following, other) in zip(photos, photos[1:], strict=False):
+    for (number, path), (following, other) in pairwise(photos):
         if number == following:
             raise InputError(f"{folder}: {path.name} and {other.name} have one number, expected each once")
     has_depth = any(folder.glob("depth_*.png")) or any(folder.glob("conf_*.png"))
