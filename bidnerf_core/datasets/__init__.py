@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.scanner_app import ScannerAppReader
 from bidnerf_core.datasets.transforms import TransformsReader
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError
@@ -35,7 +36,7 @@ class Reader(Protocol):
     def open(self, path: Path, background: Background | None) -> Dataset: ...
 
 
-READERS: list[Reader] = [TransformsReader()]
+READERS: list[Reader] = [TransformsReader(), ScannerAppReader()]
 """The formats that ``open_dataset`` tries, in this order; append a reader to add one."""
 
 

@@ -1,10 +1,12 @@
-"""Camera poses as NeRF's and nerfstudio's JSON describe them, in our conventions.
+"""Camera poses as NeRF's and nerfstudio's JSON and ARKit's exports describe them, in our conventions.
 
 They come as camera-to-world matrices with OpenGL axes (x right, y up, z backward) and leave as ``T_world_camera`` with
 OpenCV axes.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +23,12 @@ def pose(record: Record) -> SE3:
 
     A rotation that is orthonormal up to rounding is made so. Raises ``InputError`` for any other matrix.
     """
-    matrix = _matrix(record)
+    return pose_of_rows(record, "transform_matrix", record.items("transform_matrix"))
+
+
+def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
+    """Return ``T_world_camera`` as ``pose`` does; ``key`` is where ``record`` has ``rows``, for messages."""
+    matrix = _matrix(record, key, rows)
     flip = matrix.new_tensor(
         [1.0, -1.0, -1.0]
     )  # of columns: y up becomes y down, z backward becomes z forward
@@ -29,18 +36,17 @@ def pose(record: Record) -> SE3:
     if not given.is_rigid(RIGID_TO):
         off = (given.rotation.mT @ given.rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
         finding = f"off orthonormal by {off:.2g}" if off > RIGID_TO else "a mirror image"
-        raise record.error(f"the rotation of transform_matrix is {finding}, expected a rigid transform")
+        raise record.error(f"the rotation of {key} is {finding}, expected a rigid transform")
     return given.normalized()
 
 
-def _matrix(record: Record) -> Tensor:
+def _matrix(record: Record, key: str, rows: list[Any] | None) -> Tensor:
     """Return the first three of three or four rows of finite numbers; a fourth row must be 0 0 0 1."""
-    rows = record.items("transform_matrix")
     if rows is None:
-        raise record.error("no transform_matrix, expected a 4x4 camera-to-world matrix")
+        raise record.error(f"no {key}, expected a 4x4 camera-to-world matrix")
     if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise record.error("transform_matrix is not 3x4 or 4x4, expected a 4x4 camera-to-world matrix")
-    numbers = [[record.checked_number(x, "a number of transform_matrix") for x in row] for row in rows]
+        raise record.error(f"{key} is not 3x4 or 4x4, expected a 4x4 camera-to-world matrix")
+    numbers = [[record.checked_number(x, f"a number of {key}") for x in row] for row in rows]
     if len(numbers) == 4 and max(abs(x - y) for x, y in zip(numbers[3], (0, 0, 0, 1), strict=True)) > 1e-6:
-        raise record.error(f"the last row of transform_matrix is {numbers[3]}, expected [0, 0, 0, 1]")
+        raise record.error(f"the last row of {key} is {numbers[3]}, expected [0, 0, 0, 1]")
     return torch.tensor(numbers[:3], dtype=torch.float64)

@@ -21,7 +21,8 @@ from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
-from bidnerf_core.datasets.dataset import Dataset, ReadingProgress, positions, unique_names
+from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.splits import Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
 from bidnerf_core.depth_images import read_depth
 from bidnerf_core.errors import InputError
@@ -49,11 +50,7 @@ class TransformsDataset:
     def __init__(
         self, path: Path, frames: dict[str, list[FrameRecord]], background: Background | None = None
     ) -> None:
-        self._path = path
-        self._frames = frames
-        self._names = {
-            split: unique_names([frame.parts for frame in group]) for split, group in frames.items()
-        }
+        self._frames = Splits(path, frames)
         self._background = None if background is None else background_colour(background)
         self._first: tuple[str, int, int] | None = (
             None  # file, width, height of the first image of unknown size
@@ -61,46 +58,37 @@ class TransformsDataset:
 
     @property
     def path(self) -> Path:
-        return self._path
+        return self._frames.path
 
     @property
     def splits(self) -> tuple[str, ...]:
-        return tuple(self._frames)
+        return self._frames.splits
 
     @cached_property
     def background(self) -> tuple[float, float, float]:
         """The requested colour, or white where the first image of a split has an alpha channel, or black."""
         if self._background is not None:
             return self._background
-        return background_colour("white" if any(map(self._has_alpha, self.splits)) else "black")
+        return background_colour("white" if any(map(self._has_alpha, self._frames.first())) else "black")
 
     def frame_names(self, split: str) -> list[str]:
-        self._known(split)
-        return list(self._names[split])
+        return self._frames.names(split)
 
     def views(
         self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
     ) -> list[View]:
-        self._known(split)
-        frames, known = self._frames[split], self._names[split]
-        asked = known if names is None else names
-        where = f"{self._path}: split {split!r}"
-        places = positions(known, [frame.stem for frame in frames], asked, where)
+        frames = self._frames.select(split, names)
         views = []
-        for done, place in enumerate(places, start=1):
-            views.append(self._view(frames[place], known[place]))
+        for done, (name, frame) in enumerate(frames, start=1):
+            views.append(self._view(frame, name))
             if progress is not None:
-                progress(done, len(places))
+                progress(done, len(frames))
         return views
 
     def image_file(self, split: str, name: str) -> Path:
         """Return the image file of a frame. Raises ``InputError`` where there is none."""
-        frames, known = self._frames[split], self._names[split]
-        return self._image_file(frames[known.index(name)])
-
-    def _known(self, split: str) -> None:
-        if split not in self._frames:
-            raise InputError(f"{self._path}: no split {split!r}, expected one of {', '.join(self.splits)}")
+        ((_, frame),) = self._frames.select(split, [name])
+        return self._image_file(frame)
 
     def _view(self, frame: FrameRecord, name: str) -> View:
         path = self._image_file(frame)
@@ -122,7 +110,7 @@ class TransformsDataset:
         )
 
     def _image_file(self, frame: FrameRecord) -> Path:
-        tried = [Path(f"{self._path / frame.file_path}{suffix}") for suffix in TRIED_SUFFIXES]
+        tried = [Path(f"{self.path / frame.file_path}{suffix}") for suffix in TRIED_SUFFIXES]
         for path in tried:
             if path.is_file():
                 return path
@@ -132,7 +120,7 @@ class TransformsDataset:
         )
 
     def _depth_file(self, frame: FrameRecord) -> Path:
-        path = self._path / str(frame.depth_path)
+        path = self.path / str(frame.depth_path)
         if not path.is_file():
             raise frame.record.error(f"no depth image {path}, expected that file (depth_file_path)")
         return path
@@ -149,8 +137,8 @@ class TransformsDataset:
                 f"{path.name} is {width}x{height}, expected {expected[0]}x{expected[1]} as {whose}"
             )
 
-    def _has_alpha(self, split: str) -> bool:
+    def _has_alpha(self, frame: FrameRecord) -> bool:
         try:
-            return read_header(self._image_file(self._frames[split][0])).has_alpha
+            return read_header(self._image_file(frame)).has_alpha
         except InputError:  # the error is raised again when that frame is read
             return False

@@ -7,13 +7,13 @@ from pathlib import Path, PurePosixPath
 
 from bidnerf_core.camera_records import CameraRecord, camera_record
 from bidnerf_core.datasets.poses import pose
+from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError
 from bidnerf_core.images import IMAGE_SUFFIXES
 from bidnerf_core.records import Record, read_record
 from bidnerf_core.se3 import SE3
 
 SPLITS = ("train", "val", "test")
-HOLD_OUT_EVERY = 8
 METRES_PER_DEPTH_UNIT = 0.001
 
 
@@ -67,8 +67,7 @@ def split_frames(file: Record, frames: list[FrameRecord]) -> dict[str, list[Fram
     """Split one ``transforms.json`` by its lists of file names, or hold out every eighth frame where it has none."""
     lists = {split: file.items(f"{split}_filenames") for split in SPLITS}
     if not any(lists.values()):
-        others = [frame for number, frame in enumerate(frames) if number % HOLD_OUT_EVERY]
-        return {"train": others or frames, "test": frames[::HOLD_OUT_EVERY]}
+        return hold_out(frames)
     by_path = {frame.file_path: frame for frame in frames}
     splits = {}
     for split, listed in lists.items():

@@ -1,0 +1,233 @@
+"""Folders of "All Data" as the iOS program "3D Scanner App" exports them.
+
+A frame N has ``frame_N.json`` (ARKit's ``cameraPoseARFrame``, a camera-to-world matrix row by row with OpenGL axes, and
+``intrinsics``, 3x3 row by row, of the photo), some frames a photo ``frame_N.jpg``, and scans with a LiDAR ``depth_N.png``
+(16-bit planar z in millimetres, of lower resolution) with ``conf_N.png`` (ARKit's confidence: 0 low, 1 medium, 2 high).
+Frames without a photo are left out, the others ordered by their number. Every eighth photo (the first, the ninth ...) is
+held out as "test" and the others are "train".
+
+Photos are large and many: those with more than 640 pixels on the longer side are reduced to that size as they are read,
+and the intrinsics with them. A scan of 127 training photos then takes 0.6 GB instead of 1.4 GB. Depth is dropped where the
+confidence is not high and beyond 5 m, the range of the LiDAR; the photo's pixels have that of the nearest measurement.
+
+ARKit counts pixels from the centre of the upper left one. Where a frame has ARKit's ``projectionMatrix`` the principal
+point is taken from that, which is relative to the image's borders and so holds for photos of any size; without it half a
+pixel is added.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera_sources import Raster
+from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.poses import pose_of_rows
+from bidnerf_core.datasets.splits import Splits, hold_out
+from bidnerf_core.depth_images import DepthImage, read_depth_image
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.images import Background, background_colour, decode, over, read_header, read_image, reduced
+from bidnerf_core.orientation import UPRIGHT
+from bidnerf_core.photos import fit_depth
+from bidnerf_core.records import Record, read_record
+from bidnerf_core.se3 import SE3
+
+LARGEST = 640
+"""Pixels of the longer side of a photo once it is read."""
+DEPTH_UNIT = 0.001
+"""Metres."""
+RANGE = 5.0
+"""Metres that the LiDAR measures, by Apple's statement; what is beyond was inferred from the photo."""
+HIGH_CONFIDENCE = 2
+POSE, INTRINSICS, PROJECTION = "cameraPoseARFrame", "intrinsics", "projectionMatrix"
+PHOTO = re.compile(r"frame_(\d+)\.jpe?g", re.IGNORECASE)
+OTHER_SIZE = 0.01
+"""Relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that shows another image size."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScannerFrame:
+    """A frame that has a photo."""
+
+    photo: Path
+    record: Record
+    T_world_camera: SE3
+    has_depth: bool
+
+    @property
+    def stem(self) -> str:
+        return self.photo.stem
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return (self.stem,)
+
+    def beside(self, kind: str) -> Path:
+        """Return the frame's file "depth" or "conf"."""
+        return self.photo.with_name(f"{kind}_{self.stem.split('_')[1]}.png")
+
+
+@dataclass(frozen=True)
+class ScannerAppReader:
+    """The reader of folders of "3D Scanner App"; ``largest`` limits the longer side of its photos (pixels)."""
+
+    largest: int = LARGEST
+    expected = f"frame_0.jpg, frame_0.json ... with {POSE}"
+
+    def recognises(self, path: Path) -> bool:
+        """Return whether the first ``frame_N.json`` has a pose of ARKit; a broken one is left to other readers."""
+        first = next(iter(sorted(path.glob("frame_*.json"))), None)
+        try:
+            return first is not None and POSE in first.read_bytes().decode(errors="replace")
+        except OSError:
+            return False
+
+    def open(self, path: Path, background: Background | None) -> Dataset:
+        """Read all descriptions. Raises ``InputError`` where one is missing or not usable."""
+        colour = background_colour("black" if background is None else background)
+        return ScannerAppDataset(Splits(path, hold_out(read_frames(path))), colour, self.largest)
+
+
+class ScannerAppDataset:
+    """Views of a folder of "3D Scanner App"; see ``Dataset``."""
+
+    def __init__(
+        self, frames: Splits[ScannerFrame], background: tuple[float, float, float], largest: int
+    ) -> None:
+        self._frames = frames
+        self._background = background
+        self._largest = largest
+
+    @property
+    def path(self) -> Path:
+        return self._frames.path
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return self._frames.splits
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The requested colour, or black: photos have no alpha channel."""
+        return self._background
+
+    def frame_names(self, split: str) -> list[str]:
+        return self._frames.names(split)
+
+    def views(
+        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+    ) -> list[View]:
+        frames = self._frames.select(split, names)
+        views = []
+        for done, (name, frame) in enumerate(frames, start=1):
+            views.append(self._view(frame, name))
+            if progress is not None:
+                progress(done, len(frames))
+        return views
+
+    def _view(self, frame: ScannerFrame, name: str) -> View:
+        header = read_header(frame.photo)
+        camera = read_camera(frame.record, header.width, header.height)
+        small = camera.scaled(min(1.0, self._largest / max(camera.width, camera.height)))
+        colour, alpha = read_image(frame.photo)
+        rgb = over(colour, alpha, self._background)
+        if small != camera:
+            rgb = reduced(rgb, small.width, small.height)
+        depth = None
+        if frame.has_depth:
+            raster = Raster(camera.width, camera.height, UPRIGHT)
+            measured = read_measured(frame.beside("depth"), frame.beside("conf"))
+            depth = fit_depth(
+                measured, raster, (small.width, small.height), f"{frame.beside('depth')}: depth"
+            )
+        return View(Frame(name, rgb, small, depth), frame.T_world_camera)
+
+
+def read_frames(folder: Path) -> list[ScannerFrame]:
+    """Read the descriptions of all photos, ordered by number. Raises ``InputError`` where one is missing or not usable.
+
+    Depth is expected of all frames or of none, as phones without a LiDAR export it.
+    """
+    numbered = {path: PHOTO.fullmatch(path.name) for path in folder.iterdir()}
+    photos = sorted((int(found[1]), path) for path, found in numbered.items() if found)
+    if not photos:
+        raise InputError(f"{folder}: has frame_N.json but no photo, expected frame_N.jpg beside some of them")
+    for (number, path), (following, other) in pairwise(photos):
+        if number == following:
+            raise InputError(f"{folder}: {path.name} and {other.name} have one number, expected each once")
+    has_depth = any(folder.glob("depth_*.png")) or any(folder.glob("conf_*.png"))
+    return [_frame(path, has_depth) for _, path in photos]
+
+
+def _frame(photo: Path, has_depth: bool) -> ScannerFrame:
+    record = read_record(photo.with_suffix(".json"))
+    numbers = _numbers(record, POSE, 16)
+    rows = [numbers[first : first + 4] for first in range(0, 16, 4)]
+    frame = ScannerFrame(photo, record, pose_of_rows(record, POSE, rows), has_depth)
+    for kind in ("depth", "conf") if has_depth else ():
+        if not frame.beside(kind).is_file():
+            raise InputError(f"{frame.beside(kind)}: no such file, expected it as {photo.name} is there")
+    return frame
+
+
+def read_camera(record: Record, width: int, height: int) -> Intrinsics:
+    """Return the camera of a photo of this size. Raises ``InputError`` where the intrinsics are of another size."""
+    fx, skew, cx, _, fy, cy, *last = _numbers(record, INTRINSICS, 9)
+    if abs(skew) > 1e-6 or last != [0, 0, 1]:
+        raise record.error(f"{INTRINSICS} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1], expected 3x3 row by row")
+    centre = (cx + 0.5, cy + 0.5)
+    if record.items(PROJECTION) is not None:
+        # u = (1 + x_ndc) w / 2 with x_ndc = P00 x / -z - P02, and v likewise, downwards
+        projection = _numbers(record, PROJECTION, 16)
+        if abs(projection[0] * width / 2 / fx - 1) > OTHER_SIZE:
+            raise _other_size(record, width, height)
+        centre = (width / 2 * (1 - projection[2]), height / 2 * (1 + projection[6]))
+    if not (width / 4 < centre[0] < width * 3 / 4 and height / 4 < centre[1] < height * 3 / 4):
+        raise _other_size(record, width, height)
+    return Intrinsics(fx, fy, *centre, width, height)
+
+
+def read_measured(depth: Path, confidence: Path) -> DepthImage:
+    """Read depth (metres), 0 where the confidence is not high and out of the sensor's range.
+
+    Raises ``InputError`` where a file is not readable or not what it should be.
+    """
+    measured = read_depth_image(depth, DEPTH_UNIT)
+    sure = decode(confidence)
+    height, width = measured.metres.shape
+    if sure.shape != (height, width):
+        found = "x".join(map(str, sure.shape[1::-1] + sure.shape[2:]))
+        raise InputError(f"{confidence}: is {found}, expected {width}x{height} as {depth.name}")
+    if sure.dtype != np.uint8 or sure.max() > HIGH_CONFIDENCE:
+        raise InputError(f"{confidence}: has values up to {sure.max()}, expected confidences of 0, 1 and 2")
+    return replace(measured, metres=_kept(measured.metres, torch.from_numpy(sure)))
+
+
+def _kept(metres: Float[Tensor, "h w"], confidence: Tensor) -> Float[Tensor, "h w"]:
+    return torch.where((confidence == HIGH_CONFIDENCE) & (metres <= RANGE), metres, 0)
+
+
+def _other_size(record: Record, width: int, height: int) -> InputError:
+    return record.error(
+        f"{INTRINSICS} are not of its photo of {width}x{height}; expected intrinsics scaled with the photo"
+    )
+
+
+def _numbers(record: Record, key: str, count: int) -> list[float]:
+    """Return ``count`` finite numbers."""
+    found = record.items(key)
+    if found is None:
+        raise record.error(f"no {key}, expected {count} numbers")
+    if len(found) != count:
+        raise record.error(f"{key} has {len(found)} entries, expected {count} numbers")
+    return [record.checked_number(value, f"a number of {key}") for value in found]

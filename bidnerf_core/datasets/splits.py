@@ -1,0 +1,74 @@
+"""The frames of a dataset in named splits, before any image is read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+from bidnerf_core.datasets.dataset import positions, unique_names
+from bidnerf_core.errors import InputError
+
+HOLD_OUT_EVERY = 8
+
+
+@runtime_checkable
+class NamedFrame(Protocol):
+    """The description of a frame, named after its image file."""
+
+    @property
+    def stem(self) -> str: ...
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The folders of the image, then its stem."""
+        ...
+
+
+F = TypeVar("F", bound=NamedFrame)
+
+
+class Splits(Generic[F]):
+    """The descriptions of the frames in the folder ``path``, by split and name."""
+
+    def __init__(self, path: Path, frames: dict[str, list[F]]) -> None:
+        self.path = path
+        self._frames = frames
+        self._names = {
+            split: unique_names([frame.parts for frame in group]) for split, group in frames.items()
+        }
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return tuple(self._frames)
+
+    def names(self, split: str) -> list[str]:
+        """Return the names of a split in order. Raises ``InputError`` for an unknown split."""
+        self._known(split)
+        return list(self._names[split])
+
+    def select(self, split: str, names: Sequence[str] | None = None) -> list[tuple[str, F]]:
+        """Return the name and description of the frames ``names``, in that order, or of the whole split.
+
+        Raises ``InputError`` for an unknown split or frame.
+        """
+        self._known(split)
+        frames, known = self._frames[split], self._names[split]
+        asked = known if names is None else names
+        stems = [frame.stem for frame in frames]
+        places = positions(known, stems, asked, f"{self.path}: split {split!r}")
+        return [(known[place], frames[place]) for place in places]
+
+    def first(self) -> list[F]:
+        """Return the first frame of each split."""
+        return [group[0] for group in self._frames.values()]
+
+    def _known(self, split: str) -> None:
+        if split not in self._frames:
+            raise InputError(f"{self.path}: no split {split!r}, expected one of {', '.join(self.splits)}")
+
+
+def hold_out(frames: list[F]) -> dict[str, list[F]]:
+    """Hold out every eighth frame (the first, the ninth ...) as "test"; a single frame is in both splits."""
+    others = [frame for number, frame in enumerate(frames) if number % HOLD_OUT_EVERY]
+    return {"train": others or frames, "test": frames[::HOLD_OUT_EVERY]}
