@@ -10,11 +10,11 @@ process of one thread; finished frames are kept, so that an interrupted run goes
 from __future__ import annotations
 
 import argparse
-import math
 import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -94,13 +94,10 @@ def scene(stored: Map, name: str, data: Path, tuning: bool, store: RowStore) -> 
             continue
         for label, localizer in localizers.items():
             kind = f"{'RGB-D' if depth else 'RGB'}, {label}"
-            rows = [
-                store.get(
-                    [name, stored.info.weights, str(stored.info.landmarks), kind, view.frame.name],
-                    lambda view=view: one_frame(localizer, view, depth),
-                )
-                for view in views
-            ]
+            rows = []
+            for view in views:
+                key = [name, stored.info.weights, str(stored.info.landmarks), kind, view.frame.name]
+                rows.append(store.get(key, partial(one_frame, localizer, view, depth)))
             found[kind] = summary(rows)
             s = found[kind]
             print(
@@ -122,14 +119,14 @@ def main() -> None:
     parser.add_argument("--tuning-frames", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    partial = RESULTS / f"{given.name}.partial.jsonl"
+    kept = RESULTS / f"{given.name}.partial.jsonl"
     results: dict[str, Any] = {}
-    with RowStore(partial) as store:
+    with RowStore(kept) as store:
         for pair in given.scenes:
             folder, data = map(Path, pair.split(":"))
             results[data.name] = scene(load_map(folder), data.name, data, given.tuning_frames, store)
     print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
-    partial.unlink(missing_ok=True)
+    kept.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":
