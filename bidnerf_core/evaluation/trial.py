@@ -104,6 +104,7 @@ class TrialResult:
     weights: str  # file name of the map's weights, which is new with every training
     trial: Trial  # with folders' names instead of paths
     outcome: str = ""  # the kind of the method's judgement; empty in results of earlier versions
+    focal_factor: float = 1.0  # true focal length over the given one, where it was estimated along
     inputs: InputDigests | None = None  # none in results of earlier versions
 
     def __post_init__(self) -> None:
