@@ -40,7 +40,7 @@ from bidnerf_core.localization.method_settings import (
 )
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
-from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.result import Localization, Outcome
 from bidnerf_core.localization.search.by_images import ImageSearch
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
@@ -53,6 +53,8 @@ LEAST_POINTS = 50
 """Measured pixels below which there is no shape to recognise."""
 WORSE = 0.05
 """How much refinement may raise the cost on the surface; a field that asks for more does not show what was baked."""
+MANY_LANDMARKS = 500
+"""Landmarks from which on a scene has texture: an image of it in which none are recognised shows something else."""
 LOSS_POINTS = 200
 """Points on which the losses of the path are computed."""
 
@@ -178,7 +180,20 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
         answers.append(refine_by_colour(problem, found, by_colour, generator))
         best = min(answers, key=lambda answer: answer.refined.loss)
         if best.verdict.accepted or len(answers) == config.rounds:
-            return localization_of(problem, best, by_colour, began, "auto")
+            answer = localization_of(problem, best, by_colour, began, "auto")
+            return _doubted(answer) if _has_texture(problem) else answer
+
+
+def _has_texture(problem: Problem) -> bool:
+    return problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
+
+
+def _doubted(found: Localization) -> Localization:
+    """Return an answer by whole images as rejected, in a map whose landmarks should have recognised the place."""
+    if not found.converged:
+        return found
+    why = f"no landmarks were recognised; {found.reason}"
+    return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=why)
 
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:

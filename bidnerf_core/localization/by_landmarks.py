@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -31,7 +32,7 @@ from bidnerf_core.se3 import SE3
 
 POINTS = 2000
 """Measured points that are fused, at most."""
-SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 100.0, 300.0
+SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
 """How many independent measurements the points on the surface and the rendered rays of a view count for beside landmarks."""
 STEPS = 6
 """Second-order steps on the sum of all terms."""
@@ -40,6 +41,14 @@ SHARPEST = 0.04
 INFLATION = 3.0
 """Factor on the covariance of a pose by landmarks. It counts errors of keypoints and of the map's own poses as independent,
 which within an image they are not; set by the normalised errors of a fifth of the test images of four scenes.
+"""
+FOCAL_OFF, FOCAL_NOISE = 0.035, 1.5
+"""Logarithm of a focal length's estimated factor, and ratio of reprojection noise with the given to that with the estimated
+one, beyond which the given focal length is taken to be wrong.
+"""
+FOCAL_PRIOR, FOCAL_ESTIMATED = 0.003, 0.01
+"""Standard deviations, as a share of it, of a calibrated focal length and of one that was estimated along: its random error
+is in the fit's own covariance, but errors of lens and landmarks bias it by a percent or more.
 """
 DEPTH_SCALE_PRIOR = 0.02
 """Standard deviation of a depth sensor's scale."""
@@ -75,8 +84,7 @@ def answer_by_landmarks(
 
     ``rays``: rendered for the refinement; 0: none.
     """
-    unknown_focal = len(problem.views) == 1 and problem.views[0].frame.focal_is_approximate
-    found = propose(matcher, problem.views, seed=seed, unknown_focal=unknown_focal)
+    found = _found(problem, matcher, seed)
     if found is None:
         return None
     problem = replace(problem, start=found.T_world_camera)
@@ -88,6 +96,30 @@ def answer_by_landmarks(
         if rays and matcher.landmarks is not None and _is_sharp(problem):
             terms["rendering"] = _rendered_term(problem, rays, about, generator)
     return _fused(found, terms, about)
+
+
+def _found(problem: Problem, matcher: LandmarkMatcher, seed: int) -> LandmarkPose | None:
+    """Find the pose with the given focal length; with a free one where that is nominal, or where it does not fit."""
+    views = problem.views
+    if len(views) == 1 and views[0].frame.focal_is_approximate:
+        return propose(matcher, views, seed=seed, unknown_focal=True)
+    found = propose(matcher, views, seed=seed)
+    check = None if found is None else found.focal_check
+    if found is None or check is None:
+        return found
+    if abs(math.log(check.factor)) <= FOCAL_OFF and found.noise <= FOCAL_NOISE * check.noise:
+        return found
+    return propose(matcher, views, seed=seed, unknown_focal=True) or found
+
+
+def _pose_covariance(found: LandmarkPose) -> Float[Tensor, "6 6"]:
+    """Return the covariance of a pose by landmarks with what the calibration contributes, by a prior on the focal length."""
+    covariance = INFLATION * found.map_covariance
+    if found.focal_check is None:
+        return covariance
+    sigma = FOCAL_PRIOR if found.focal_factor == 1 else FOCAL_ESTIMATED
+    slope = found.focal_check.slope
+    return covariance + sigma**2 * slope[:, None] * slope
 
 
 def _is_sharp(problem: Problem) -> bool:
@@ -135,7 +167,7 @@ def _fused(found: LandmarkPose, terms: dict[str, Term], about: Pivot) -> Landmar
     The covariance counts the additional terms as ``INDEPENDENT`` measurements only: their errors are alike over large parts
     of an image, and are not those of the steps' residuals.
     """
-    covariance = INFLATION * found.map_covariance
+    covariance = _pose_covariance(found)
     if not terms:
         return LandmarkAnswer(found, found.T_world_camera, covariance, ())
     prior = GaussianPrior(found.T_world_camera, covariance, about)

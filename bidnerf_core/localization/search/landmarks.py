@@ -45,6 +45,20 @@ LEAST_INLIERS = 6
 
 
 @dataclass(frozen=True, eq=False)
+class FocalCheck:
+    """A fit with a free focal length, from the pose that was found with the given one."""
+
+    factor: float  # of the focal length
+    noise: float  # pixels: standard deviation of the reprojection errors with that factor
+    slope: Float[Tensor, "6"]  # right update of the pose for a unit of the factor's logarithm
+
+    @staticmethod
+    def of(data: ObservedPoints, best: ReprojectionFit) -> FocalCheck:
+        free = fit(data, best.T_world_rig, best.noise, True, best.focal_factor)
+        return FocalCheck(free.focal_factor, free.noise, free.covariance[:6, 6] / free.covariance[6, 6])
+
+
+@dataclass(frozen=True, eq=False)
 class LandmarkPose:
     """A pose found by landmarks, and what speaks for it."""
 
@@ -68,6 +82,9 @@ class LandmarkPose:
     depth_scale: (
         float | None
     )  # by which measured depth has to be multiplied; none where too little was measured
+    # What the same correspondences say of the focal length of a single view: its factor, the noise (pixels) that is left
+    # with it, and how the pose would move with its logarithm (right update). None for several views.
+    focal_check: FocalCheck | None = None
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
     @property
@@ -245,6 +262,7 @@ def _described(
         spread=_spread(images, correspondences, pixels),
         focal_factor=best.focal_factor,
         depth_scale=float(ratio.median()) if len(ratio) >= LEAST_INLIERS else None,
+        focal_check=FocalCheck.of(data, best) if len(images) == 1 else None,
         seconds=seconds,
     )
 
