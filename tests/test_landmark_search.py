@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
+from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.landmarks import LandmarkPose, propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
@@ -46,6 +47,17 @@ def test_three_of_four_matches_may_be_wrong(exact: LandmarkMap) -> None:
     assert error(found) < 0.01
     assert found is not None
     assert found.log10_nfa < -20
+
+
+def test_inliers_allow_for_the_uncertainty_of_landmarks(exact: LandmarkMap) -> None:
+    """Where landmarks are less certain than keypoints, these seem free of noise; agreement must not shrink with that."""
+    points = Points(noise=0.5)
+    uncertain = replace(exact, deviations=torch.full_like(exact.deviations, 0.06))
+    found = propose(LandmarkMatcher(uncertain), [points.view(TRUE)], points)
+    assert found is not None
+    assert found.noise < 0.2  # pixels, of 0.5
+    assert found.inliers > 0.9 * len(found.correspondences)
+    assert landmark_verdict(found).accepted
 
 
 def test_a_lens_with_distortion_is_no_harder(exact: LandmarkMap) -> None:

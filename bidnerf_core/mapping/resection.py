@@ -57,6 +57,12 @@ class ObservedPoints:
         off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
         return torch.where(z > 0, off, torch.inf)
 
+    def normalized_residuals(self, T_world_rig: SE3, noise: float) -> Float[Tensor, "m 2"]:
+        """Return the residuals in standard deviations; ``noise`` is that of keypoints (pixels), to which the points' add."""
+        z = self.in_camera(T_world_rig)[:, 2]
+        deviation = _deviation(self, T_world_rig, self.focal / torch.where(z > 0, z, 1), noise)
+        return self.residuals(T_world_rig) / deviation[:, None]
+
 
 @dataclass(frozen=True, eq=False)
 class ReprojectionFit:
@@ -122,7 +128,7 @@ def _linearized(data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, 
     focal = data.focal * log_factor.exp()
     # Observed are pixels: what was divided by the given focal length is multiplied by it again.
     off = local[:, :2] / z[:, None] * focal[:, None] - data.image * data.focal[:, None]
-    deviation = (noise**2 + _landmark_variance(data, T) * (focal / z) ** 2).sqrt()
+    deviation = _deviation(data, T, focal / z, noise)
     residual = torch.where(front[:, None], off / deviation[:, None], 30.0)
     squared = residual.square().sum(-1)
     weight = front / (1 + squared / SCALE**2)
@@ -141,6 +147,11 @@ def _linearized(data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, 
         single.mT @ single,
         _spread(residual, hessian.shape[0]),
     )
+
+
+def _deviation(data: ObservedPoints, T: SE3, pixels_per_metre: Tensor, noise: float) -> Float[Tensor, "m"]:
+    """Return the standard deviation of a residual along each axis (pixels): the keypoint's and the point's together."""
+    return (noise**2 + _landmark_variance(data, T) * pixels_per_metre**2).sqrt()
 
 
 def _landmark_variance(data: ObservedPoints, T: SE3) -> Tensor:

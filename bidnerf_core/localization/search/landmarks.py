@@ -70,6 +70,7 @@ class LandmarkPose:
     noise: float  # pixels: standard deviation of the reprojection errors along each axis, robustly
     correspondences: Correspondences  # those that the pose was refined on
     residuals: Float[Tensor, "m 2"]  # pixels, of the correspondences
+    normalized_residuals: Float[Tensor, "m 2"]  # the same in standard deviations, those of landmarks included
     pixels: Float[Tensor, "m 2"]  # where the correspondences were observed, as the image has them
     matches: int  # by descriptors alone, before there was a pose
     agreeing: int  # of those, how many agree with the pose
@@ -90,7 +91,7 @@ class LandmarkPose:
     @property
     def inliers(self) -> int:
         """Correspondences within three standard deviations."""
-        return int((torch.linalg.vector_norm(self.residuals, dim=-1) <= 3 * self.noise).sum())
+        return int((torch.linalg.vector_norm(self.normalized_residuals, dim=-1) <= 3).sum())
 
 
 def propose(
@@ -236,6 +237,7 @@ def _described(
     seconds: dict[str, float],
 ) -> LandmarkPose:
     data = observed_points(images, landmarks, correspondences)
+    focused = data.with_focal(best.focal_factor)
     threshold = _pixels(images, THRESHOLD)
     off = (
         observed_points(images, landmarks, matches).with_focal(best.focal_factor).residuals(best.T_world_rig)
@@ -253,7 +255,8 @@ def _described(
         map_covariance=best.covariance[:6, :6] + landmarks.pose_covariance,
         noise=best.noise,
         correspondences=correspondences,
-        residuals=data.with_focal(best.focal_factor).residuals(best.T_world_rig),
+        residuals=focused.residuals(best.T_world_rig),
+        normalized_residuals=focused.normalized_residuals(best.T_world_rig, best.noise),
         pixels=pixels,
         matches=len(matches),
         agreeing=agreeing,
