@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 from bidnerf_core.errors import InputError
 
-KINDS = {
+FILE_KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
     stat.S_IFSOCK: "a socket",
@@ -37,7 +37,7 @@ def open_binary(path: Path, expected: str) -> BinaryIO:
     except (OSError, ValueError) as error:  # a ValueError is a NUL in the name
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be opened ({reason}), expected {expected}") from error
-    kind = KINDS.get(stat.S_IFMT(mode), "no regular file")
+    kind = FILE_KINDS.get(stat.S_IFMT(mode), "no regular file")
     raise InputError(f"{path}: is {kind}, expected {expected}")
 
 

@@ -30,7 +30,7 @@ HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV")
 FULL_SCALE = {"bool": 1, "uint8": 255, "uint16": 65535}
-ROUNDING = 1e-3
+COLOUR_ROUNDING = 1e-3
 """How far a floating-point channel may leave [0, 1], as resampling and colour conversion cause it."""
 
 
@@ -118,7 +118,7 @@ def _check_unit_range(raw: np.ndarray, what: str) -> None:
         count = int((~np.isfinite(raw)).sum())
         raise InputError(f"{what} has {count} values that are NaN or infinite, expected floats in [0, 1]")
     low, high = float(raw.min()), float(raw.max())
-    if low < -ROUNDING or high > 1 + ROUNDING:
+    if low < -COLOUR_ROUNDING or high > 1 + COLOUR_ROUNDING:
         hint = "; divide by 255, or give uint8" if 1 < high <= 255 and low >= 0 else ""
         raise InputError(f"{what} has floats from {low:g} to {high:g}, expected [0, 1]{hint}")
 

@@ -38,7 +38,7 @@ of its own that are no subclasses of these."""
 UNREADABLE = "?"
 """Stands for the name of entry points that cannot be read."""
 
-METHODS = {"build": ("config", "bounds"), "train": ("field", "views", "config", "report")}
+REQUIRED_METHODS = {"build": ("config", "bounds"), "train": ("field", "views", "config", "report")}
 
 
 class BackendError(InputError):
@@ -222,7 +222,7 @@ def _checked(info: BackendInfo, backend: Any) -> Backend:
 
 def _defects(backend: Any) -> Iterator[str]:
     """Return what keeps an object from being a ``Backend``, the most telling defect first."""
-    missing = [name for name in ("summary", "config_type", *METHODS) if not hasattr(backend, name)]
+    missing = [name for name in ("summary", "config_type", *REQUIRED_METHODS) if not hasattr(backend, name)]
     if missing:
         who = f"class {backend.__name__}" if isinstance(backend, type) else type(backend).__name__
         yield f"{who} has no {', '.join(missing)}"
@@ -232,7 +232,7 @@ def _defects(backend: Any) -> Iterator[str]:
     if not isinstance(backend.summary, str):
         yield f"summary is {backend.summary!r}, expected text"
     yield from _config_defects(backend.config_type)
-    for name, parameters in METHODS.items():
+    for name, parameters in REQUIRED_METHODS.items():
         if not _accepts(getattr(backend, name), len(parameters)):
             yield f"{name} does not take ({', '.join(parameters)})"
 

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 from bidnerf_core.errors import InputError
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
-LARGEST = sys.float_info.max  # JSON knows NaN, 1e999 and integers that no float holds
+LARGEST_NUMBER = sys.float_info.max  # JSON knows NaN, 1e999 and integers that no float holds
 
 
 def to_plain(value: Any, where: str = "") -> Any:
@@ -33,7 +33,7 @@ def to_plain(value: Any, where: str = "") -> Any:
     raise InputError(f"{where or 'value'} is a {type(value).__name__}, expected what JSON can hold")
 
 
-def from_plain(kind: type[T], value: Any, where: str) -> T:
+def from_plain(kind: type[_T], value: Any, where: str) -> _T:
     """An instance of the dataclass ``kind``; missing keys take their defaults. ``where`` opens the error's line.
 
     Raises ``InputError`` for a key that ``kind`` does not have, for one that it lacks, for a value of another type than
@@ -87,7 +87,7 @@ def _converted(kind: Any, value: Any, where: str) -> Any:
         inner = arguments[1] if arguments else Any
         return {key: _converted(inner, item, f"{where}.{key}") for key, item in value.items()}
     elif kind is float and type(value) in (int, float):
-        if abs(value) <= LARGEST:
+        if abs(value) <= LARGEST_NUMBER:
             return float(value)
     elif type(value) is kind or (value is None and kind is type(None)):
         return value

@@ -28,7 +28,7 @@ from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
-from bidnerf_core.training import RayBank, Silent, depth_term
+from bidnerf_core.training import RayBank, Silent, ray_termination
 from bidnerf_hashgrid import backend as hashgrid
 from problems import FieldMap, localize
 from sparse_model import Known
@@ -358,7 +358,7 @@ def test_training_is_supervised_by_the_points(model: Path, scene: Known) -> None
             hashgrid.train(field, views, config, Silent())
         batch = RayBank(dense, bounds).draw(3000, torch.Generator().manual_seed(1))
         with torch.no_grad():
-            return float(depth_term(render(field, batch.rays, batch.background), batch))
+            return float(ray_termination(render(field, batch.rays, batch.background), batch))
 
     assert misplaced(1.0) < 0.9 * misplaced(0.0)
 

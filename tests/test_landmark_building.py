@@ -13,7 +13,7 @@ from bidnerf_core.mapping.features import Sift
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, build_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.pose_scatter import robust_covariance
-from bidnerf_core.mapping.tracks import Matches, joined
+from bidnerf_core.mapping.tracks import Matches, joined_tracks
 from bidnerf_core.mapping.triangulation import Sightings, intersected, parallax, refined
 from bidnerf_core.mapping.view_pairs import likely_pairs
 from landmark_scene import PINHOLE, Points, looking_in, ring
@@ -170,7 +170,9 @@ def test_a_match_that_would_join_two_keypoints_of_an_image_is_left_out() -> None
     def match(a: int, b: int, ambiguity: float) -> Matches:
         return Matches(torch.tensor([[a, b]]), torch.tensor([ambiguity]))
 
-    track = joined([(0, 1, match(0, 0, 0.1)), (1, 2, match(0, 0, 0.2)), (0, 2, match(1, 0, 0.5))], [2, 1, 1])
+    track = joined_tracks(
+        [(0, 1, match(0, 0, 0.1)), (1, 2, match(0, 0, 0.2)), (0, 2, match(1, 0, 0.5))], [2, 1, 1]
+    )
     assert track[0] == track[2] == track[3]
     assert track[1] != track[0]
 

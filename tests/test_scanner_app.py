@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.datasets.scanner_app import LARGEST, RANGE, ScannerAppReader
+from bidnerf_core.datasets.scanner_app import LARGEST_SIDE, RANGE, ScannerAppReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 
@@ -127,7 +127,7 @@ def moved(view: View, right: float, down: float) -> View:
 
 def test_photos_are_reduced_with_their_camera(scan: Path) -> None:
     small = every_view(open_dataset(scan))["frame_0"].frame.intrinsics
-    assert (small.width, small.height) == (LARGEST, LARGEST * HEIGHT // WIDTH)
+    assert (small.width, small.height) == (LARGEST_SIDE, LARGEST_SIDE * HEIGHT // WIDTH)
     whole = every_view(open_dataset(scan, readers=[ScannerAppReader(largest=2000)]))["frame_0"]
     assert whole.frame.intrinsics == Intrinsics(FOCAL, FOCAL, CENTRE[0] + 0.5, CENTRE[1] + 0.5, WIDTH, HEIGHT)
     assert whole.frame.intrinsics.resized(small.width, small.height) == small

@@ -15,7 +15,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.localization.costs.view_renderers import SurfaceRenderer
 from bidnerf_core.localization.search.by_images import (
     APART,
-    STAGES,
+    IMAGE_STAGES,
     TURNED,
     ImageSearch,
     ImageStage,
@@ -42,7 +42,7 @@ def hypotheses(search: ImageSearch, start: SE3 | None, count: int, generator: Ge
 def test_the_pose_is_found_without_depth(number: int, generator: Generator) -> None:
     view = baked.unseen()[number]
     search = image_search(view)
-    found = search(hypotheses(search, None, 64, generator), STAGES[:4])
+    found = search(hypotheses(search, None, 64, generator), IMAGE_STAGES[:4])
     error = pose_error(found.T[0], view.T_ref_camera)
     # Of 3.5 m and with pixels and surfels that are 4 cm wide: what is left is the field's to take.
     assert float(error.translation) < 0.2
@@ -52,7 +52,7 @@ def test_the_pose_is_found_without_depth(number: int, generator: Generator) -> N
 def test_a_rig_is_placed_by_its_last_camera(generator: Generator) -> None:
     views = baked.unseen()[:2]
     search = image_search(*views)
-    found = search(hypotheses(search, None, 32, generator), STAGES[:3])
+    found = search(hypotheses(search, None, 32, generator), IMAGE_STAGES[:3])
     assert float(pose_error(found.T[0], views[-1].T_ref_camera).rotation_deg) < 3
 
 
@@ -93,10 +93,10 @@ def test_what_looks_the_same_from_two_sides_has_no_margin(generator: Generator) 
         torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)), torch.zeros(3, dtype=torch.float64)
     )
     T = view.T_ref_camera
-    found = search(SE3.stack([T, half @ T, T.retract(torch.full((6,), 0.05).double())]), STAGES[1:4])
+    found = search(SE3.stack([T, half @ T, T.retract(torch.full((6,), 0.05).double())]), IMAGE_STAGES[1:4])
     assert found.margin < 0.15 * float(found.scores[0])
     assert bool(Distinct(search.middle, APART * search.extent, TURNED)(found.T)[1])
-    alone = search(T[None], STAGES[1:2])
+    alone = search(T[None], IMAGE_STAGES[1:2])
     assert math.isinf(alone.margin)
 
 

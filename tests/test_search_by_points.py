@@ -9,7 +9,7 @@ from torch import Generator
 
 import baked
 from bidnerf_core.evaluation.errors import pose_error
-from bidnerf_core.localization.search.by_points import STAGES
+from bidnerf_core.localization.search.by_points import POINT_STAGES
 from bidnerf_core.localization.search.hypotheses import hypotheses_for_points, random_rotations
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches
@@ -32,7 +32,7 @@ def test_the_path_leads_from_a_hypothesis_to_the_answer(generator: Generator) ->
     search = baked.point_search(baked.unseen()[0])
     start = hypotheses_for_points(search.surroundings, None, 64, generator)
     found = search.from_poses(start)
-    assert len(found.path.translation) == 1 + sum(stage.steps for stage in STAGES)
+    assert len(found.path.translation) == 1 + sum(stage.steps for stage in POINT_STAGES)
     assert (start.matrix() == found.path[0].matrix()).all(-1).all(-1).any()
     assert torch.equal(found.path[-1].matrix(), found.T[0].matrix())
     assert len(found.losses) == len(found.path.translation) - 1

@@ -16,7 +16,7 @@ from bidnerf_core.field import Rays, RaySamples
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render, rendering_weights
 from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.training import RayBank, Silent, TrainingBatch, depth_term, supervised_loss
+from bidnerf_core.training import RayBank, Silent, TrainingBatch, ray_termination, supervised_loss
 from bidnerf_hashgrid import backend as hashgrid
 from bidnerf_vanilla import VanillaConfig
 from bidnerf_vanilla import backend as vanilla
@@ -51,13 +51,13 @@ def ray(density: torch.Tensor, measured: float) -> tuple[Rendering, TrainingBatc
 
 def by_density(density: torch.Tensor, measured: float) -> torch.Tensor:
     density = density.clone().requires_grad_()
-    return torch.autograd.grad(depth_term(*ray(density, measured)), density)[0]
+    return torch.autograd.grad(ray_termination(*ray(density, measured)), density)[0]
 
 
 def test_the_derivative_is_the_numerical_one() -> None:
     density = torch.rand(10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert torch.autograd.gradcheck(
-        lambda d: depth_term(*ray(d, 3.25)), density.requires_grad_(), eps=1e-6, atol=1e-8
+        lambda d: ray_termination(*ray(d, 3.25)), density.requires_grad_(), eps=1e-6, atol=1e-8
     )
 
 
@@ -88,7 +88,7 @@ def test_a_wall_behind_the_measured_surface_is_moved_forward() -> None:
 
 def test_rays_without_depth_do_not_count() -> None:
     density = torch.full((10,), 0.3, dtype=torch.float64)
-    assert float(depth_term(*ray(density, 0.0))) == 0
+    assert float(ray_termination(*ray(density, 0.0))) == 0
     assert float(by_density(density, 0.0).abs().max()) == 0
     rendering, batch = ray(density, 3.25)
     assert supervised_loss(rendering, batch, 2.0, 0.0)[0] == 0
@@ -122,7 +122,7 @@ def misplaced(field: Any, views: Sequence[View]) -> float:
     """The depth term where depth was measured: mean distance of the weight from there, metres."""
     batch = RayBank(views, BOUNDS).draw(3000, torch.Generator().manual_seed(1))
     with torch.no_grad():
-        return float(depth_term(render(field, batch.rays, batch.background), batch))
+        return float(ray_termination(render(field, batch.rays, batch.background), batch))
 
 
 @pytest.mark.parametrize("name", BACKENDS)

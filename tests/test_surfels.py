@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.mapping.surfels import fused, merged
+from bidnerf_core.mapping.surfels import fused_surfels, merged
 from bidnerf_core.se3 import SE3
 
 
@@ -19,7 +19,7 @@ def on_a_plane(generator: Generator, count: int = 400) -> tuple[torch.Tensor, to
 
 def test_a_plane_is_left_where_it_is_and_has_its_normal(generator: Generator) -> None:
     points, normal = on_a_plane(generator)
-    surfels = fused(points, torch.rand((len(points), 3), generator=generator))
+    surfels = fused_surfels(points, torch.rand((len(points), 3), generator=generator))
     assert len(surfels) == len(points)
     assert torch.allclose(surfels.positions, points, atol=1e-5)
     assert torch.allclose((surfels.normals @ normal).abs(), torch.ones(len(points)), atol=1e-4)
@@ -27,14 +27,14 @@ def test_a_plane_is_left_where_it_is_and_has_its_normal(generator: Generator) ->
 
 def test_a_sphere_has_radial_normals(generator: Generator) -> None:
     outward = torch.nn.functional.normalize(torch.randn((4000, 3), generator=generator), dim=-1)
-    surfels = fused(2 * outward, outward)
+    surfels = fused_surfels(2 * outward, outward)
     assert ((surfels.normals * outward).sum(-1).abs() > 0.99).float().mean() > 0.98
 
 
 def test_noise_across_the_plane_is_averaged(generator: Generator) -> None:
     points, normal = on_a_plane(generator, 2000)
     noise = 0.005 * torch.randn((len(points), 1), generator=generator)
-    smooth = fused(points + noise * normal, points).positions
+    smooth = fused_surfels(points + noise * normal, points).positions
     off = (smooth - points.mean(0)) @ normal
     assert off.std() < 0.5 * noise.std()
 
@@ -42,7 +42,7 @@ def test_noise_across_the_plane_is_averaged(generator: Generator) -> None:
 def test_a_linear_colour_has_its_gradient_within_the_plane(generator: Generator) -> None:
     points, normal = on_a_plane(generator)
     slope = torch.randn((3, 3), generator=generator)  # channel by axis
-    surfels = fused(points, points @ slope.T)
+    surfels = fused_surfels(points, points @ slope.T)
     within = slope - (slope @ normal)[:, None] * normal
     error = torch.linalg.matrix_norm(surfels.rgb_gradient - within)
     assert error.median() < 0.06 * torch.linalg.matrix_norm(within)  # a little weight tames thin strips
@@ -51,7 +51,7 @@ def test_a_linear_colour_has_its_gradient_within_the_plane(generator: Generator)
 
 def test_one_colour_has_no_gradient(generator: Generator) -> None:
     points, _ = on_a_plane(generator)
-    surfels = fused(points, torch.full((len(points), 3), 0.3))
+    surfels = fused_surfels(points, torch.full((len(points), 3), 0.3))
     assert surfels.rgb_gradient.abs().max() < 1e-4
     assert torch.allclose(surfels.rgb, torch.tensor(0.3))
 
@@ -59,7 +59,7 @@ def test_one_colour_has_no_gradient(generator: Generator) -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 11, 13])
 def test_few_points_in_a_row_are_surfels_too(count: int) -> None:
     points = torch.arange(count)[:, None] * torch.tensor([0.1, 0.0, 0.0])
-    surfels = fused(points, points)
+    surfels = fused_surfels(points, points)
     for value in (surfels.positions, surfels.normals, surfels.rgb, surfels.rgb_gradient):
         assert len(value) == count
         assert value.isfinite().all()

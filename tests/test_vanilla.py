@@ -23,7 +23,7 @@ from bidnerf_core.storage import MapInfo, load_map, save_map
 from bidnerf_core.testing import BackendContract
 from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, SIDE, points, rgb_views, rgbd_views
-from bidnerf_core.training import RayBank, TrainingState, depth_term, supervised_loss
+from bidnerf_core.training import RayBank, TrainingState, ray_termination, supervised_loss
 from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.encoding import encoded_width, positional_encoding
@@ -262,7 +262,7 @@ def test_what_is_compared_with_measured_depth() -> None:
             total += float((w * (t - d).abs()).sum() + (1 - w.sum()) * d)
             count += 1
     assert count > 10
-    assert float(depth_term(rendering, batch)) == pytest.approx(total / count, rel=1e-4)
+    assert float(ray_termination(rendering, batch)) == pytest.approx(total / count, rel=1e-4)
     loss, mse = supervised_loss(rendering, batch, SIDE, 0.5)
     assert mse == pytest.approx(float(((rendering.rgb - batch.observed.rgb) ** 2).mean()))
     assert float(loss) == pytest.approx(mse + 0.5 * total / count / SIDE, rel=1e-4)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.carving.boxes import MARGIN, Box, corner, grown, rays_of
+from bidnerf_core.carving.boxes import MARGIN, AxisBox, corner, grown, rays_of
 from bidnerf_core.carving.hull import carved_box, has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
@@ -52,7 +52,7 @@ def estimate_bounds(
     return SceneBounds(corner(box[0]), corner(box[1]), near, FAR_MARGIN * far, background)
 
 
-def _measured_box(views: Sequence[View], margin: float) -> tuple[Box, float]:
+def _measured_box(views: Sequence[View], margin: float) -> tuple[AxisBox, float]:
     """Return the box of the measured points, and half the least distance of one from its camera; both without outliers."""
     share = max(POINTS_OF_VIEW, POINTS // len(views))
     parts = [measured_points(view, share) for view in views]
@@ -73,7 +73,7 @@ def measured_points(view: View, share: int) -> tuple[Float[Tensor, "n 3"], Float
     return view.T_ref_camera.to(torch.float64).apply(points), torch.linalg.vector_norm(points, dim=-1)
 
 
-def _guessed_box(views: Sequence[View]) -> Box:
+def _guessed_box(views: Sequence[View]) -> AxisBox:
     """Return the box that the cameras alone suggest, see ``estimate_bounds``."""
     places = _places(views)
     if (middle := _looked_at(views)) is not None:
@@ -118,13 +118,13 @@ def _places(views: Sequence[View]) -> Float[Tensor, "v 3"]:
     return torch.stack([view.T_ref_camera.translation.double() for view in views])
 
 
-def _nearest(views: Sequence[View], box: Box) -> float:
+def _nearest(views: Sequence[View], box: AxisBox) -> float:
     """Return the distance of the box from the nearest camera (metres); 0 where one is inside."""
     outside = torch.maximum(box[0] - _places(views), _places(views) - box[1]).clamp(min=0)
     return torch.linalg.vector_norm(outside, dim=-1).amin().item()
 
 
-def _farthest(views: Sequence[View], box: Box) -> float:
+def _farthest(views: Sequence[View], box: AxisBox) -> float:
     """Return the largest distance of a corner of the box from a camera (metres)."""
     across = torch.maximum((_places(views) - box[0]).abs(), (_places(views) - box[1]).abs())
     return torch.linalg.vector_norm(across, dim=-1).amax().item()

@@ -11,7 +11,7 @@ from torch import Tensor
 from bidnerf_core.frames import View
 
 Corner: TypeAlias = tuple[float, float, float]
-Box: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
+AxisBox: TypeAlias = tuple[Float[Tensor, "3"], Float[Tensor, "3"]]
 """Lower and upper corner: metres, world, float64."""
 
 MARGIN = 0.03  # of the box's size, at each end
@@ -19,14 +19,14 @@ MARGIN = 0.03  # of the box's size, at each end
 
 def grown(
     lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = MARGIN
-) -> Box:
+) -> AxisBox:
     """Return the box with a margin of ``share`` of its size, and ``at_least`` metres, at each end; a flat box gets some thickness."""
     size = upper - lower
     margin = torch.maximum(size * share, size.amax() * 0.01).clamp(min=at_least)
     return lower - margin, upper + margin
 
 
-def met(box: Box, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> float:
+def met(box: AxisBox, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> float:
     """Return the fraction of the rays that meet the box (slab method)."""
     slope = 1 / torch.where(directions == 0, torch.finfo(directions.dtype).tiny, directions)
     first, second = (box[0] - origins) * slope, (box[1] - origins) * slope

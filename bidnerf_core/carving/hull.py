@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.carving.boxes import Box, corner, grown, met, rays_of
+from bidnerf_core.carving.boxes import AxisBox, corner, grown, met, rays_of
 from bidnerf_core.carving.cells import occupied_cells
 from bidnerf_core.frames import View
 
 HULL = (64, 64, 64)
 CARVING_ROUNDS = 3  # each in the box that the one before found
-WITNESSES = (0.5, 0.25, 0.1, 0.0)
+HULL_WITNESSES = (0.5, 0.25, 0.1, 0.0)
 """Thresholds on how many views see something at a cell, as fractions of the largest such number. Cells below are periphery:
 so few views see them that hardly any could have emptied them."""
 EXPLAINED = 0.999  # fraction of the pixels with matter whose rays must meet the box
@@ -26,10 +26,10 @@ def has_outline(view: View) -> bool:
     return view.frame.alpha is not None and bool((view.frame.alpha <= 0).any())
 
 
-def carved_box(box: Box, views: Sequence[View]) -> Box:
+def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     """Return the box of the cells that no two views see through and at which many views see something.
 
-    The threshold on their number is the largest of ``WITNESSES`` for which the box still explains the silhouettes.
+    The threshold on their number is the largest of ``HULL_WITNESSES`` for which the box still explains the silhouettes.
     """
     origins, directions = _rays_to_matter(views)
     for _ in range(CARVING_ROUNDS):
@@ -39,7 +39,7 @@ def carved_box(box: Box, views: Sequence[View]) -> Box:
         if len(kept) == 0:
             return box
         witnesses = _witnesses(views, lower + (kept + 0.5) * cell)
-        for share in WITNESSES:
+        for share in HULL_WITNESSES:
             cells = kept[witnesses >= share * witnesses.amax()]
             box = grown(lower + cells.amin(dim=0) * cell, lower + (cells.amax(dim=0) + 1) * cell)
             if met(box, origins, directions) >= EXPLAINED:

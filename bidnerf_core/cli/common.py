@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 else:
     Dataset = View = Method = Any  # their modules import torch, which commands such as 'backends' do without
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 DEFAULT_BACKEND = "hashgrid"
 LARGEST_SEED = 2**31 - 1
@@ -73,7 +73,7 @@ Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAct
 """``--frame a b --frame c`` names three frames."""
 
 
-def parse(command: str, function: Callable[..., T], arguments: list[str]) -> T:
+def parse(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
     """Call ``function`` with the parsed arguments; wrong usage ends the program with status 2.
 
     ``--help`` shows the options but for settings that are marked ``EXPERT``, and ``--help-all`` shows all of them.
@@ -85,11 +85,11 @@ def parse(command: str, function: Callable[..., T], arguments: list[str]) -> T:
     return _called(command, _of_finite_settings(function), arguments)
 
 
-def _called(command: str, function: Callable[..., T], arguments: list[str]) -> T:
+def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
     return tyro.cli(function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,))
 
 
-def _show_help(command: str, function: Callable[..., T], hidden: int) -> T:
+def _show_help(command: str, function: Callable[..., _T], hidden: int) -> _T:
     page = Page()
     try:
         with contextlib.redirect_stdout(page):
@@ -100,11 +100,11 @@ def _show_help(command: str, function: Callable[..., T], hidden: int) -> T:
         sys.stdout.write(page.wrapped(shutil.get_terminal_size().columns))
 
 
-def _of_finite_settings(function: Callable[..., T]) -> Callable[..., T]:
+def _of_finite_settings(function: Callable[..., _T]) -> Callable[..., _T]:
     """Return the function with a check that its settings are finite, which a training would fail on hours later."""
 
     @functools.wraps(function)
-    def checked(*arguments: Any, **options: Any) -> T:
+    def checked(*arguments: Any, **options: Any) -> _T:
         for value in (*arguments, *options.values()):
             _require_finite(value)
         return function(*arguments, **options)

@@ -46,7 +46,7 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map, load_map
 from bidnerf_core.training import TrainingStopped
 
-CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
+PHOTO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 TRAINING_VIEWS, RADIUS = 60, 3.5
 START_ERROR = (0.55, 13.0)  # scene units (the object fills a 2x2x2 cube) and degrees
 DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # quicker than the defaults, for small images
@@ -54,7 +54,7 @@ ANIMATED = 14  # frames of the animation
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class DemoTrial:
     """An unseen frame, a start that is far off, and what two methods find: one without the start, one from it."""
 
     view: View
@@ -101,10 +101,10 @@ def demo(
 
 def _demonstrated(
     chosen: Backend, backend: str, out: Path, frames: int, steps: int | None, seed: int
-) -> tuple[list[Trial], Map]:
+) -> tuple[list[DemoTrial], Map]:
     scene = demo_object()
-    seen = views(scene, CAMERA, orbit(RADIUS, TRAINING_VIEWS, seed=seed))
-    unseen = views(scene, CAMERA, orbit(RADIUS, frames, elevation=(15.0, 50.0), seed=seed + 1))
+    seen = views(scene, PHOTO_CAMERA, orbit(RADIUS, TRAINING_VIEWS, seed=seed))
+    unseen = views(scene, PHOTO_CAMERA, orbit(RADIUS, frames, elevation=(15.0, 50.0), seed=seed + 1))
     try:
         config = quick_config(chosen)
         config = config if steps is None else dataclasses.replace(config, steps=steps)
@@ -122,11 +122,11 @@ def _demonstrated(
         start = perturb(view.T_ref_camera, *START_ERROR, seed=seed + number)
         with console.status(f"localizing frame {number + 1}"):
             found = auto(view.frame, seed=seed), bid(view.frame, start, seed=seed)
-        trials.append(Trial(view, start, *found))
+        trials.append(DemoTrial(view, start, *found))
     return trials, stored
 
 
-def _print(trials: Sequence[Trial]) -> None:
+def _print(trials: Sequence[DemoTrial]) -> None:
     table = Table(title="Pose errors before and after", title_justify="left", box=None, pad_edge=False)
     for column in ("frame", "method", "start", "", "found", "", "steps", "seconds", "converged"):
         table.add_column(column, justify="left" if column in ("frame", "method") else "right")
@@ -144,7 +144,7 @@ def _shown(error: PoseError, digits: int, digits_of_angle: int) -> tuple[str, st
     return f"{float(error.translation):.{digits}f} m", f"{float(error.rotation_deg):.{digits_of_angle}f} deg"
 
 
-def _draw(stored: Map, trials: Sequence[Trial], out: Path) -> None:
+def _draw(stored: Map, trials: Sequence[DemoTrial], out: Path) -> None:
     for trial in trials:
         painter = Painter(stored, trial.view.frame)
         iio.imwrite(out / f"overlay-{trial.view.frame.name}.png", _overlay(painter, trial))
@@ -162,7 +162,7 @@ def _draw(stored: Map, trials: Sequence[Trial], out: Path) -> None:
     show(f"look at {', '.join(str(out / name) for name in drawn)}")
 
 
-def _overlay(painter: Painter, trial: Trial) -> UInt8[np.ndarray, "H W 3"]:
+def _overlay(painter: Painter, trial: DemoTrial) -> UInt8[np.ndarray, "H W 3"]:
     """Return two rows: what is found without a start, and from one."""
     auto, bid = trial.without_start.T_world_camera, trial.from_start.T_world_camera
     rows = (

@@ -17,10 +17,10 @@ import tyro
 
 from bidnerf_core.settings import is_expert, to_flat
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
-def without_expert_settings(function: Callable[..., T]) -> tuple[Callable[..., T], int]:
+def without_expert_settings(function: Callable[..., _T]) -> tuple[Callable[..., _T], int]:
     """Return a function for whose options a help page is short, and the number of the options that it leaves out.
 
     Settings are the parameters whose default is a dataclass. The parser removes what it is to hide, so this function is
@@ -35,7 +35,7 @@ def without_expert_settings(function: Callable[..., T]) -> tuple[Callable[..., T
             parameters[name] = parameter.replace(default=short, annotation=type(short))
 
     @functools.wraps(function)
-    def shown(*arguments: Any, **options: Any) -> T:
+    def shown(*arguments: Any, **options: Any) -> _T:
         return function(*arguments, **options)
 
     shown.__annotations__ = hints

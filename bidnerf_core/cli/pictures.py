@@ -15,7 +15,7 @@ from bidnerf_core.rendering import render_image
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map
 
-LARGEST = 240
+PICTURE_SIDE = 240
 """Pixels of the longer side; larger photos are reduced, since rendering takes time for each pixel."""
 
 
@@ -23,7 +23,7 @@ class Painter:
     """Draws overlays of one photo with renderings of a map."""
 
     def __init__(self, map: Map, frame: Frame) -> None:
-        scale = LARGEST / max(frame.intrinsics.width, frame.intrinsics.height)
+        scale = PICTURE_SIDE / max(frame.intrinsics.width, frame.intrinsics.height)
         self._map = map
         self._camera = frame.intrinsics if scale >= 1 else frame.intrinsics.scaled(scale)
         size = (self._camera.width, self._camera.height)

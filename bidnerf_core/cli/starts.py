@@ -15,7 +15,7 @@ from bidnerf_core.files import open_binary
 from bidnerf_core.localization import pose_from_matrix
 from bidnerf_core.se3 import SE3
 
-EXPECTED = 'expected {"T_world_camera": 4x4 rows}'
+EXPECTED_POSE = 'expected {"T_world_camera": 4x4 rows}'
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class StartSpec:
     def check(self) -> None:
         """Raise ``UsageError`` for a perturbation out of range."""
         if self.perturb is not None:
-            limits = (("T", "metres", protocols.FARTHEST), ("R", "degrees", 180.0))
+            limits = (("T", "metres", protocols.FARTHEST_START), ("R", "degrees", 180.0))
             for (what, unit, most), value in zip(limits, self.perturb, strict=True):
                 if not 0 <= value <= most:
                     raise UsageError(f"--perturb: {what} is {value:g}, expected {unit} from 0 to {most:g}")
@@ -55,10 +55,10 @@ def read_pose(path: Path) -> SE3:
     except (ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: not JSON ({error}), {EXPECTED}") from error
+        raise InputError(f"{path}: not JSON ({error}), {EXPECTED_POSE}") from error
     rows = found.get("T_world_camera") if isinstance(found, dict) else found
     try:
         matrix = torch.tensor(rows, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{path}: no matrix of numbers in it, {EXPECTED}") from error
+        raise InputError(f"{path}: no matrix of numbers in it, {EXPECTED_POSE}") from error
     return pose_from_matrix(matrix, f"{path}: T_world_camera")

@@ -22,7 +22,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
-SPLITS = frozenset({"train", "val", "test"})
+MODEL_SPLITS = frozenset({"train", "val", "test"})
 LARGEST_MISFIT = 0.2
 """Limit of the median distance between training cameras and the model's, relative to their spread. A larger one means
 another scene; a hand-held camera that moved by decimetres reaches 0.03."""
@@ -169,7 +169,7 @@ class _Names:
 
         Raises ``InputError`` where the name is ambiguous.
         """
-        others = SPLITS - {split}
+        others = MODEL_SPLITS - {split}
         fits = [
             (folders, image) for folders, image in self._by_name.get(name, []) if not others & set(folders)
         ]

@@ -23,7 +23,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.files import open_binary
 from bidnerf_core.se3 import SE3
 
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 Number = TypeVar("Number", int, float)
 
 NAMES = ("images", "points3D")
@@ -121,7 +121,7 @@ class _Bytes:
         return self._place - size
 
 
-def _binary(path: Path, one: Callable[[_Bytes], Item]) -> list[Item]:
+def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
     """Read a count, then that many items with ``one``."""
     file = _Bytes(path)
     (count,) = file.take(COUNT)

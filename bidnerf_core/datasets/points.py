@@ -13,7 +13,7 @@ from bidnerf_core.files import open_binary
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
-EXPECTED = "expected n rows of x, y, z in metres"
+EXPECTED_POINTS = "expected n rows of x, y, z in metres"
 
 
 def read_depth_points(path: Path) -> Observations:
@@ -26,7 +26,9 @@ def read_depth_points(path: Path) -> Observations:
     """
     points, T_camera_sensor = _read(path)
     if points.ndim != 2 or points.shape[1] < 3 or points.dtype.kind not in "fiu":
-        raise InputError(f"{path}: an array of shape {points.shape} and type {points.dtype}, {EXPECTED}")
+        raise InputError(
+            f"{path}: an array of shape {points.shape} and type {points.dtype}, {EXPECTED_POINTS}"
+        )
     xyz = torch.from_numpy(points[:, :3].astype(np.float64))
     try:
         return Observations.from_points(xyz, T_camera_sensor)
@@ -45,7 +47,7 @@ def _read(path: Path) -> tuple[np.ndarray, SE3]:
         except InputError:
             raise
         except (OSError, ValueError, EOFError, BadZipFile) as error:
-            raise InputError(f"{path}: not a file of points ({error}), {EXPECTED}") from error
+            raise InputError(f"{path}: not a file of points ({error}), {EXPECTED_POINTS}") from error
 
 
 def _from_text(text: str) -> np.ndarray:
@@ -62,7 +64,7 @@ def _from_archive(path: Path, archive: np.lib.npyio.NpzFile) -> tuple[np.ndarray
             raise InputError(f"{path}: holds {', '.join(archive) or 'nothing'}, expected an array 'points'")
         arrays = [archive[name] for name in ("points", "T_camera_sensor") if name in archive]
         if not all(isinstance(array, np.ndarray) for array in arrays):  # others come as bytes
-            raise InputError(f"{path}: holds something that is not an array, {EXPECTED} in 'points'")
+            raise InputError(f"{path}: holds something that is not an array, {EXPECTED_POINTS} in 'points'")
         if len(arrays) == 1:
             return arrays[0], SE3.identity()
         matrix = torch.from_numpy(arrays[1].astype(np.float64))

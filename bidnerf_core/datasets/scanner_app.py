@@ -42,7 +42,7 @@ from bidnerf_core.photos import fit_depth
 from bidnerf_core.records import Record, read_record
 from bidnerf_core.se3 import SE3
 
-LARGEST = 640
+LARGEST_SIDE = 640
 """Pixels of the longer side of a photo once it is read."""
 DEPTH_UNIT = 0.001
 """Metres."""
@@ -81,7 +81,7 @@ class ScannerFrame:
 class ScannerAppReader:
     """The reader of folders of "3D Scanner App"; ``largest`` limits the longer side of its photos (pixels)."""
 
-    largest: int = LARGEST
+    largest: int = LARGEST_SIDE
     expected = f"frame_0.jpg, frame_0.json ... with {POSE}"
 
     def recognises(self, path: Path) -> bool:
@@ -95,7 +95,7 @@ class ScannerAppReader:
     def open(self, path: Path, background: Background | None) -> Dataset:
         """Read all descriptions. Raises ``InputError`` where one is missing or not usable."""
         colour = background_colour("black" if background is None else background)
-        return ScannerAppDataset(Splits(path, hold_out(read_frames(path))), colour, self.largest)
+        return ScannerAppDataset(Splits(path, hold_out(scanner_frames(path))), colour, self.largest)
 
 
 class ScannerAppDataset:
@@ -137,7 +137,7 @@ class ScannerAppDataset:
 
     def _view(self, frame: ScannerFrame, name: str) -> View:
         header = read_header(frame.photo)
-        camera = read_camera(frame.record, header.width, header.height)
+        camera = scanner_camera(frame.record, header.width, header.height)
         small = camera.scaled(min(1.0, self._largest / max(camera.width, camera.height)))
         colour, alpha = read_image(frame.photo)
         rgb = over(colour, alpha, self._background)
@@ -153,7 +153,7 @@ class ScannerAppDataset:
         return View(Frame(name, rgb, small, depth), frame.T_world_camera)
 
 
-def read_frames(folder: Path) -> list[ScannerFrame]:
+def scanner_frames(folder: Path) -> list[ScannerFrame]:
     """Read the descriptions of all photos, ordered by number. Raises ``InputError`` where one is missing or not usable.
 
     Depth is expected of all frames or of none, as phones without a LiDAR export it.
@@ -180,7 +180,7 @@ def _frame(photo: Path, has_depth: bool) -> ScannerFrame:
     return frame
 
 
-def read_camera(record: Record, width: int, height: int) -> Intrinsics:
+def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
     """Return the camera of a photo of this size. Raises ``InputError`` where the intrinsics are of another size."""
     fx, skew, cx, _, fy, cy, *last = _numbers(record, INTRINSICS, 9)
     if abs(skew) > 1e-6 or last != [0, 0, 1]:

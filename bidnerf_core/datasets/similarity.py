@@ -23,7 +23,7 @@ class Similarity:
         return self.T_target_source.apply(self.scale * points)
 
 
-FARTHEST = 1e12
+FARTHEST_CAMERA = 1e12
 """Largest coordinate; the squares of larger ones lose all precision."""
 
 
@@ -35,8 +35,8 @@ def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
     """
     source, target = source.double(), target.double()
     largest = max((float(x.abs().max()) for x in (source, target) if x.numel()), default=0.0)
-    if not largest <= FARTHEST:
-        raise InputError(f"a point {largest:g} away from the origin, expected {FARTHEST:g} at most")
+    if not largest <= FARTHEST_CAMERA:
+        raise InputError(f"a point {largest:g} away from the origin, expected {FARTHEST_CAMERA:g} at most")
     if len(source) < 2 or spread(source) == 0 or spread(target) == 0:
         raise InputError(f"{len(source)} pairs of points, expected 2 or more at different places")
     from_mean, to_mean = source - source.mean(0), target - target.mean(0)

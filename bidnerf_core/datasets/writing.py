@@ -18,7 +18,7 @@ from bidnerf_core.frames import Frame, View
 
 OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
 LENS = ("k1", "k2", "p1", "p2", "k3")
-LARGEST = 65534  # readers take the largest number of 16 bits for "not measured"
+LARGEST_DEPTH = 65534  # readers take the largest number of 16 bits for "not measured"
 
 
 def write_transforms(
@@ -53,9 +53,9 @@ def _written(folder: Path, split: str, view: View, background: tuple[float, floa
     }
     _write(folder / entry["file_path"], _colours(frame, background))
     if frame.depth is not None:
-        unit = max(METRES_PER_DEPTH_UNIT, float(frame.depth.max()) / LARGEST)
+        unit = max(METRES_PER_DEPTH_UNIT, float(frame.depth.max()) / LARGEST_DEPTH)
         entry |= {"depth_file_path": f"depth/{split}/{frame.name}.png", "depth_unit_scale_factor": unit}
-        steps = (frame.depth.double() / unit).round().clamp(0, LARGEST)
+        steps = (frame.depth.double() / unit).round().clamp(0, LARGEST_DEPTH)
         _write(folder / entry["depth_file_path"], steps.cpu().numpy().astype(np.uint16))
     return entry
 

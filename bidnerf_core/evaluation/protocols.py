@@ -82,7 +82,7 @@ def _require_length(what: str, value: float) -> None:
 
 
 Size = tuple[float, ...]
-FARTHEST = 1e6
+FARTHEST_START = 1e6
 """The largest translation error of a start, metres."""
 
 MOST_TRIALS = 100_000
@@ -117,7 +117,7 @@ class Protocol:
 
     def check_size(self, size: Size) -> None:
         """Raise ``InputError`` for a size with the wrong number of values, or with one that is out of range."""
-        most = [180.0 if "deg" in unit else FARTHEST for unit in self.units]
+        most = [180.0 if "deg" in unit else FARTHEST_START for unit in self.units]
         if len(size) != len(self.units) or not all(0 <= x <= m for x, m in zip(size, most, strict=True)):
             expected = " : ".join(self.units) or "none, for it has no sizes"
             limits = f", 0 to {' : '.join(f'{m:g}' for m in most)}" if most else ""

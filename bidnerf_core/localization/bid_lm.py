@@ -27,7 +27,7 @@ from bidnerf_core.settings import EXPERT, NotNegative, Range, Settings
 Poses = Annotated[int, Range(1, 10**5), EXPERT]
 Steps = Annotated[int, Range(1, 10**5)]
 ExpertSteps = Annotated[int, Range(1, 10**5), EXPERT]
-Rays = Annotated[int, Range(7, 10**7)]
+RayCount = Annotated[int, Range(7, 10**7)]
 ExpertRays = Annotated[int, Range(7, 10**7), EXPERT]
 
 
@@ -43,7 +43,7 @@ class BidLmStages(Settings):
     middle_steps: ExpertSteps = 4  # that each of them takes
     middle_rays: ExpertRays = 256  # for each of them
     fine_steps: Steps = 6  # of the best one, in full detail
-    fine_rays: Rays = 1024  # rendered for each of these steps
+    fine_rays: RayCount = 1024  # rendered for each of these steps
     blur: Annotated[int, Range(1, 10**4), EXPERT] = 8  # colours of coarse steps are means over so many pixels
     # times that poses are first centred on what was measured
     centring: Annotated[int, Range(0, 100), EXPERT] = 2

@@ -34,7 +34,7 @@ POINTS = 2000
 """Measured points that are fused, at most."""
 SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
 """How many independent measurements the points on the surface and the rendered rays of a view count for beside landmarks."""
-STEPS = 6
+FUSION_STEPS = 6
 """Second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
@@ -55,7 +55,7 @@ DEPTH_SCALE_PRIOR = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Term:
+class FusedTerm:
     """A cost with the variance of its residuals, so that terms of different units can be added."""
 
     cost: Cost
@@ -88,7 +88,7 @@ def answer_by_landmarks(
     if found is None:
         return None
     problem = replace(problem, start=found.T_world_camera)
-    about, terms = pivot("scene", problem), dict[str, Term]()
+    about, terms = pivot("scene", problem), dict[str, FusedTerm]()
     generator = Generator().manual_seed(seed)
     if abs(found.focal_factor - 1) < 1e-3:  # other terms would need the corrected camera
         if problem.surface is not None and problem.has_depth:
@@ -126,7 +126,7 @@ def _is_sharp(problem: Problem) -> bool:
     return problem.colour_noise is None or problem.colour_noise <= SHARPEST
 
 
-def _surface_term(problem: Problem, found: LandmarkPose, generator: Generator) -> Term:
+def _surface_term(problem: Problem, found: LandmarkPose, generator: Generator) -> FusedTerm:
     """Return the term of measured points on the surface, at the depth scale that landmarks and prior agree on."""
     assert problem.surface is not None
     cloud = PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator)
@@ -134,7 +134,7 @@ def _surface_term(problem: Problem, found: LandmarkPose, generator: Generator) -
     scales = PointScales(FINEST * problem.surface.cell)
     cost = SurfaceCost(problem.surface, cloud, scales)
     variance = max(float(cost.residual_variance(found.T_world_camera[None])[0]), LEAST_VARIANCE)
-    return Term(cost, variance, SURFACE_MEASUREMENTS * len(problem.views))
+    return FusedTerm(cost, variance, SURFACE_MEASUREMENTS * len(problem.views))
 
 
 def _depth_scale(found: LandmarkPose) -> float:
@@ -147,10 +147,10 @@ def _depth_scale(found: LandmarkPose) -> float:
     return 1 + weight * (found.depth_scale - 1)
 
 
-def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator) -> Term:
+def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator) -> FusedTerm:
     """Return the term of what the field renders against what was photographed."""
     cell = 0.01 if problem.surface is None else problem.surface.cell
-    stage = RefinementStage(STEPS, rays, depth_scale=6 * cell)
+    stage = RefinementStage(FUSION_STEPS, rays, depth_scale=6 * cell)
     depth = DepthSettings() if problem.has_depth else None
     settings = RenderedCostSettings(
         ColourSettings(), depth, RefinementSettings(exposure=problem.exposure_varies)
@@ -158,10 +158,10 @@ def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generat
     cost = settings.drawn(problem, stage, about, generator)
     assert problem.start is not None
     variance = max(float(cost.cost(problem.start[None])[0]), LEAST_VARIANCE)
-    return Term(cost, variance, RENDERED_MEASUREMENTS * len(problem.views))
+    return FusedTerm(cost, variance, RENDERED_MEASUREMENTS * len(problem.views))
 
 
-def _fused(found: LandmarkPose, terms: dict[str, Term], about: Pivot) -> LandmarkAnswer:
+def _fused(found: LandmarkPose, terms: dict[str, FusedTerm], about: Pivot) -> LandmarkAnswer:
     """Take steps on the sum of the terms.
 
     The covariance counts the additional terms as ``INDEPENDENT`` measurements only: their errors are alike over large parts
@@ -172,7 +172,7 @@ def _fused(found: LandmarkPose, terms: dict[str, Term], about: Pivot) -> Landmar
         return LandmarkAnswer(found, found.T_world_camera, covariance, ())
     prior = GaussianPrior(found.T_world_camera, covariance, about)
     cost = Sum((prior, *(term.scaled for term in terms.values())))
-    done = descend(cost, found.T_world_camera[None], STEPS, about.moved)
+    done = descend(cost, found.T_world_camera[None], FUSION_STEPS, about.moved)
     T = done.T[0].normalized()
     information = prior(T[None]).hessian[0]
     for term in terms.values():

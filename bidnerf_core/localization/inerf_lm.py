@@ -26,18 +26,18 @@ from bidnerf_core.localization.search.by_images import ImageSearch, ImageStage
 from bidnerf_core.localization.search.hypotheses import neighbours
 from bidnerf_core.settings import EXPERT, Range, Settings
 
-Count = Annotated[int, Range(1, 10**5), EXPERT]
+StepCount = Annotated[int, Range(1, 10**5), EXPERT]
 
 
 @dataclass(frozen=True)
 class ImageSearchSettings(Settings):
     """Small renderings of the poses about the start, ever larger and of ever fewer."""
 
-    search_poses: Count = 24  # the best of the poses, which take steps on small renderings
-    search_steps: Count = 8  # that each of them takes
-    middle_poses: Count = 6  # the best of these, which take more on larger ones
-    middle_steps: Count = 6  # that each of them takes
-    last_steps: Count = 4  # of the best two, on the largest renderings
+    search_poses: StepCount = 24  # the best of the poses, which take steps on small renderings
+    search_steps: StepCount = 8  # that each of them takes
+    middle_poses: StepCount = 6  # the best of these, which take more on larger ones
+    middle_steps: StepCount = 6  # that each of them takes
+    last_steps: StepCount = 4  # of the best two, on the largest renderings
     # pixels along the first renderings' longer side; the last have 3 times
     width: Annotated[int, Range(4, 1000)] = 16
 

@@ -16,7 +16,7 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 
 
 @runtime_checkable
@@ -119,7 +119,7 @@ def rig(
     return Problem(scene.field, scene.bounds, relative, start, depth_rays, scene.surface, matcher, noise)
 
 
-def window(sequence: Sequence[Item], last: int, size: int, stride: int = 1) -> tuple[Item, ...]:
+def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> tuple[_Item, ...]:
     """Return item ``last`` and those before it, ``size`` of them, ``stride`` apart; fewer at the sequence's beginning.
 
     Views in the order of time give the paper's moving window. Raises ``InputError`` where there is no such item.

@@ -16,7 +16,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.mapping.surface_map import SurfaceMap, nearest_surfels
-from bidnerf_core.mapping.surfels import fused, merged
+from bidnerf_core.mapping.surfels import fused_surfels, merged
 from bidnerf_core.rendering import RenderedImage, render_image
 from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import Above, Range, Settings
@@ -56,7 +56,7 @@ def bake(
 ) -> SurfaceMap:
     """Return the surface that the measured depth of ``views`` and depth rendered from ``cameras`` (T_world_camera) agree on.
 
-    Points that several of these images agree on are kept, fused into surfels and indexed by a grid. Measured depth is closer
+    Points that several of these images agree on are kept, fused_surfels into surfels and indexed by a grid. Measured depth is closer
     to the truth than a field that was trained on it, so rendered depth is meant for where none was measured. Raises
     ``InputError`` where there is no image or no point that they agree on.
     """
@@ -81,7 +81,7 @@ def surface_of(images: Sequence[PosedDepthImage], bounds: SceneBounds, config: B
     occupied, (positions, colours) = merged(grid.numbers(points[inside]), points[inside], rgb[inside])
     nearest = nearest_surfels(occupied, grid.shape)
     keyframes = torch.stack([image.T_world_camera.matrix() for image in images])
-    return SurfaceMap(fused(positions, colours), grid, nearest, keyframes)
+    return SurfaceMap(fused_surfels(positions, colours), grid, nearest, keyframes)
 
 
 def _measured(view: View, pixels: float) -> PosedDepthImage:

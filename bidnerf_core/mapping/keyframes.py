@@ -17,7 +17,7 @@ from bidnerf_core.se3 import SE3
 Camera = tuple[Intrinsics, SE3]
 """Intrinsics and T_world_camera."""
 
-LARGEST = 400
+KEYFRAME_SIDE = 400
 """Pixels along the longer side of a rendered keyframe, at most."""
 MOST = 100
 """Keyframes that are rendered, at most: evenly many of the cameras."""
@@ -30,7 +30,7 @@ def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[
     every = max(1, math.ceil(len(cameras) / MOST))
     views = []
     for number, (intrinsics, T) in enumerate(cameras[::every]):
-        small = intrinsics.scaled(min(1.0, LARGEST / max(intrinsics.width, intrinsics.height)))
+        small = intrinsics.scaled(min(1.0, KEYFRAME_SIDE / max(intrinsics.width, intrinsics.height)))
         image = render_image(field, small, T, bounds)
         views.append(View(Frame(f"{number:04d}", image.rgb, small, image.depth), T))
     return views

@@ -16,9 +16,9 @@ HEARD = 6
 """Pixels of the nine about a keypoint that must have measured depth."""
 DEFAULT_NOISE = 0.01
 """Share of the depth: its standard deviation where nothing tells of it."""
-ENOUGH = 30
+ENOUGH_DEPTHS = 30
 """Triangulated observations with depth from which on its noise is estimated."""
-APART = 3.0
+EDGE_APART = 3.0
 """Standard deviations from the mean of its track beyond which a depth does not count."""
 
 
@@ -47,7 +47,7 @@ def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, 
 def depth_noise(sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]) -> float:
     """Standard deviation of measured depth as a share of it, robustly, from points that were triangulated."""
     known = depth > 0
-    if int(known.sum()) < ENOUGH:
+    if int(known.sum()) < ENOUGH_DEPTHS:
         return DEFAULT_NOISE
     off = depth[known] / sightings.in_camera(points)[known, 2] - 1
     return max(1e-4, 1.4826 * float(off.abs().median()))
@@ -68,7 +68,7 @@ def placed(
     information = _information(sightings, depth, relative, pixel_noise)
     mean, _ = _weighted(world, information, observations.point)
     off = (world - mean[observations.point])[..., None]
-    agree = (off.mT @ information @ off)[:, 0, 0] <= APART**2
+    agree = (off.mT @ information @ off)[:, 0, 0] <= EDGE_APART**2
     tracks = torch.bincount(observations.point)
     majority = 2 * torch.bincount(observations.point[agree], minlength=len(tracks)) > tracks
     kept = agree & majority[observations.point]

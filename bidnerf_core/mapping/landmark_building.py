@@ -1,4 +1,4 @@
-"""Building landmarks: keypoints of posed images, matched, joined into tracks, and triangulated or placed by depth."""
+"""Building landmarks: keypoints of posed images, matched, joined_tracks into tracks, and triangulated or placed by depth."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.mapping.features import Features, Sift
 from bidnerf_core.mapping.keypoint_depth import depth_noise, measured_depth, placed
-from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
 from bidnerf_core.mapping.pose_scatter import pose_scatter
-from bidnerf_core.mapping.tracks import PosedKeypoints, epipolar_matches, joined
+from bidnerf_core.mapping.tracks import PosedKeypoints, epipolar_matches, joined_tracks
 from bidnerf_core.mapping.triangulation import (
     Sightings,
     fitting,
@@ -31,7 +31,7 @@ from bidnerf_core.mapping.triangulation import (
 )
 from bidnerf_core.mapping.view_pairs import likely_pairs
 
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 Result = TypeVar("Result")
 
 SIFT = Sift()
@@ -78,7 +78,7 @@ def build_landmarks(
     counter = _Counter(progress, len(views) + len(pairs))
     images = counter.over(_mapped(lambda view: _detected(view, features), views))
     matches = counter.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
-    label = joined(
+    label = joined_tracks(
         [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)], [len(p.keypoints) for p in images]
     )
     observations = TrackedKeypoints(images, label, torch.arange(len(label)))
@@ -110,14 +110,14 @@ def _located(
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
     triangulated = replace(
-        fused(kept, positions, pixel_noise**2 * covariance, pixel_noise),
+        fused_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
         pose_covariance=pose_scatter(kept, positions, pixel_noise),
     )
     relative = depth_noise(sightings, positions, depth[kept.number])
     left = torch.ones_like(tracked).index_fill_(0, kept.number, False)
     left &= tracked | config.singles
     rest, positions, covariance = placed(observations[left], depth[left], relative, pixel_noise)
-    return concatenated([triangulated, fused(rest, positions, covariance, pixel_noise)])
+    return concatenated([triangulated, fused_landmarks(rest, positions, covariance, pixel_noise)])
 
 
 def _triangulated(
@@ -157,7 +157,7 @@ def _bounded(landmarks: LandmarkMap, most: int, report: Callable[[str], None]) -
     return landmarks[order.sort().values]
 
 
-def _mapped(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+def _mapped(work: Callable[[_Item], Result], items: Sequence[_Item]) -> Iterator[Result]:
     """Results in the order of ``items``, made by as many threads as torch has been given."""
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         yield from pool.map(work, items)

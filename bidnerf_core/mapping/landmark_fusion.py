@@ -59,7 +59,7 @@ class TrackedKeypoints:
         return torch.cat([p.keypoints.descriptors for p in self.images])[self.number]
 
 
-def fused(
+def fused_landmarks(
     observations: TrackedKeypoints,
     positions: Float[Tensor, "n 3"],
     covariance: Float[Tensor, "n 3 3"],

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.mapping.landmarks import PER_LANDMARK, LandmarkMap
 
-KINDS = {
+LANDMARK_KINDS = {
     "positions": ((-1, 3), torch.float32),
     "deviations": ((-1, 2), torch.float32),
     "descriptors": ((-1, -1), torch.uint8),
@@ -26,13 +26,16 @@ KINDS = {
 
 def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
     """Return copies of the parts of ``landmarks`` by name."""
-    found = {name: torch.as_tensor(getattr(landmarks, name), dtype=kind) for name, (_, kind) in KINDS.items()}
+    found = {
+        name: torch.as_tensor(getattr(landmarks, name), dtype=kind)
+        for name, (_, kind) in LANDMARK_KINDS.items()
+    }
     return {name: value.contiguous().clone() for name, value in found.items()}
 
 
 def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
     """Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, kind or content."""
-    for name, (shape, kind) in KINDS.items():
+    for name, (shape, kind) in LANDMARK_KINDS.items():
         value = tensors[name]
         fits = value.dim() == len(shape) and all(
             a in (-1, b) for a, b in zip(shape, value.shape, strict=True)
@@ -42,7 +45,7 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
         if value.is_floating_point() and not bool(value.isfinite().all()):
             raise ValueError(f"{name} holds NaN or infinity")
     _check_contents(tensors)
-    parts: dict[str, Any] = {name: tensors[name] for name in KINDS}
+    parts: dict[str, Any] = {name: tensors[name] for name in LANDMARK_KINDS}
     return LandmarkMap(**parts | {"noise": float(tensors["noise"])})
 
 

@@ -8,24 +8,24 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.resection import ObservedPoints, fit
+from bidnerf_core.mapping.resection import ObservedPoints, resect
 from bidnerf_core.mapping.triangulation import Sightings
 
 SEEN = 20
 """Points that an image needs for its pose to be found from them."""
-ENOUGH = 8
+ENOUGH_IMAGES = 8
 """Images from which on a covariance of six numbers is estimated."""
-ROUNDS = 10
+WEIGHT_ROUNDS = 10
 """Of reweighting; the weights hardly change after five."""
 
 
 def pose_scatter(
     tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"], noise: float
 ) -> Float[Tensor, "6 6"]:
-    """Covariance of the right updates from the given poses to those that fit the points best; zero for too few images.
+    """Covariance of the right updates from the given poses to those that resect the points best; zero for too few images.
 
     ``noise`` is that of the keypoints, pixels. An image takes part in the triangulation of what it sees and draws it to
-    its own error, which is allowed for: of k views of a point, a fit shows the share 1 - 1/k of the variance, while another
+    its own error, which is allowed for: of k views of a point, a resect shows the share 1 - 1/k of the variance, while another
     image would be off by 1 + 1/k.
     """
     sightings, image = tracked.sightings, tracked.image
@@ -35,10 +35,10 @@ def pose_scatter(
         mine = (image == number).nonzero()[:, 0]
         T = tracked.images[number].T_world_camera
         views = float(seen[mine].mean())
-        found = fit(_seen_by(sightings[mine], positions), T, noise)
+        found = resect(_seen_by(sightings[mine], positions), T, noise)
         update = (T.inverse() @ found.T_world_rig).log()
         updates.append(update * ((1 + 1 / views) / (1 - 1 / views)) ** 0.5)
-    if len(updates) < ENOUGH:
+    if len(updates) < ENOUGH_IMAGES:
         return torch.zeros((6, 6), dtype=torch.float64)
     return robust_covariance(torch.stack(updates))
 
@@ -60,7 +60,7 @@ def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
     channels = values.shape[1]
     scale = values.square().median(0).values.clamp(min=1e-30)
     covariance = torch.diag(scale)
-    for _ in range(ROUNDS):
+    for _ in range(WEIGHT_ROUNDS):
         squared = (values @ torch.linalg.inv(covariance) * values).sum(-1).clamp(min=1e-12)
         squared = squared * (float(chi2.ppf(0.5, channels)) / float(squared.median()))
         weight = 1 / (1 + squared / channels)

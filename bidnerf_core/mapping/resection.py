@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.se3 import SE3, skew
 
-STEPS = 20
+RESECTION_STEPS = 20
 """At most; a good start takes four or five."""
 FIRM = 1e-6
 """Squared step (in standard deviations of the pose) under which nothing changes any more."""
@@ -76,7 +76,7 @@ class ReprojectionFit:
     ]  # of the right update (translation, rotation) and of the logarithm of the factor
 
 
-def fit(
+def resect(
     data: ObservedPoints, start: SE3, noise: float, free_focal: bool = False, focal_factor: float = 1.0
 ) -> ReprojectionFit:
     """Minimize Cauchy's loss of the residuals in standard deviations; those of the landmarks count too.
@@ -85,7 +85,7 @@ def fit(
     """
     T, log_factor, damping = start, torch.tensor(focal_factor, dtype=torch.float64).log(), 1e-4
     system = _linearized(data, T, log_factor, noise, free_focal)
-    for _ in range(STEPS):
+    for _ in range(RESECTION_STEPS):
         step = -_solved(system.hessian, damping, system.gradient)
         T_new = T.retract(step[:6]).normalized()
         factor_new = log_factor + step[6] if free_focal else log_factor

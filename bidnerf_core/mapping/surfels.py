@@ -1,4 +1,4 @@
-"""Surfels: small discs of a surface, fused from points."""
+"""Surfels: small discs of a surface, fused_surfels from points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-NEIGHBOURS = 12
+SURFEL_NEIGHBOURS = 12
 """How many surfels the plane and the colour gradient of one of them are fitted to."""
 
 
@@ -37,9 +37,9 @@ def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[
     return found, means
 
 
-def fused(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
+def fused_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
     """Return surfels of merged points: to each its neighbours' plane is fitted, and it is moved onto that plane."""
-    near = _neighbours(positions, NEIGHBOURS)
+    near = _neighbours(positions, SURFEL_NEIGHBOURS)
     offsets = positions[near] - positions[:, None]
     mean = offsets.mean(1)
     centred = offsets - mean[:, None]

@@ -10,7 +10,7 @@ from bidnerf_core.mapping.surfels import Surfels
 from bidnerf_core.se3 import SE3
 from bidnerf_core.voxel_grid import VoxelGrid
 
-KINDS = {
+SURFACE_KINDS = {
     "positions": ((-1, 3), torch.float32),
     "normals": ((-1, 3), torch.float32),
     "rgb": ((-1, 3), torch.float32),
@@ -24,14 +24,14 @@ KINDS = {
 
 
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
-    """Return all that a surface consists of, under the names and in the dtypes of ``KINDS``."""
+    """Return all that a surface consists of, under the names and in the dtypes of ``SURFACE_KINDS``."""
     parts = surface.surfels
     found = {
         "positions": parts.positions, "normals": parts.normals, "rgb": parts.rgb, "rgb_gradient": parts.rgb_gradient,
         "nearest": surface.nearest_in_cell, "keyframes": surface.keyframes,
         "lower": torch.tensor(surface.grid.lower, dtype=torch.float64), "cell": torch.tensor(surface.cell, dtype=torch.float64),
     }  # fmt: skip
-    return {name: found[name].to(kind).contiguous().clone() for name, (_, kind) in KINDS.items()}
+    return {name: found[name].to(kind).contiguous().clone() for name, (_, kind) in SURFACE_KINDS.items()}
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
@@ -39,7 +39,7 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """
-    for name, (shape, kind) in KINDS.items():
+    for name, (shape, kind) in SURFACE_KINDS.items():
         value = tensors[name]
         fits = len(shape) == value.dim() and all(
             a in (-1, b) for a, b in zip(shape, value.shape, strict=True)

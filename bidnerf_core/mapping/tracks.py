@@ -15,14 +15,14 @@ from bidnerf_core.se3 import SE3
 
 BAND = 2.0
 """Pixels from the epipolar line within which the partner of a keypoint is sought."""
-RATIO = 0.95
+TRACK_RATIO = 0.95
 """Distance of the descriptors as a share of that to the next best of all keypoints of the image, at most."""
 RATIO_IN_BAND = 0.85
 """The same share, of the next best one near the epipolar line."""
-APART = 4.0
+TRACK_APART = 4.0
 """Pixels from which on two keypoints of an image are different ones: SIFT gives one for each dominant orientation."""
 
-ONE_PLACE = 1e-12
+ONE_KEYPOINT = 1e-12
 """Metres between cameras under which there are no epipolar lines."""
 
 
@@ -57,10 +57,10 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
     mutual = banded.argmin(dim=0)[partner] == torch.arange(len(partner))
     rows = (mutual & best.isfinite()).nonzero()[:, 0]
     best, partner = best[rows], partner[rows]
-    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < APART
+    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < TRACK_APART
     next_best = distance[rows].masked_fill(near, torch.inf).amin(dim=1)
     next_in_band = banded[rows].masked_fill(near, torch.inf).amin(dim=1)
-    good = (best < RATIO_IN_BAND**2 * next_in_band) & (best < RATIO**2 * next_best)
+    good = (best < RATIO_IN_BAND**2 * next_in_band) & (best < TRACK_RATIO**2 * next_best)
     ambiguity = (best / next_best.clamp(min=1)).sqrt()
     return Matches(torch.stack([rows, partner], dim=-1)[good], ambiguity[good])
 
@@ -81,7 +81,7 @@ def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
     sideways = torch.stack([-forward[:, 1], forward[:, 0]], dim=-1)
     seen = torch.cat([b.rays[:, :2], torch.ones_like(b.rays[:, :1])], dim=-1).float().mT
     band = BAND / b.focal
-    if float(torch.linalg.vector_norm(base)) < ONE_PLACE:
+    if float(torch.linalg.vector_norm(base)) < ONE_KEYPOINT:
         return torch.cdist(start.float(), seen[:2].mT) <= band
     across, along = (
         torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen
@@ -92,7 +92,7 @@ def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
     return (across.abs_() <= band) & (along >= least)
 
 
-def joined(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
+def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
     """Join matches (image, image, keypoints) into tracks: the track of each keypoint, in the numbering of all images.
 
     The least ambiguous matches come first, and one that would bring two keypoints of an image together is left out: a

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-STEPS = 8
+TRIANGULATION_STEPS = 8
 """Gauss-Newton steps; from the linear answer, four or five are enough."""
 DAMPING = 1e-6
 """Of the mean diagonal: holds what rays without parallax leave open."""
@@ -64,7 +64,7 @@ def refined(
 
     Returns the points and the inverse of their normal matrices: the covariance for a noise of one pixel.
     """
-    for _ in range(STEPS):
+    for _ in range(TRIANGULATION_STEPS):
         matrix, gradient = _normal_equations(sightings, points, scale)
         points = points - torch.linalg.solve(_held(matrix), gradient)
     matrix, _ = _normal_equations(sightings, points, scale)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from bidnerf_core.backend import Backend
 from bidnerf_core.field import RadianceField, levels
 from bidnerf_core.testing import derivatives, recipes, samples, values
-from bidnerf_core.testing.faults import calling, query, require
+from bidnerf_core.testing.faults import calling, query, require_that
 from bidnerf_core.testing.scene import awkward_rays, joined, points, rgb_views, rgbd_views
 from bidnerf_core.testing.subject import Subject, called, frozen, precise
 
@@ -29,21 +29,21 @@ class BackendContract(Subject):
 
     def test_backend_says_what_it_is(self) -> None:
         backend = self._backend()
-        require(
+        require_that(
             isinstance(backend, Backend),
             f"{called(backend)} lacks some of summary, config_type, build, train",
         )
         summary = backend.summary
         one_line = isinstance(summary, str) and summary.strip() != "" and "\n" not in summary
-        require(one_line, f"{called(backend)}.summary is {summary!r}, expected one line of text")
+        require_that(one_line, f"{called(backend)}.summary is {summary!r}, expected one line of text")
 
     def test_config_is_a_frozen_dataclass_with_defaults_and_steps(self) -> None:
         kind, who = self._backend().config_type, f"{called(self._backend())}.config_type"
-        require(
+        require_that(
             isinstance(kind, type) and dataclasses.is_dataclass(kind),
             f"{who} is {kind!r}, expected a dataclass",
         )
-        require(
+        require_that(
             cast(Any, kind).__dataclass_params__.frozen,
             f"{who} {kind.__name__} is not frozen, expected @dataclass(frozen=True)",
         )
@@ -51,12 +51,12 @@ class BackendContract(Subject):
         bare = [
             f.name for f in dataclasses.fields(kind) if f.default is missing and f.default_factory is missing
         ]
-        require(
+        require_that(
             not bare,
             f"{who} {kind.__name__} has no default for {', '.join(bare)}, expected one for every field",
         )
         steps = getattr(kind(), "steps", None)
-        require(
+        require_that(
             type(steps) is int and steps > 0,
             f"{who} {kind.__name__} has steps = {steps!r}, expected a field of type int: the length of a training",
         )
@@ -64,23 +64,23 @@ class BackendContract(Subject):
     def test_config_survives_json(self) -> None:
         for config in (self._backend().config_type(), self._config()):
             found = self._reread(config)
-            require(
+            require_that(
                 found == config, f"{type(config).__name__} comes back from JSON as {found}, expected {config}"
             )
 
     def test_build_gives_a_field(self) -> None:
         field = self._build()
         who = f"{called(self._backend())}.build gives a {type(field).__name__}"
-        require(
+        require_that(
             isinstance(field, nn.Module), f"{who}, expected an nn.Module, whose state_dict is what is saved"
         )
-        require(isinstance(field, RadianceField), f"{who} without query or sampler, expected both")
+        require_that(isinstance(field, RadianceField), f"{who} without query or sampler, expected both")
 
     def test_build_is_reproducible(self) -> None:
         with torch.random.fork_rng(devices=[]):
             first, second = (self._build().state_dict() for _ in range(2))
         for name, value in first.items():
-            require(
+            require_that(
                 torch.equal(value, second[name]),
                 f"{called(self._backend())}.build: {name!r} differs between two builds of one config, expected its chance"
                 " to come from a seed in the config",
@@ -117,7 +117,7 @@ class BackendContract(Subject):
             names = (f.name for f in dataclasses.fields(rays))
             elsewhere = dataclasses.replace(rays, **{name: getattr(rays, name).cuda() for name in names})
             found = samples.seen(cast(RadianceField, moved), elsewhere, "rays on CUDA").cpu()
-        require(
+        require_that(
             values.close(found, samples.seen(field, rays, "rays"), 2e-2),
             f"{type(field).__name__} renders otherwise on CUDA than on the CPU",
         )
@@ -159,7 +159,7 @@ class BackendContract(Subject):
             torch.equal(samples.seen(a, rays, "rays"), samples.seen(b, rays, "rays"))
             for a, b in zip(levels(loaded), levels(trained), strict=True)
         )
-        require(
+        require_that(
             same,
             f"{type(fresh).__name__}: saved, built anew and loaded, it renders otherwise than before, expected the same"
             " bits; is some state not in state_dict (a plain attribute, a buffer with persistent=False)?",

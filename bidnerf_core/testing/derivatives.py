@@ -11,7 +11,7 @@ from torch import Tensor
 from bidnerf_core.field import RadianceField
 from bidnerf_core.rendering import render
 from bidnerf_core.se3 import SE3
-from bidnerf_core.testing.faults import calling, query, require
+from bidnerf_core.testing.faults import calling, query, require_that
 from bidnerf_core.testing.scene import SIDE, camera_rays, points, rgbd_views
 
 COUNT = 64
@@ -67,10 +67,10 @@ def check_pose_gradient(field: RadianceField, dtype: torch.dtype) -> None:
         rendering = render(field, camera_rays(T_world_camera))
         seen = {"rgb": rendering.rgb.square().mean(), "distance": rendering.distance.mean()}
     for what, value in seen.items():
-        require(value.requires_grad, f"{who}: {what} carries no gradient; {DETACHED}")
+        require_that(value.requires_grad, f"{who}: {what} carries no gradient; {DETACHED}")
         (gradient,) = torch.autograd.grad(value, delta, retain_graph=True)
-        require(bool(gradient.isfinite().all()), f"{who}: the gradient of {what} is NaN or infinite")
-        require(bool(gradient.abs().max() > 0), f"{who}: the gradient of {what} is zero; {DETACHED}")
+        require_that(bool(gradient.isfinite().all()), f"{who}: the gradient of {what} is NaN or infinite")
+        require_that(bool(gradient.abs().max() > 0), f"{who}: the gradient of {what} is zero; {DETACHED}")
 
 
 DETACHED = "expected one: query must not detach positions or run under no_grad"
@@ -111,7 +111,7 @@ def _slopes(ask: Asked, at: Float[Tensor, "n 3"], speed: Float[Tensor, "n 3"]) -
 
 
 def _require_agreement(field: RadianceField, what: str, by: str, share: Tensor) -> None:
-    require(
+    require_that(
         float(share) >= AGREEING,
         f"{type(field).__name__}.query: the derivative of {what} by {by} agrees with finite differences at"
         f" {float(share):.0%} of the points, expected {AGREEING:.0%}; is something detached, rounded or clamped?",

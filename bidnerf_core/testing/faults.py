@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples
 
 
-def require(condition: bool, fault: str) -> None:
+def require_that(condition: bool, fault: str) -> None:
     """Raise ``AssertionError`` unless ``condition`` holds. An ``assert`` would be skipped under ``python -O``."""
     if not condition:
         raise AssertionError(fault)
@@ -38,7 +38,7 @@ def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) 
         ("density", values.density, shape),
         ("rgb", values.rgb, (*shape, 3)),
     ):
-        require(
+        require_that(
             tuple(found.shape) == expected,
             f"{who}: {what} has shape {tuple(found.shape)}, expected {expected} for positions of shape"
             f" {tuple(positions.shape)}",
@@ -52,10 +52,12 @@ def sample(field: RadianceField, rays: Rays, of: str, jitter: Generator | None =
     with calling(who):
         samples = field.sampler(rays, jitter)
     shape, found = samples.starts.shape, tuple(rays.near.shape)
-    require(
+    require_that(
         tuple(shape[:-1]) == found and samples.ends.shape == shape and samples.valid.shape == shape,
         f"{who}: starts, ends and valid have shapes {tuple(shape)}, {tuple(samples.ends.shape)} and"
         f" {tuple(samples.valid.shape)}, expected the same for all three: {found} and one more axis",
     )
-    require(samples.valid.dtype == torch.bool, f"{who}: valid is {samples.valid.dtype}, expected torch.bool")
+    require_that(
+        samples.valid.dtype == torch.bool, f"{who}: valid is {samples.valid.dtype}, expected torch.bool"
+    )
     return samples

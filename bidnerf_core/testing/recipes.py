@@ -15,7 +15,7 @@ from bidnerf_core.backend import Backend
 from bidnerf_core.field import RadianceField
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
-from bidnerf_core.testing.faults import calling, require
+from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.scene import BOUNDS, camera_rays, rgbd_views
 from bidnerf_core.training import Progress, TrainingState, TrainingStopped
 
@@ -65,7 +65,7 @@ def check_learning(
     before = colour_error(field)
     _train(backend, field, views, config, Recorder(), f"on {kind} views")
     after = colour_error(field)
-    require(
+    require_that(
         after <= LEARNED * before,
         f"{_name(backend)}.train on {kind} views: {config.steps} steps took the squared error of colour from"
         f" {before:.4g} to {after:.4g}, expected {LEARNED * before:.4g} or less; does the recipe change the field that it"
@@ -82,14 +82,14 @@ def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
     _train(backend, field, rgbd_views(), config, report, "")
     who = f"{_name(backend)}.train"
     told = [(progress.step, progress.total) for progress in report.steps]
-    require(
+    require_that(
         told == [(i + 1, total) for i in range(total)],
         f"{who}: report.step was called with {_shortly(told)}, expected (1, {total}) to ({total}, {total}), one a step",
     )
     odd = [p for p in report.steps if not (math.isfinite(p.loss) and math.isfinite(p.psnr))]
-    require(not odd, f"{who}: reported a loss or PSNR that is not finite: {odd[:1]}")
+    require_that(not odd, f"{who}: reported a loss or PSNR that is not finite: {odd[:1]}")
     saved = [state.step for state in report.saved]
-    require(
+    require_that(
         saved == due,
         f"{who}: saved after steps {saved}, expected {due}: whenever report.due(step) says so, and only then",
     )
@@ -112,7 +112,7 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
     try:
         _train(backend, second, rgbd_views(), config, report, "")
     except TrainingStopped as stopped:
-        require(
+        require_that(
             stopped.step == middle,
             f"{who}: TrainingStopped says step {stopped.step}, but report.stopping was set after step {middle}",
         )
@@ -121,14 +121,14 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
             f"{who}: did not stop when report.stopping was set after step {middle}, expected TrainingStopped"
         )
     saved = [state.step for state in report.saved]
-    require(
+    require_that(
         saved == [middle],
         f"{who}: when stopped after step {middle}, saved after steps {saved}, expected [{middle}]",
     )
     rest = Recorder(state=report.saved[0])
     _train(backend, third, rgbd_views(), config, rest, "resumed")
     told = [progress.step for progress in rest.steps]
-    require(
+    require_that(
         told == list(range(middle + 1, config.steps + 1)),
         f"{who}: resumed after step {middle}, it reported steps {_shortly(told)}, expected {middle + 1} to {config.steps}",
     )
@@ -164,12 +164,14 @@ def _train(
 
 
 def _require_same(found: dict[str, Tensor], expected: dict[str, Tensor], fault: str) -> None:
-    require(
+    require_that(
         found.keys() == expected.keys(),
         f"{fault}: the tensors are {sorted(found)}, expected {sorted(expected)}",
     )
     for name, value in expected.items():
-        require(torch.equal(found[name].cpu(), value.detach().cpu()), f"{fault} (tensor {name!r} differs)")
+        require_that(
+            torch.equal(found[name].cpu(), value.detach().cpu()), f"{fault} (tensor {name!r} differs)"
+        )
 
 
 def _state_of(field: RadianceField) -> dict[str, Tensor]:
@@ -177,7 +179,9 @@ def _state_of(field: RadianceField) -> dict[str, Tensor]:
 
 
 def _module(field: RadianceField) -> nn.Module:
-    require(isinstance(field, nn.Module), f"the field is a {type(field).__name__}, expected an nn.Module")
+    require_that(
+        isinstance(field, nn.Module), f"the field is a {type(field).__name__}, expected an nn.Module"
+    )
     assert isinstance(field, nn.Module)
     return field
 

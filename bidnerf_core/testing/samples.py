@@ -7,7 +7,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.field import RadianceField, Rays, RaySamples
 from bidnerf_core.rendering import Rendering, render
-from bidnerf_core.testing.faults import calling, require, sample
+from bidnerf_core.testing.faults import calling, require_that, sample
 from bidnerf_core.testing.scene import SIDE, awkward_rays, joined, picked
 from bidnerf_core.testing.values import close
 
@@ -30,22 +30,24 @@ def _check_order(field: RadianceField, rays: Rays, samples: RaySamples, of: str)
     who = f"sampler {type(field.sampler).__name__} of {of}"
     starts, ends, valid = samples.starts, samples.ends, samples.valid
     finite = bool((starts.isfinite() & ends.isfinite()).all())
-    require(
+    require_that(
         finite, f"{who}: starts or ends are NaN or infinite; expected finite numbers, also where not valid"
     )
-    require(
+    require_that(
         bool((starts <= ends + SLACK)[valid].all()),
         f"{who}: an interval ends before it starts, or is not sorted",
     )
     reached = torch.where(valid, ends, -torch.inf).cummax(-1).values if starts.shape[-1] else ends
     overlap = (starts[..., 1:] < reached[..., :-1] - SLACK) & valid[..., 1:]
-    require(
+    require_that(
         not bool(overlap.any()), f"{who}: valid intervals overlap or are not sorted, expected nearest first"
     )
     within = (starts >= rays.near[..., None] - SLACK) & (ends <= rays.far[..., None] + SLACK)
-    require(bool(within[valid].all()), f"{who}: a valid interval lies outside [near, far] of its ray")
+    require_that(bool(within[valid].all()), f"{who}: a valid interval lies outside [near, far] of its ray")
     missed = rays.far <= rays.near
-    require(not bool(valid[missed].any()), f"{who}: a ray with far <= near has valid samples, expected none")
+    require_that(
+        not bool(valid[missed].any()), f"{who}: a ray with far <= near has valid samples, expected none"
+    )
 
 
 def check_repeatable(field: RadianceField) -> None:
@@ -54,11 +56,11 @@ def check_repeatable(field: RadianceField) -> None:
     who = f"sampler {type(field.sampler).__name__}"
     with torch.random.fork_rng(devices=[]):
         twice = [sample(field, rays, "rays") for _ in range(2)]
-        require(
+        require_that(
             _same(*twice), f"{who}: two calls without jitter differ, expected no chance without a generator"
         )
         jittered = [sample(field, rays, "rays with jitter", _generator()) for _ in range(2)]
-    require(
+    require_that(
         _same(*jittered),
         f"{who}: two calls with jitter of the same seed differ, expected all chance to come from the given generator",
     )
@@ -76,10 +78,10 @@ def check_rays_alone(field: RadianceField) -> None:
     )
     who = f"{type(field).__name__} rendered"
     expected = "expected each ray to be sampled for itself"
-    require(
+    require_that(
         close(permuted, whole[order], 1e-3), f"{who}: rays in another order see something else; {expected}"
     )
-    require(
+    require_that(
         close(alone, whole[::7], 1e-3),
         f"{who}: a ray alone sees something else than among others; {expected}",
     )
@@ -88,7 +90,7 @@ def check_rays_alone(field: RadianceField) -> None:
 def check_background(field: RadianceField) -> None:
     """Check that a ray that misses the scene sees the background and nothing else."""
     found = seen(field, awkward_rays()["rays that miss the scene"], "rays that miss the scene")
-    require(
+    require_that(
         close(found, torch.tensor([*BACKGROUND, 0.0, 0.0]).expand_as(found)),
         f"{type(field).__name__} rendered: a ray with far <= near does not see the background alone; is a sample valid"
         " there?",
@@ -99,12 +101,12 @@ def check_levels(field: RadianceField) -> None:
     """Check that each level is a field and that the last one renders as the field itself."""
     offered = tuple(getattr(field, "levels", None) or (field,))
     for number, level in enumerate(offered):
-        require(
+        require_that(
             isinstance(level, RadianceField),
             f"levels[{number}] is a {type(level).__name__}, expected a field: an object with sampler and query",
         )
     rays = joined(list(awkward_rays().values()))
-    require(
+    require_that(
         close(seen(offered[-1], rays, "rays"), seen(field, rays, "rays"), 1e-3),
         f"{type(field).__name__}.levels: the last one renders otherwise than the field itself; expected the coarsest"
         " first and the field itself last",

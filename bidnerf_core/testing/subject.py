@@ -15,10 +15,10 @@ from bidnerf_core.field import RadianceField, levels
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.testing import recipes
-from bidnerf_core.testing.faults import calling, query, require
+from bidnerf_core.testing.faults import calling, query, require_that
 from bidnerf_core.testing.scene import BOUNDS, points, rgbd_views
 
-STEPS = 40
+SUBJECT_STEPS = 40
 """Training steps where the test sets no ``config``."""
 
 
@@ -32,7 +32,7 @@ class Subject:
     def _backend(self) -> Any:
         if self.name is not None:
             return load_backend(self.name)
-        require(
+        require_that(
             self.backend is not None,
             f"{type(self).__name__} has neither backend nor name, expected one of them",
         )
@@ -41,7 +41,7 @@ class Subject:
     def _config(self) -> Any:
         if self.config is not None:
             return self.config
-        return dataclasses.replace(self._backend().config_type(), steps=STEPS)
+        return dataclasses.replace(self._backend().config_type(), steps=SUBJECT_STEPS)
 
     def _reread(self, config: Any) -> Any:
         """Return the config as it is read back from a map on disk."""

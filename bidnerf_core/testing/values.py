@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.field import FieldValues, RadianceField
-from bidnerf_core.testing.faults import query, require
+from bidnerf_core.testing.faults import query, require_that
 from bidnerf_core.testing.scene import awkward_points, points
 
 SHAPES = ((), (7,), (1,), (2, 3), (2, 1, 3), (0,), (2, 0), (0, 3))
@@ -23,7 +23,7 @@ def check_shapes(field: RadianceField) -> None:
         count = torch.Size(shape).numel()
         places, towards = (x[:count].reshape(*shape, 3) for x in (positions, directions))
         values = stacked(query(field, places, towards, f"points arranged as {shape}"))
-        require(
+        require_that(
             close(values.reshape(-1, 4), flat[:count]),
             f"{type(field).__name__}.query: points arranged as {shape} have other values than the same points in"
             " one row; expected each point's value to depend on that point alone",
@@ -37,15 +37,15 @@ def check_ranges(field: RadianceField) -> None:
         values = query(field, positions, directions, of)
         who = f"{type(field).__name__}.query of {of}"
         for what, found in (("density", values.density), ("rgb", values.rgb)):
-            require(
+            require_that(
                 bool(found.isfinite().all()), f"{who}: {what} is NaN or infinite, expected finite numbers"
             )
         low, high = float(values.rgb.min()), float(values.rgb.max())
         least = float(values.density.min())
-        require(
+        require_that(
             least >= 0, f"{who}: density is {least:g}, expected 0 or more; end with softplus, relu or exp"
         )
-        require(
+        require_that(
             low >= 0 and high <= 1,
             f"{who}: rgb is from {low:g} to {high:g}, expected 0 to 1; end with a sigmoid",
         )
@@ -59,15 +59,15 @@ def check_precision(field: RadianceField, doubled: RadianceField) -> None:
     for what in ("density", "rgb"):
         single, double = getattr(expected, what), getattr(found, what)
         who = f"{type(field).__name__}.query after .double(): {what}"
-        require(
+        require_that(
             single.dtype == torch.float32,
             f"{type(field).__name__}.query: {what} is {single.dtype} for points in float32, expected float32",
         )
-        require(
+        require_that(
             double.dtype == torch.float64,
             f"{who} is {double.dtype}, expected float64; make constants with positions.new_tensor or as buffers",
         )
-        require(
+        require_that(
             close(double.float(), single, 1e-2),
             f"{who} is another than in float32, expected the same to rounding",
         )
@@ -84,7 +84,7 @@ def check_threads(field: RadianceField) -> None:
 
     with ThreadPoolExecutor(THREADS) as pool:
         answers = list(pool.map(ask, range(THREADS * ROUNDS)))
-    require(
+    require_that(
         all(close(answer, alone[i % THREADS]) for i, answer in enumerate(answers)),
         f"{type(field).__name__}.query: several threads that ask at once get other values than one; expected query"
         " to keep nothing on self",

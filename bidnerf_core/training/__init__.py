@@ -1,7 +1,7 @@
 """What training recipes share: batches of rays, the loss, and the loop with its schedule, checkpoints and resumption."""
 
 from bidnerf_core.training.loop import StepOutcome, cosine, fit
-from bidnerf_core.training.loss import depth_term, supervised_loss
+from bidnerf_core.training.loss import ray_termination, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 from bidnerf_core.training.report import Progress, Report, Silent, TrainingState, TrainingStopped
 
@@ -15,7 +15,7 @@ __all__ = [
     "TrainingState",
     "TrainingStopped",
     "cosine",
-    "depth_term",
+    "ray_termination",
     "fit",
     "supervised_loss",
 ]

@@ -15,14 +15,14 @@ def supervised_loss(
 ) -> tuple[Float[Tensor, ""], float]:
     """Return the squared error of colour plus ``depth_weight`` times the depth term, and the colour term alone for display.
 
-    The depth term (``depth_term``) is a fraction of ``side``, the scene's longest side (metres).
+    The depth term (``ray_termination``) is a fraction of ``side``, the scene's longest side (metres).
     """
     error = (rendering.rgb - batch.observed.rgb) ** 2
     mse = float(error.detach().mean())
-    return error.mean() + depth_weight * depth_term(rendering, batch) / side, mse
+    return error.mean() + depth_weight * ray_termination(rendering, batch) / side, mse
 
 
-def depth_term(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor, ""]:
+def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor, ""]:
     """Return the mean distance (metres) of a ray's weight from its measured depth; 0 where no ray has any.
 
     Like the ray termination loss of DS-NeRF (Deng et al. 2022) it is least where all weight is at the measured depth; an

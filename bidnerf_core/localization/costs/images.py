@@ -22,7 +22,7 @@ from bidnerf_core.se3 import SE3
 
 UNKNOWN_COST = 0.7
 """Cost of a pixel that shows what the map does not hold."""
-EXPOSURE_ROUNDS = 2
+IMAGE_EXPOSURE_ROUNDS = 2
 """Rounds of robust reweighting in which the exposure is fitted."""
 
 
@@ -109,7 +109,7 @@ def exposed(
     if not (scales.gain and scales.bias):
         return seen.rgb
     exposure: Exposure | None = None
-    for _ in range(EXPOSURE_ROUNDS):
+    for _ in range(IMAGE_EXPOSURE_ROUNDS):
         rgb = seen.rgb if exposure is None else exposure.applied(seen.rgb)
         near = geman_mcclure_inlier(((measured - rgb) ** 2).sum(1, keepdim=True), scales.colour)
         weights = seen.known[:, None] * near**2 / scales.colour**2

@@ -18,7 +18,7 @@ from bidnerf_core.rendering import Rendering, render_samples
 from bidnerf_core.residuals import Residual
 from bidnerf_core.se3 import SE3
 
-Background = tuple[float, float, float]
+BackgroundColour = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ def linearize(
     observed: Observations,
     residual: Residual,
     T_world_pivot: SE3,
-    background: Background,
+    background: BackgroundColour,
     least_weight: float = 0.0,
     channels: tuple[int, ...] | None = None,
 ) -> Linearization:
@@ -79,7 +79,7 @@ def flattened(rays: Rays) -> Rays:
 
 def _ray_gradients(
     field: RadianceField, rays: Rays, observed: Observations, residual: Residual, samples: RaySamples,
-    kept: Bool[Tensor, "r s"], background: Background, channels: tuple[int, ...], count: int,
+    kept: Bool[Tensor, "r s"], background: BackgroundColour, channels: tuple[int, ...], count: int,
 ) -> tuple[Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]:  # fmt: skip
     """Return the derivatives of each ray's residuals by its origin and by its direction, from the ``kept`` samples."""
     results = [rays.origins.new_zeros((len(rays.near), count, 3)) for _ in range(2)]

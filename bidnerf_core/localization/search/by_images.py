@@ -36,7 +36,7 @@ class ImageStage:
     keep: int
 
 
-STAGES = (
+IMAGE_STAGES = (
     ImageStage(16, 0, 48),
     ImageStage(16, 8, 12),
     ImageStage(24, 8, 4),
@@ -77,7 +77,7 @@ class ImageSearch:
         extent = float(torch.linalg.vector_norm(torch.tensor(problem.bounds.size)))
         return ImageSearch(problem.views, renderer, torch.tensor([0.0, 0.0, away]), extent, True)
 
-    def __call__(self, T: SE3, stages: Sequence[ImageStage] = STAGES) -> SearchResult:
+    def __call__(self, T: SE3, stages: Sequence[ImageStage] = IMAGE_STAGES) -> SearchResult:
         """Search from the hypotheses T (h)."""
         distinct = Distinct(self.middle, APART * self.extent, TURNED)
         return search(T, self._stages(stages), distinct, keep_runner_up=True)

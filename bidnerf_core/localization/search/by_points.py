@@ -36,7 +36,7 @@ class PointStage:
 
 
 # Colour has no weight at first: its derivatives reach no farther than a surfel, and from afar only hold a pose back.
-STAGES = (
+POINT_STAGES = (
     PointStage(48, 0, 96, 0.3, 0.0),
     PointStage(48, 8, 24, 0.3, 0.0),
     PointStage(100, 10, 6, 0.2, 0.0),
@@ -56,7 +56,7 @@ class PointSearch:
         """Search once, from ``count`` fresh hypotheses."""
         return self.from_poses(hypotheses_for_points(self.surroundings, start, count, generator))
 
-    def from_poses(self, T: SE3, stages: tuple[PointStage, ...] = STAGES) -> SearchResult:
+    def from_poses(self, T: SE3, stages: tuple[PointStage, ...] = POINT_STAGES) -> SearchResult:
         """Search from the hypotheses T (h)."""
         apart = APART * self.surface.extent
         return search(

@@ -53,7 +53,7 @@ def query_image(frame: Frame, T_rig_camera: SE3, features: Features) -> QueryIma
 
 
 @dataclass(frozen=True, eq=False)
-class Correspondences:
+class LandmarkMatches:
     """Which keypoint of which view shows which landmark."""
 
     view: Int[Tensor, "m"]
@@ -64,19 +64,19 @@ class Correspondences:
     def __len__(self) -> int:
         return len(self.view)
 
-    def __getitem__(self, index: Tensor) -> Correspondences:
-        return Correspondences(
+    def __getitem__(self, index: Tensor) -> LandmarkMatches:
+        return LandmarkMatches(
             self.view[index], self.keypoint[index], self.landmark[index], self.ambiguity[index]
         )
 
     @staticmethod
-    def cat(parts: Sequence[Correspondences]) -> Correspondences:
+    def cat(parts: Sequence[LandmarkMatches]) -> LandmarkMatches:
         names = ("view", "keypoint", "landmark", "ambiguity")
-        return Correspondences(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        return LandmarkMatches(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
 
 def observed_points(
-    images: Sequence[QueryImage], landmarks: LandmarkMap, found: Correspondences
+    images: Sequence[QueryImage], landmarks: LandmarkMap, found: LandmarkMatches
 ) -> ObservedPoints:
     """Look up what the correspondences refer to."""
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)

@@ -11,14 +11,14 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.localization.search.correspondences import Correspondences, QueryImage
+from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.se3 import SE3
 
 CANDIDATES = 6
 """Landmarks that are compared with a keypoint, at most: the nearest ones in the image."""
-RATIO = 0.9
+GUIDED_RATIO = 0.9
 """Distance of the descriptors as a share of that to the next best candidate, at most."""
 OBLIQUE = radians(40)
 """By how much a landmark may be seen from outside of the cone of directions that it was seen from."""
@@ -34,7 +34,7 @@ def guided_matches(
     most_distance: float,
     focal_factor: float = 1.0,
     shift: tuple[float, float] = (0.0, 0.0),
-) -> Correspondences:
+) -> LandmarkMatches:
     """Correspondences within ``radius`` pixels of the projections under a pose.
 
     Descriptors may differ by the squared distance ``most_distance``. ``shift`` (pixels) moves all projections: with one
@@ -44,7 +44,7 @@ def guided_matches(
         _in_view(number, image, landmarks, T_world_rig, radius, most_distance, focal_factor, shift)
         for number, image in enumerate(images)
     ]
-    return Correspondences.cat(parts)
+    return LandmarkMatches.cat(parts)
 
 
 def _in_view(
@@ -56,7 +56,7 @@ def _in_view(
     most_distance: float,
     focal_factor: float,
     shift: tuple[float, float],
-) -> Correspondences:
+) -> LandmarkMatches:
     focal = image.focal * focal_factor
     T_world_camera = T_world_rig @ image.T_rig_camera
     local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
@@ -72,7 +72,7 @@ def _in_view(
         image.keypoints.descriptors, landmarks.descriptors, keypoint, landmark
     )
     best, ambiguity = _best(keypoint, landmark, distance, most_distance)
-    return Correspondences(torch.full_like(best, number), keypoint[best], landmark[best], ambiguity)
+    return LandmarkMatches(torch.full_like(best, number), keypoint[best], landmark[best], ambiguity)
 
 
 def _visible(
@@ -113,9 +113,9 @@ def _best(
     following = (first + 1).clamp(max=max(0, len(order) - 1))
     alone = (first + 1 >= len(order)) | begins[following]
     nearest = distance[order[first]]
-    next_best = torch.where(alone, most / RATIO**2, distance[order[following]])
+    next_best = torch.where(alone, most / GUIDED_RATIO**2, distance[order[following]])
     ambiguity = (nearest / next_best.clamp(min=1)).sqrt()
-    good = (nearest <= most) & (ambiguity <= RATIO)
+    good = (nearest <= most) & (ambiguity <= GUIDED_RATIO)
     return _once(order[first[good]], landmark, distance, ambiguity[good])
 
 

@@ -15,7 +15,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import (
-    Correspondences,
+    LandmarkMatches,
     QueryImage,
     observed_points,
     query_images,
@@ -26,7 +26,7 @@ from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus,
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.features import Features, Sift, paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import ObservedPoints, ReprojectionFit, fit
+from bidnerf_core.mapping.resection import ObservedPoints, ReprojectionFit, resect
 from bidnerf_core.se3 import SE3
 
 SIFT = Sift()
@@ -34,7 +34,7 @@ THRESHOLD = 0.005
 """Share of the image's diagonal within which a correspondence agrees with a pose; 2 pixels at least."""
 RADII = (2.0, 1.0)
 """Radii of guided matching, in multiples of 3 pixels (of an image of 400 x 300, larger for larger ones)."""
-ROUNDS = 3
+GUIDED_ROUNDS = 3
 """Rounds of guided matching with the last radius, at most; it ends where correspondences no longer change."""
 LOOSE = 1.3
 """Descriptors of guided matches may be so much more distant than those of nine tenths of the first inliers."""
@@ -46,7 +46,7 @@ LEAST_INLIERS = 6
 
 @dataclass(frozen=True, eq=False)
 class FocalCheck:
-    """A fit with a free focal length, from the pose that was found with the given one."""
+    """A resect with a free focal length, from the pose that was found with the given one."""
 
     factor: float  # of the focal length
     noise: float  # pixels: standard deviation of the reprojection errors with that factor
@@ -54,7 +54,7 @@ class FocalCheck:
 
     @staticmethod
     def of(data: ObservedPoints, best: ReprojectionFit) -> FocalCheck:
-        free = fit(data, best.T_world_rig, best.noise, True, best.focal_factor)
+        free = resect(data, best.T_world_rig, best.noise, True, best.focal_factor)
         return FocalCheck(free.focal_factor, free.noise, free.covariance[:6, 6] / free.covariance[6, 6])
 
 
@@ -68,7 +68,7 @@ class LandmarkPose:
     ]  # of the right update, translation (metres) first; of keypoints and landmarks
     map_covariance: Float[Tensor, "6 6"]  # the same, with how the poses of the map's own images scatter
     noise: float  # pixels: standard deviation of the reprojection errors along each axis, robustly
-    correspondences: Correspondences  # those that the pose was refined on
+    correspondences: LandmarkMatches  # those that the pose was refined on
     residuals: Float[Tensor, "m 2"]  # pixels, of the correspondences
     normalized_residuals: Float[Tensor, "m 2"]  # the same in standard deviations, those of landmarks included
     pixels: Float[Tensor, "m 2"]  # where the correspondences were observed, as the image has them
@@ -130,7 +130,7 @@ def propose(
 def _first_pose(
     images: Sequence[QueryImage],
     landmarks: LandmarkMap,
-    matches: Correspondences,
+    matches: LandmarkMatches,
     seed: int,
     unknown_focal: bool,
 ) -> Hypothesis | None:
@@ -154,15 +154,15 @@ def _pixels(images: Sequence[QueryImage], share: float) -> float:
 def _refined(
     images: Sequence[QueryImage],
     landmarks: LandmarkMap,
-    matches: Correspondences,
+    matches: LandmarkMatches,
     found: Hypothesis,
     unknown_focal: bool,
-) -> tuple[Correspondences, ReprojectionFit, float] | None:
+) -> tuple[LandmarkMatches, ReprojectionFit, float] | None:
     """Refine on the inliers; then on guided matches, in ever smaller radii, until they no longer change."""
     threshold = _pixels(images, THRESHOLD)
     inliers = matches[found.inliers]
     most = _usual_distance(images, landmarks, inliers)
-    best = fit(
+    best = resect(
         observed_points(images, landmarks, inliers),
         found.T_world_rig,
         threshold / 2,
@@ -170,7 +170,7 @@ def _refined(
         found.focal_factor,
     )
     correspondences = inliers
-    for radius in (*RADII[:-1], *[RADII[-1]] * ROUNDS):
+    for radius in (*RADII[:-1], *[RADII[-1]] * GUIDED_ROUNDS):
         guided = guided_matches(
             images, landmarks, best.T_world_rig, 1.5 * radius * threshold, most, best.focal_factor
         )
@@ -180,7 +180,7 @@ def _refined(
             break
         unchanged = _same(guided, correspondences)
         correspondences = guided
-        best = fit(
+        best = resect(
             observed_points(images, landmarks, guided),
             best.T_world_rig,
             best.noise,
@@ -193,11 +193,11 @@ def _refined(
     return correspondences, best, chance
 
 
-def _same(a: Correspondences, b: Correspondences) -> bool:
+def _same(a: LandmarkMatches, b: LandmarkMatches) -> bool:
     return len(a) == len(b) and torch.equal(a.landmark, b.landmark) and torch.equal(a.keypoint, b.keypoint)
 
 
-def _usual_distance(images: Sequence[QueryImage], landmarks: LandmarkMap, inliers: Correspondences) -> float:
+def _usual_distance(images: Sequence[QueryImage], landmarks: LandmarkMap, inliers: LandmarkMatches) -> float:
     """Squared distance of descriptors up to which guided matches are taken."""
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
     descriptors = torch.cat([image.keypoints.descriptors for image in images])
@@ -230,8 +230,8 @@ def _chance(
 def _described(
     images: Sequence[QueryImage],
     landmarks: LandmarkMap,
-    matches: Correspondences,
-    correspondences: Correspondences,
+    matches: LandmarkMatches,
+    correspondences: LandmarkMatches,
     best: ReprojectionFit,
     chance: float,
     seconds: dict[str, float],
@@ -276,7 +276,7 @@ def _probability(images: Sequence[QueryImage], threshold: float) -> float:
     return min(0.5, math.pi * threshold**2 / (camera.width * camera.height))
 
 
-def _spread(images: Sequence[QueryImage], found: Correspondences, pixels: Float[Tensor, "m 2"]) -> float:
+def _spread(images: Sequence[QueryImage], found: LandmarkMatches, pixels: Float[Tensor, "m 2"]) -> float:
     """Share of the cells of an 8 x 8 grid that hold a correspondence, the mean of the views."""
     shares = []
     for number, image in enumerate(images):

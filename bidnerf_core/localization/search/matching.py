@@ -16,13 +16,13 @@ EXACT = 4_000
 """Landmarks up to which there are no cells."""
 COMPARISONS = 30_000_000
 """Of keypoints with landmarks, up to which comparing all of them is faster than looking up cells."""
-BLOCK = 64
+QUERY_BLOCK = 64
 """Neighbouring columns whose least value is found first: sorting all of them would take longer than computing them."""
 PROBED = 12
 """Cells that are searched for each keypoint."""
 SAMPLE = 40
 """Landmarks for each cell, of those that the cells are found from."""
-ROUNDS = 6
+K_MEANS_ROUNDS = 6
 """Of Lloyd's algorithm: cells need not be the best ones, only balanced."""
 ROWS = 256
 """Keypoints or landmarks that are compared with all others at a time: bounds the memory."""
@@ -103,7 +103,7 @@ def _k_means(
     sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLE * count]
     values = descriptors[sample].float()
     centres = values[:count].clone()
-    for _ in range(ROUNDS):
+    for _ in range(K_MEANS_ROUNDS):
         cell = _nearest_centre(values, centres)
         sizes = torch.bincount(cell, minlength=count)
         total = torch.zeros_like(centres).index_add_(0, cell, values)
@@ -118,13 +118,15 @@ def _nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[T
 def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
     """The ``count`` least of each row (or all, where there are fewer), least first, and their columns."""
     columns = distances.shape[1]
-    if columns <= 4 * BLOCK * count:
+    if columns <= 4 * QUERY_BLOCK * count:
         found = distances.topk(min(count, columns), dim=1, largest=False)
         return found.values, found.indices
-    blocks = torch.nn.functional.pad(distances, (0, -columns % BLOCK), value=torch.inf).unflatten(
-        1, (-1, BLOCK)
+    blocks = torch.nn.functional.pad(distances, (0, -columns % QUERY_BLOCK), value=torch.inf).unflatten(
+        1, (-1, QUERY_BLOCK)
     )
     block = blocks.amin(-1).topk(count, dim=1, largest=False).indices
-    candidates = blocks.gather(1, block[..., None].expand(-1, -1, BLOCK)).flatten(1)
+    candidates = blocks.gather(1, block[..., None].expand(-1, -1, QUERY_BLOCK)).flatten(1)
     best = candidates.topk(count, dim=1, largest=False)
-    return best.values, block.gather(1, best.indices // BLOCK) * BLOCK + best.indices % BLOCK
+    return best.values, block.gather(
+        1, best.indices // QUERY_BLOCK
+    ) * QUERY_BLOCK + best.indices % QUERY_BLOCK

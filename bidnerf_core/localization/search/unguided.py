@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.localization.search.correspondences import Correspondences, QueryImage
+from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.landmarks import LandmarkMap
 
-NEIGHBOURS = 4
+LOOKED_UP = 4
 """Landmarks that are looked up for each keypoint: the next best one elsewhere tells how ambiguous the best one is."""
 SAME_PLACE = 2.0
 """Two landmarks nearer than so many of their diameters are one thing, seen twice."""
@@ -22,18 +22,18 @@ LEAST_MATCHES = 60
 """Fewer unambiguous matches than that are filled up with the least ambiguous others."""
 
 
-def unguided_matches(images: Sequence[QueryImage], matcher: LandmarkMatcher) -> Correspondences:
+def unguided_matches(images: Sequence[QueryImage], matcher: LandmarkMatcher) -> LandmarkMatches:
     """The landmark most alike to each keypoint, where it stands out; the least ambiguous ones first."""
     parts = []
     for number, image in enumerate(images):
-        distances, index = matcher.nearest(image.keypoints.descriptors, NEIGHBOURS)
+        distances, index = matcher.nearest(image.keypoints.descriptors, LOOKED_UP)
         ambiguity = _ambiguity(matcher.landmarks, distances, index)
         keypoint = torch.arange(len(index))[distances[:, 0].isfinite()]
-        part = Correspondences(
+        part = LandmarkMatches(
             torch.full_like(keypoint, number), keypoint, index[keypoint, 0], ambiguity[keypoint]
         )
         parts.append(part)
-    found = Correspondences.cat(parts)
+    found = LandmarkMatches.cat(parts)
     found = found[found.ambiguity.argsort(stable=True)]
     return found[torch.arange(len(found)) < max(LEAST_MATCHES, int((found.ambiguity <= AMBIGUITY).sum()))]
 
