@@ -4,7 +4,8 @@ r"""What each part of method ``auto`` contributes: landmarks, the surface, rende
 
 No start is given. Frames whose index in the test split is 1 modulo 5 are left out, since settings were tuned on them;
 ``--tuning-frames`` takes those only. Maps need landmarks (``bidnerf train`` and ``bidnerf bake --data`` make them). One
-process of one thread; finished frames are kept, so that an interrupted run goes on where it stopped.
+process of one thread; finished frames are kept, so that an interrupted run goes on where it stopped. The surface alone takes
+many seconds an image without depth; ``--slow`` tries that as well.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "landmarks alone": {"fused_rays": 0},
     "all": {},
 }
+SLOW = "surface alone"
 BOUND = float(chi2.ppf(0.95, 6))
 """Normalised squared error below which nineteen of twenty errors lie, where the covariance is right."""
 
@@ -79,7 +81,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def scene(stored: Map, name: str, data: Path, tuning: bool, store: RowStore) -> dict[str, Any]:
+def scene(stored: Map, name: str, data: Path, tuning: bool, slow: bool, store: RowStore) -> dict[str, Any]:
     """Try all variants on the frames of one scene, RGB and where there is depth RGB-D."""
     dataset = open_dataset(data, stored.bounds.background)
     names = [n for i, n in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == tuning]
@@ -93,6 +95,8 @@ def scene(stored: Map, name: str, data: Path, tuning: bool, store: RowStore) -> 
         if depth and not any(view.frame.has_depth for view in views):
             continue
         for label, localizer in localizers.items():
+            if label == SLOW and not depth and not slow:
+                continue
             kind = f"{'RGB-D' if depth else 'RGB'}, {label}"
             rows = []
             for view in views:
@@ -117,6 +121,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", help="MAP:DATA")
     parser.add_argument("--name", default="auto_terms", help="of the record")
     parser.add_argument("--tuning-frames", action="store_true")
+    parser.add_argument("--slow", action="store_true", help="try the surface alone without depth, too")
     given = parser.parse_args()
     torch.set_num_threads(1)
     kept = RESULTS / f"{given.name}.partial.jsonl"
@@ -124,7 +129,9 @@ def main() -> None:
     with RowStore(kept) as store:
         for pair in given.scenes:
             folder, data = map(Path, pair.split(":"))
-            results[data.name] = scene(load_map(folder), data.name, data, given.tuning_frames, store)
+            results[data.name] = scene(
+                load_map(folder), data.name, data, given.tuning_frames, given.slow, store
+            )
     print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
     kept.unlink(missing_ok=True)
 

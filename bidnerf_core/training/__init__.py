@@ -15,7 +15,7 @@ __all__ = [
     "TrainingState",
     "TrainingStopped",
     "cosine",
-    "ray_termination",
     "fit",
+    "ray_termination",
     "supervised_loss",
 ]
