@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import bidnerf_core.localization.auto as auto_module
 import textured_field
 from bidnerf_core import InputError, Localization, Localizer, Outcome, View
 from bidnerf_core.evaluation.errors import pose_error
@@ -120,6 +121,18 @@ def test_an_approximate_focal_length_is_found_and_no_other_term_uses_the_wrong_o
     assert squared_distance(found.T, found.covariance) < CHI2_99
 
 
+@pytest.mark.parametrize(("factor", "estimated"), [(1.0, False), (0.98, False), (0.85, True), (1.2, True)])
+def test_a_calibrated_focal_length_is_replaced_only_where_it_cannot_be_right(
+    factor: float, estimated: bool
+) -> None:
+    camera = replace(CAMERA, fx=CAMERA.fx / factor, fy=CAMERA.fy / factor)
+    frame = replace(unseen().frame, intrinsics=camera, depth=None)
+    found = answer(replace(unseen(), frame=frame))
+    assert found.found.focal_factor == (pytest.approx(factor, rel=0.03) if estimated else 1)
+    if estimated or factor == 1:
+        assert squared_distance(found.T, found.covariance) < CHI2_99
+
+
 def test_the_scale_of_a_depth_sensor_is_found() -> None:
     """Depth that is 3 % too long would move the pose by 5 cm; landmarks tell its scale."""
     depth = unseen().frame.depth
@@ -211,6 +224,28 @@ def test_a_covered_lens_is_not_found_by_rendering_either(grey: float) -> None:
     found = localized(view, textured_map(surface=True))
     assert found.outcome is Outcome.UNDETERMINED
     assert found.reason
+
+
+@pytest.mark.parametrize(
+    ("many", "settings", "expected"),
+    [
+        (10_000, {}, Outcome.CONVERGED),
+        (1, {}, Outcome.TOO_FEW_MATCHES),
+        (1, {"landmarks": False}, Outcome.CONVERGED),
+    ],
+    ids=["hardly any landmarks", "many", "not asked for"],
+)
+def test_what_the_landmarks_of_a_textured_scene_do_not_recognise_is_not_accepted(
+    many: int, settings: dict[str, bool], expected: Outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whole images may look alike where no keypoint does."""
+    monkeypatch.setattr(auto_module, "MANY_LANDMARKS", many)
+    monkeypatch.setattr(auto_module, "answer_by_landmarks", lambda *_: None)
+    localizer = Localizer(textured_map(surface=True), "auto", replace(QUICK, **settings))
+    found = localizer(without_depth(unseen()).frame, start=TRUTH)
+    assert found.outcome is expected
+    assert ("no landmarks were recognised" in found.reason) == (expected is Outcome.TOO_FEW_MATCHES)
+    assert_within(found.T_world_camera, 0.02, 0.5)
 
 
 def test_without_keypoints_and_surface_a_start_is_needed() -> None:
