@@ -86,11 +86,13 @@ def test_diagnostics_of_points_lead_to_an_outcome(
     assert verdict.accepted == (expected is Outcome.CONVERGED)
 
 
-def refined(inliers: float = 1.0, step: float = 0.0, covariance: float = 1.0) -> RefinementResult:
+def refined(
+    inliers: float = 1.0, step: float = 0.0, covariance: float = 1.0, contrast: float = math.inf
+) -> RefinementResult:
     T = SE3.identity()
     losses = torch.zeros(0, dtype=torch.float64)
     return RefinementResult(
-        T, 0.0, inliers, covariance * torch.eye(6, dtype=torch.float64), step, T[None], losses
+        T, 0.0, inliers, covariance * torch.eye(6, dtype=torch.float64), step, T[None], losses, contrast
     )
 
 
@@ -110,6 +112,8 @@ def searched_images(best: float, margin: float) -> SearchResult:
         (refined(step=0.03), None, Outcome.NOT_SETTLED, "a step of 0.03, expected 0.02 at most"),
         (refined(step=math.nan), None, Outcome.NOT_SETTLED, "expected 0.02 at most"),
         (refined(covariance=math.inf), None, Outcome.UNDETERMINED, "does not determine the pose"),
+        (refined(contrast=0.019), None, Outcome.UNDETERMINED, "of a single colour"),
+        (refined(contrast=0.021), None, Outcome.CONVERGED, "100%"),
         (refined(), searched_images(0.2, 0.001), Outcome.AMBIGUOUS, "another pose fits about as well"),
         (refined(), searched_images(0.2, 0.003), Outcome.CONVERGED, "100%"),
         (refined(), searched_images(0.2, math.inf), Outcome.CONVERGED, "100%"),

@@ -26,6 +26,8 @@ SIGHT_LINES = 300
 """Lines of sight that are traced, at most."""
 IMAGE_MARGIN = 0.01
 """Share of its cost by which the next best answer of a search by images must be worse."""
+FLAT = 0.02
+"""Standard deviation of an image's colours, in [0, 1], below which a gain and a bias fit it to any view."""
 AMBIGUOUS = Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
 
 
@@ -128,6 +130,8 @@ def rendered_verdict(
     """Judge a pose by fresh rendered rays and, where it came from a search by images, by the runner-up."""
     if not bool(found.covariance.isfinite().all()):
         return Verdict(Outcome.UNDETERMINED, "what was measured does not determine the pose")
+    if found.contrast < FLAT:
+        return Verdict(Outcome.UNDETERMINED, "the image is of a single colour, as if the lens were covered")
     share = f"{found.inliers:.0%} of fresh rays agree with what was measured"
     if not found.inliers >= thresholds.converged_inliers:
         return Verdict(Outcome.RENDERING_MISMATCH, f"{share}, expected {thresholds.converged_inliers:.0%}")

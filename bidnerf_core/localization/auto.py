@@ -181,7 +181,7 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
         best = min(answers, key=lambda answer: answer.refined.loss)
         if best.verdict.accepted or len(answers) == config.rounds:
             answer = localization_of(problem, best, by_colour, began, "auto")
-            return _doubted(answer) if _has_texture(problem) else answer
+            return _doubted(answer) if config.landmarks and _has_texture(problem) else answer
 
 
 def _has_texture(problem: Problem) -> bool:

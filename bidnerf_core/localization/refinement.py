@@ -6,6 +6,7 @@ stage draws its own. Poses are a batch axis: several are refined at once, and ea
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -37,6 +38,7 @@ class RefinementResult:
     step: float  # length of the step that these rays ask for (metres, radians)
     poses: SE3  # (steps + 1): the first pose given, then the best one after each step
     losses: Float[Tensor, "s"]  # before each step
+    contrast: float = math.inf  # standard deviation of the measured colours, in [0, 1]; infinite with depth
 
 
 def refine(
@@ -123,4 +125,14 @@ def _assessed(cost: RenderedCost, T: SE3, history: History) -> RefinementResult:
         step=float(torch.linalg.vector_norm(equations.solve(torch.zeros_like(equations.cost))[best])),
         poses=SE3.stack(history.poses),
         losses=torch.tensor(history.losses, dtype=torch.float64),
+        contrast=_contrast(cost),
     )
+
+
+def _contrast(cost: RenderedCost) -> float:
+    """Return the largest standard deviation of a measured colour channel, where nothing but colour was measured."""
+    weights, rgb = cost.rays.weights, cost.rays.observed.rgb
+    if bool((weights[:, 3:] > 0).any()):
+        return math.inf
+    coloured = rgb[(weights[:, :3] > 0).all(-1)]
+    return 0.0 if not len(coloured) else float(coloured.std(0, correction=0).max())

@@ -1,0 +1,253 @@
+"""Poses by landmarks, alone and fused with depth and rendering, and what ``auto`` does where they do not convince."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+import bidnerf_core.localization.auto as auto_module
+import textured_field
+from bidnerf_core import InputError, Localization, Localizer, Outcome, View
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.localization import AutoConfig
+from bidnerf_core.localization.by_landmarks import (
+    SHARPEST,
+    LandmarkAnswer,
+    answer_by_landmarks,
+    localization_by_landmarks,
+)
+from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.se3 import SE3
+from textured_field import CAMERA, MapWithLandmarks, textured_map, unseen
+
+TRUTH = unseen().T_ref_camera
+RAYS = 256
+CHI2_99 = 16.8  # of six degrees of freedom
+
+
+@functools.cache
+def matcher() -> LandmarkMatcher:
+    assert textured_map().landmarks is not None
+    return LandmarkMatcher(textured_map().landmarks)
+
+
+def without_depth(view: View) -> View:
+    return replace(view, frame=replace(view.frame, depth=None))
+
+
+def answer(*views: View, rays: int = 0, map: MapWithLandmarks | None = None, seed: int = 0) -> LandmarkAnswer:
+    problem = rig(map or textured_map(), views, None, matcher=matcher())
+    found = answer_by_landmarks(problem, matcher(), rays, seed)
+    assert found is not None
+    return found
+
+
+def squared_distance(T: SE3, covariance: Tensor) -> float:
+    """Return the squared Mahalanobis distance of the true pose."""
+    xi = (T.inverse() @ TRUTH).log()
+    return float(xi @ torch.linalg.solve(covariance, xi))
+
+
+def assert_within(T: SE3, metres: float, degrees: float) -> None:
+    error = pose_error(T, TRUTH)
+    assert float(error.translation) < metres
+    assert float(error.rotation_deg) < degrees
+
+
+def test_landmarks_alone_find_a_photo() -> None:
+    found = answer(without_depth(unseen()))
+    assert found.terms == ()
+    assert torch.equal(found.T.matrix(), found.found.T_world_camera.matrix())
+    assert_within(found.T, 0.02, 0.5)
+    assert squared_distance(found.T, found.covariance) < CHI2_99
+
+
+@pytest.mark.parametrize(
+    ("depth", "rays", "terms"),
+    [(True, 0, ("depth",)), (False, RAYS, ("rendering",)), (True, RAYS, ("depth", "rendering"))],
+    ids=["depth", "rendering", "both"],
+)
+def test_each_further_term_brings_the_pose_nearer(depth: bool, rays: int, terms: tuple[str, ...]) -> None:
+    view = unseen() if depth else without_depth(unseen())
+    found, alone = answer(view, rays=rays, map=textured_map(surface=True)), answer(without_depth(unseen()))
+    assert found.terms == terms
+    before, after = (pose_error(T, TRUTH) for T in (alone.T, found.T))
+    assert float(after.translation) < float(before.translation)
+    assert float(after.rotation_deg) < float(before.rotation_deg)
+    assert squared_distance(found.T, found.covariance) < CHI2_99
+
+
+def test_more_terms_make_the_covariance_smaller() -> None:
+    """In every direction: what was measured beside the landmarks adds information and takes none away."""
+    alone = answer(without_depth(unseen()))
+    for more in (
+        answer(unseen(), map=textured_map(surface=True)),
+        answer(without_depth(unseen()), rays=RAYS),
+    ):
+        difference = alone.covariance - more.covariance
+        root = torch.linalg.cholesky(torch.linalg.inv(alone.covariance))
+        assert float(torch.linalg.eigvalsh(root.mT @ difference @ root)[0]) > -0.05
+        assert torch.equal(more.covariance, more.covariance.mT)
+        assert float(torch.linalg.eigvalsh(more.covariance)[0]) > 0
+
+
+def test_rendering_brings_a_pose_by_blurred_keypoints_to_that_of_the_field() -> None:
+    """The image is what the field renders, so that rendered rays alone have no error."""
+    assert_within(answer(without_depth(unseen()), rays=RAYS).T, 0.002, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("noise", "terms"),
+    [(None, ("rendering",)), (SHARPEST, ("rendering",)), (1.01 * SHARPEST, ())],
+    ids=["unknown", "sharp", "blurred"],
+)
+def test_a_blurred_field_is_not_rendered(noise: float | None, terms: tuple[str, ...]) -> None:
+    blurred = replace(textured_map(), colour_noise=noise)
+    assert answer(without_depth(unseen()), rays=RAYS, map=blurred).terms == terms
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.2])
+def test_an_approximate_focal_length_is_found_and_no_other_term_uses_the_wrong_one(factor: float) -> None:
+    camera = replace(CAMERA, fx=CAMERA.fx / factor, fy=CAMERA.fy / factor)
+    frame = replace(unseen().frame, intrinsics=camera, focal_is_approximate=True)
+    found = answer(replace(unseen(), frame=frame), rays=RAYS, map=textured_map(surface=True))
+    assert found.found.focal_factor == pytest.approx(factor, rel=0.03)
+    assert found.terms == ()
+    assert squared_distance(found.T, found.covariance) < CHI2_99
+
+
+@pytest.mark.parametrize(("factor", "estimated"), [(1.0, False), (0.98, False), (0.85, True), (1.2, True)])
+def test_a_calibrated_focal_length_is_replaced_only_where_it_cannot_be_right(
+    factor: float, estimated: bool
+) -> None:
+    camera = replace(CAMERA, fx=CAMERA.fx / factor, fy=CAMERA.fy / factor)
+    frame = replace(unseen().frame, intrinsics=camera, depth=None)
+    found = answer(replace(unseen(), frame=frame))
+    assert found.found.focal_factor == (pytest.approx(factor, rel=0.03) if estimated else 1)
+    if estimated or factor == 1:
+        assert squared_distance(found.T, found.covariance) < CHI2_99
+
+
+def test_the_scale_of_a_depth_sensor_is_found() -> None:
+    """Depth that is 3 % too long would move the pose by 5 cm; landmarks tell its scale."""
+    depth = unseen().frame.depth
+    assert depth is not None
+    view = replace(unseen(), frame=replace(unseen().frame, depth=1.03 * depth))
+    found = answer(view, map=textured_map(surface=True))
+    assert found.terms == ("depth",)
+    assert found.found.depth_scale == pytest.approx(1 / 1.03, rel=0.01)
+    assert_within(found.T, 0.015, 0.3)
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    view = without_depth(unseen())
+    first = answer(view, rays=RAYS, seed=3)
+    torch.manual_seed(99)
+    again, other = answer(view, rays=RAYS, seed=3), answer(view, rays=RAYS, seed=4)
+    assert torch.equal(first.T.matrix(), again.T.matrix())
+    assert not torch.equal(first.T.matrix(), other.T.matrix())
+
+
+def test_a_rig_is_placed_by_its_last_camera() -> None:
+    first = textured_field.view(textured_field.POSES[0], "first")
+    turned = SE3.exp(torch.tensor([1.0, 2.0, 3.0, 0.3, 0.2, 0.1], dtype=torch.float64))
+    views = [View(v.frame, turned @ v.T_ref_camera) for v in map(without_depth, (first, unseen()))]
+    found = answer(*views)
+    assert_within(found.T, 0.02, 0.5)
+
+
+def test_the_answer_tells_its_path_and_what_was_fused() -> None:
+    view = without_depth(unseen())
+    start = TRUTH.retract(torch.full((6,), 0.1, dtype=torch.float64))
+    problem = rig(textured_map(), [view], start)
+    said = localization_by_landmarks(problem, answer(view, rays=RAYS), began=0.0)
+    assert said.outcome is Outcome.CONVERGED
+    assert said.reason.endswith("px, fused with rendering")
+    assert said.steps == len(said.losses) == len(said.poses.translation) - 1 == 2
+    assert torch.equal(said.poses[0].matrix(), start.matrix())
+    assert torch.equal(said.poses[-1].matrix(), said.T_world_camera.matrix())
+
+
+# Method ``auto`` decides whether landmarks are trusted.
+
+QUICK = AutoConfig(points=500, hypotheses=32, rounds=1, refine_steps=0, fused_rays=64)
+
+
+def localized(view: View, map: MapWithLandmarks | None = None, start: SE3 | None = None) -> Localization:
+    return Localizer(map or textured_map(), "auto", QUICK)(view.frame, start=start)
+
+
+def test_auto_takes_landmarks_first_with_a_start_or_without() -> None:
+    start = TRUTH.retract(torch.full((6,), 0.5, dtype=torch.float64))  # far off: it must not matter
+    for found in (localized(without_depth(unseen())), localized(without_depth(unseen()), start=start)):
+        assert found.outcome is Outcome.CONVERGED
+        assert "landmarks agree" in found.reason
+        assert_within(found.T_world_camera, 0.02, 0.5)
+
+
+def test_landmarks_can_be_switched_off() -> None:
+    localizer = Localizer(textured_map(surface=True), "auto", replace(QUICK, landmarks=False))
+    found = localizer(unseen().frame)
+    assert "landmarks" not in found.reason
+    assert "surface" in found.reason
+
+
+@pytest.mark.parametrize("depth", [True, False], ids=["depth", "colour"])
+def test_an_image_of_another_place_is_rejected(depth: bool) -> None:
+    """The other ground has the same shape, and colours of the same kind."""
+    other = textured_field.view(TRUTH, "other", seed=1)
+    found = localized(other if depth else without_depth(other), textured_map(surface=True))
+    assert not found.converged
+    assert "landmarks agree within" not in found.reason
+
+
+def blank(grey: float = 0.5) -> View:
+    rgb = torch.full_like(unseen().frame.rgb, grey)
+    return View(replace(unseen().frame, rgb=rgb, name="blank"), SE3.identity())
+
+
+def test_without_keypoints_measured_depth_is_searched_for_on_the_surface() -> None:
+    found = localized(blank(), textured_map(surface=True))
+    assert not found.converged
+    assert "of the measured points" in found.reason
+
+
+@pytest.mark.parametrize("grey", [0.0, 0.5, 1.0])
+def test_a_covered_lens_is_not_found_by_rendering_either(grey: float) -> None:
+    """A gain and a bias fit a single colour to whatever the map shows."""
+    view = without_depth(blank(grey))
+    found = localized(view, textured_map(surface=True))
+    assert found.outcome is Outcome.UNDETERMINED
+    assert found.reason
+
+
+@pytest.mark.parametrize(
+    ("many", "settings", "expected"),
+    [
+        (10_000, {}, Outcome.CONVERGED),
+        (1, {}, Outcome.TOO_FEW_MATCHES),
+        (1, {"landmarks": False}, Outcome.CONVERGED),
+    ],
+    ids=["hardly any landmarks", "many", "not asked for"],
+)
+def test_what_the_landmarks_of_a_textured_scene_do_not_recognise_is_not_accepted(
+    many: int, settings: dict[str, bool], expected: Outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whole images may look alike where no keypoint does."""
+    monkeypatch.setattr(auto_module, "MANY_LANDMARKS", many)
+    monkeypatch.setattr(auto_module, "answer_by_landmarks", lambda *_: None)
+    localizer = Localizer(textured_map(surface=True), "auto", replace(QUICK, **settings))
+    found = localizer(without_depth(unseen()).frame, start=TRUTH)
+    assert found.outcome is expected
+    assert ("no landmarks were recognised" in found.reason) == (expected is Outcome.TOO_FEW_MATCHES)
+    assert_within(found.T_world_camera, 0.02, 0.5)
+
+
+def test_without_keypoints_and_surface_a_start_is_needed() -> None:
+    with pytest.raises(InputError, match=r"the map has no surface.*needs a start"):
+        localized(blank())
