@@ -25,7 +25,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
-from bidnerf_core import storage
+from bidnerf_core import files
 from bidnerf_core.cli import COMMANDS, main, progress
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 LOCALIZE_KEYS = {
     "frame", "T_world_camera", "converged", "outcome", "reason", "steps", "seconds", "covariance", "loss", "backend",
-    "method", "error",
+    "method", "focal_factor", "error",
 }  # fmt: skip
 QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64"]
 Edit = Callable[[Path], None]
@@ -483,7 +483,7 @@ def no_space(*_: object) -> None:
 def test_a_full_disk_leaves_nothing_behind(
     bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(storage.os, "fsync", no_space)
+    monkeypatch.setattr(files.os, "fsync", no_space)
     out = tmp_path / "some" / "where"
     trained = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
     assert trained.status == 1

@@ -123,7 +123,7 @@ class Answers:
         say(f"{name}: {error}")
         failure = {
             "frame": name, "T_world_camera": None, "converged": False, "outcome": "bad input", "reason": str(error),
-            "steps": 0, "seconds": 0.0, "covariance": None, "loss": None, "method": method,
+            "steps": 0, "seconds": 0.0, "covariance": None, "loss": None, "method": method, "focal_factor": 1.0,
             "backend": self._stored.info.backend, "error": None,
         }  # fmt: skip
         self._objects.append(failure)
