@@ -179,3 +179,18 @@ def test_mistakes_are_told(
     assert (found, out, "Traceback" in err) == (status, "", False), err
     assert status == 2 or err.count("\n") == 1
     assert said in err
+
+
+def test_how_well_a_field_renders_is_measured_on_photos_alone(
+    shared: Path, folder: Path, bidnerf: Run
+) -> None:
+    """Against images that it renders itself any field is perfect."""
+    assert load_map(folder).colour_noise is None
+    bidnerf("bake", folder, *COARSE)
+    assert load_map(folder).colour_noise is None
+    bidnerf("bake", folder, "--data", shared / "data", *COARSE)
+    noise = load_map(folder).colour_noise
+    assert noise is not None
+    assert noise > 0.05  # it was trained for a moment only
+    bidnerf("bake", folder, *COARSE)
+    assert load_map(folder).colour_noise == noise
