@@ -15,6 +15,8 @@ import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli import bake as module
 from bidnerf_core.cli import main
+from bidnerf_core.cli.common import read_views
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.storage import Map, load_info, load_map
 from tiny import backends_listed_once  # noqa: F401
@@ -179,3 +181,22 @@ def test_mistakes_are_told(
     assert (found, out, "Traceback" in err) == (status, "", False), err
     assert status == 2 or err.count("\n") == 1
     assert said in err
+
+
+@pytest.mark.usefixtures("_ball")
+def test_how_well_a_field_renders_is_measured_on_photos_alone(
+    shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against images that it renders itself any field is perfect."""
+    photos = read_views(open_dataset(shared / "data", tiny.BACKGROUND), "train")
+    monkeypatch.setattr(module, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
+    bidnerf("bake", folder, *COARSE)
+    assert load_map(folder).landmarks is not None
+    assert load_map(folder).colour_noise is None
+    bidnerf("bake", folder, "--data", shared / "data", *COARSE)
+    noise = load_map(folder).colour_noise
+    assert noise is not None
+    assert noise > 0.05  # a ball is not what the photos show
+    bidnerf("bake", folder, *COARSE)
+    assert load_map(folder).landmarks is not None
+    assert load_map(folder).colour_noise == noise

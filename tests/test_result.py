@@ -30,6 +30,7 @@ KEYS = [
     "covariance",
     "loss",
     "method",
+    "focal_factor",
 ]
 
 

@@ -61,7 +61,10 @@ def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
             f"{folder}: holds no cameras to render it from; give a dataset of its views by --data"
         )
     _bake_surface(folder, stored, views, cameras, config)
-    _bake_landmarks(folder, stored, views or rendered_views(stored.field, stored.bounds, cameras))
+    # Photos alone show how well the field renders; against its own images it has no error.
+    noise = colour_noise(stored.field, stored.bounds, views) if views else stored.colour_noise
+    photos = views or rendered_views(stored.field, stored.bounds, cameras)
+    _bake_landmarks(folder, stored, photos, noise)
 
 
 def _bake_surface(
@@ -81,7 +84,7 @@ def _bake_surface(
     )
 
 
-def _bake_landmarks(folder: Path, stored: Map, views: Sequence[View]) -> None:
+def _bake_landmarks(folder: Path, stored: Map, views: Sequence[View], noise: float | None) -> None:
     """Build landmarks of the views; a scene without texture has none, and the surface alone then serves."""
     began = time.monotonic()
     try:
@@ -90,7 +93,6 @@ def _bake_landmarks(folder: Path, stored: Map, views: Sequence[View]) -> None:
     except InputError as error:
         say(f"{folder}: no landmarks: {error}")
         return
-    noise = colour_noise(stored.field, stored.bounds, views)
     save_landmarks(folder, stored.info, landmarks, noise)
     say(
         f"{folder}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(views)} views,"
