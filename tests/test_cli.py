@@ -25,7 +25,6 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
-from bidnerf_core import files
 from bidnerf_core.cli import COMMANDS, main, progress
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
@@ -483,7 +482,7 @@ def no_space(*_: object) -> None:
 def test_a_full_disk_leaves_nothing_behind(
     bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files.os, "fsync", no_space)
+    monkeypatch.setattr(os, "fsync", no_space)
     out = tmp_path / "some" / "where"
     trained = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
     assert trained.status == 1
