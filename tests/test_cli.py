@@ -693,6 +693,7 @@ def test_localize_prints_the_object_that_was_agreed_on(
         "loss": float,
         "backend": str,
         "method": str,
+        "focal_factor": float,
     }
     assert {key: type(found[key]) for key in kinds} == kinds
     assert found["backend"] == "hashgrid"
