@@ -46,7 +46,7 @@ class Observations:
     def of_depth(
         origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], distance: Float[Tensor, "n"]
     ) -> Observations:
-        """Rays along which a distance (metres, > 0) was measured and no colour. Raises ``InputError`` where there are none."""
+        """Return rays along which a distance (metres, > 0) but no colour was measured. Raises ``InputError`` for none."""
         if len(distance) == 0:
             raise InputError("depth rays: nothing was measured, expected at least one finite point in front")
         coloured = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
@@ -84,12 +84,12 @@ class Observations:
         return self.origins + self.distance[..., None] * self.directions
 
     def without_colour(self) -> Observations:
-        """The rays along which a distance was measured, without their colours. Raises ``InputError`` where there are none."""
+        """Return the rays along which a distance was measured, without colours. Raises ``InputError`` for none."""
         measured = self[self.measured]
         return Observations.of_depth(measured.origins, measured.directions, measured.distance)
 
     def flattened(self) -> Observations:
-        """The same rays along one axis."""
+        """Return these rays flattened to one axis."""
         origins, directions, rgb = (part.reshape(-1, 3) for part in (self.origins, self.directions, self.rgb))
         return Observations(origins, directions, rgb, self.distance.reshape(-1), self.coloured.reshape(-1))
 
@@ -111,7 +111,7 @@ class Observations:
         return self[index.to(self.distance.device)].to(device, dtype)
 
     def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:
-        """The same on another device and in another floating-point type."""
+        """Return a copy on another device and in another floating-point type."""
         origins, directions, rgb, distance = (
             part.to(device=device, dtype=dtype)
             for part in (self.origins, self.directions, self.rgb, self.distance)

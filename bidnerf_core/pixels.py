@@ -105,9 +105,9 @@ def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"
 
 DrawerName = Literal["uniform", "interest-points", "interest-regions"]
 QUALITY = 0.01
-"""Corner response, in parts of the image's strongest, from which a local maximum is an interest point."""
+"""Least corner response of an interest point, as a share of the strongest response in the image."""
 FAINTEST = 1e-5
-"""The same, absolute: above what noise of a grey level (1/255) does to a blank wall."""
+"""Least corner response of an interest point in any image. A blank wall with noise of 1/255 stays below it."""
 BORDER = 3
 """Observations around each that the corner detector looks at; it does not take smaller images."""
 REACH, ROUNDS = 5, 3

@@ -106,7 +106,7 @@ def observations_per_point(sightings: Sightings, count: int) -> Int[Tensor, "n"]
 
 
 def fitting(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """Observations within ``tolerance`` pixels of the projection of their point."""
+    """Return which observations lie within ``tolerance`` pixels of the projection of their point."""
     return torch.linalg.vector_norm(sightings.residuals(points), dim=-1) <= tolerance
 
 

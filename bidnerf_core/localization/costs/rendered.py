@@ -122,7 +122,7 @@ class RenderedCost:
 
 @dataclass(frozen=True)
 class RenderedCostSettings:
-    """What all stages of a refinement share."""
+    """The settings of the rendered cost that all stages of a refinement share."""
 
     colour: ColourSettings
     depth: DepthSettings | None  # None: colour alone
@@ -131,7 +131,7 @@ class RenderedCostSettings:
     def drawn(
         self, problem: Problem, stage: RefinementStage, pivot: Pivot, generator: Generator
     ) -> RenderedCost:
-        """Draw a stage's rays."""
+        """Draw the rays of a stage and return the cost on them."""
         depth = self.depth
         objective = objective_of(self.colour, depth, stage.colour_scale, stage.depth_scale, MISS_SCALES)
         counts = RayCounts(stage.rays, 0 if depth is None else depth.depth_rays)
@@ -142,10 +142,10 @@ class RenderedCostSettings:
 def _residuals(
     found: Linearization, rays: WeightedRays, objective: Objective, exposure: bool, surface_sigma: float
 ) -> Residuals:
-    """Turn a linearization into weighted residuals; with ``exposure``, rendered as bright as the image was taken.
+    """Turn a linearization into weighted residuals; with ``exposure``, the rendering is first corrected to the image's.
 
-    ``surface_sigma`` (metres): a residual varies by its steepness times that, beside its own scale, and counts for so much
-    less.
+    ``surface_sigma`` (metres) is the uncertainty of the map's surfaces. It adds the variance (slope x sigma)^2 to that of
+    each residual, so steep residuals receive less weight.
     """
     value, jacobian, weights = found.residuals.double(), found.jacobian.double(), rays.weights.double()
     if exposure:

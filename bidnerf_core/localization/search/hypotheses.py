@@ -32,9 +32,9 @@ class Surroundings:
 def hypotheses_for_points(known: Surroundings, start: SE3 | None, count: int, generator: Generator) -> SE3:
     """Return ``count`` poses from which measured points may fit the surface.
 
-    Half are keyframes, moved a little. Half are orientations, three quarters of them about those of keyframes and a quarter
-    uniformly random, each placed so that the middle of what was measured lies on the middle of the scene, as it does where
-    cameras look at an object. Where there is a start, it and its neighbourhood take a quarter of all.
+    Half are keyframes, moved a little. The other half put the middle of the measured points on the middle of the scene, as
+    is right where cameras look at an object; three quarters of their orientations are near those of keyframes, and a quarter
+    are uniformly random. If there is a start, a quarter of all poses are the start and poses near it.
     """
     spread = _deviation(0.1 * known.extent, 0.25)
     near = [] if start is None else [_about(start, known.pivot, max(1, count // 4), spread, generator)]
@@ -52,8 +52,8 @@ def hypotheses_for_points(known: Surroundings, start: SE3 | None, count: int, ge
 def hypotheses_for_images(known: Surroundings, start: SE3 | None, count: int, generator: Generator) -> SE3:
     """Return ``count`` poses from which the map may look like the query's images.
 
-    Half are keyframes as they are, as far as there are so many; the others are keyframes moved about what they look at,
-    every fourth of them rolled by any angle. Where there is a start, it and its neighbourhood take a quarter of all.
+    Up to half are keyframes as they are. The others are keyframes moved about what they look at; every fourth of them is
+    also rolled by a random angle. If there is a start, a quarter of all poses are the start and poses near it.
     """
     near = [] if start is None else [_turned_and_moved(known, start, max(1, count // 4), generator)]
     left = count - sum(len(T.translation) for T in near)
