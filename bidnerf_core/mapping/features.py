@@ -52,9 +52,7 @@ class Sift:
     """SIFT (Lowe 2004) by OpenCV, with the root normalisation of Arandjelovic and Zisserman 2012."""
 
     count: int = 2000  # largest number of keypoints: those of highest contrast are kept
-    contrast: float = (
-        0.01  # least contrast of a keypoint; OpenCV's default of 0.04 leaves few indoors
-    )
+    contrast: float = 0.01  # least contrast of a keypoint; OpenCV's default of 0.04 leaves few indoors
 
     # Pixels along the longer side above which an image is reduced first: a phone's twelve megapixels hold no more
     # keypoints of the sizes that maps are made of, and take half a minute.

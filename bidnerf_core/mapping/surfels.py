@@ -59,7 +59,10 @@ def _neighbours(positions: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n k
 def _gradient(
     offsets: Float[Tensor, "n k 3"], normals: Float[Tensor, "n 3"], rgb: Float[Tensor, "n k 3"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Return the least-squares gradient of colour within the plane (Park et al. 2017, "Colored point cloud registration", eq. 10)."""
+    """Return the least-squares gradient of colour within the plane.
+
+    See Park et al. 2017, "Colored point cloud registration", eq. 10.
+    """
     flat = offsets - (offsets * normals[:, None]).sum(-1, keepdim=True) * normals[:, None]
     spread = flat.mT @ flat
     size = spread.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(flat.dtype).tiny)
