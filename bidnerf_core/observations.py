@@ -1,7 +1,7 @@
-"""Measured rays: what a sensor saw, and how far away, along half-lines of a reference frame.
+"""Measured rays: colours and distances that sensors measured along half-lines in a reference frame.
 
-The same bundle serves pixels of an RGB-D image, the returns of a lidar and the points of structure from motion. A ray says
-of itself what was measured along it: ``coloured`` marks the rays with a colour, ``distance`` is 0 where none was measured.
+The same bundle serves pixels of an RGB-D image, the returns of a lidar and the points of structure from motion. Each ray
+holds what was measured along it: ``coloured`` marks rays with a colour, and ``distance`` is 0 where none was measured.
 """
 
 from __future__ import annotations

@@ -24,20 +24,20 @@ from bidnerf_core.observations import Observations
 
 @runtime_checkable
 class PixelDrawer(Protocol):
-    """Picks ``count`` pixels (column, row) of a frame; ``generator`` is on the CPU, and so is the answer."""
+    """Draws ``count`` pixels (column, row) of a frame; ``generator`` and the result are on the CPU."""
 
     def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]: ...
 
 
 def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
-    """Every pixel as likely as any other."""
+    """Draw pixels uniformly, with replacement."""
     columns = torch.randint(frame.intrinsics.width, (count,), generator=generator)
     rows = torch.randint(frame.intrinsics.height, (count,), generator=generator)
     return torch.stack([columns, rows], dim=-1)
 
 
 def all_pixels(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Row by row. Centres lie at +0.5, so that truncation gives the index."""
+    """Return all pixels of a frame, row by row. Centres lie at +0.5, so that truncation gives the index."""
     return frame.intrinsics.pixel_centres().long().reshape(-1, 2)
 
 
@@ -47,7 +47,10 @@ def observe(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
 ) -> Observations:
-    """What ``view`` measured at ``pixels``, as half-lines of its reference frame, on ``device`` (default: the image's)."""
+    """Return the measurements of ``view`` at ``pixels``, as half-lines in its reference frame.
+
+    They lie on ``device``, by default the image's.
+    """
     frame = view.frame
     pixels = pixels.cpu()  # few, and a camera computes there
     columns, rows = pixels.to(frame.rgb.device).unbind(-1)

@@ -1,7 +1,7 @@
-"""Files of one JSON object a line that only grow, safe against a kill at any moment.
+"""Append-only files of one JSON object per line, which stay valid if the process is killed at any moment.
 
-A line is on the disk before the work behind it counts as done. What a kill left half-written at the end is cut off when
-the file is next opened; anything else that is no JSON is an error that names the line and is never thrown away.
+A line is on the disk before its work counts as done. A line that a kill left half-written at the end is cut off when the
+file is next opened. Anything else that is not JSON raises an error that names the line, and is never deleted.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ RESULT_LINES = LineFormat(b'{"T_world_camera": ', "lines as 'bidnerf evaluate' w
 
 
 def key_of(trial: Trial) -> Key:
-    """Return what two trials share exactly where they are one and the same, on any machine."""
+    """Return a key that is equal for two trials if and only if they are the same trial, on any machine."""
     return json.dumps(to_plain(trial.portable), sort_keys=True)
 
 

@@ -36,7 +36,7 @@ class Measured:
 
 
 class TrialProcess:
-    """A process that runs trials one after another and keeps its map in memory. Use as a context: leaving it ends it.
+    """A process that runs trials one after another and keeps its map in memory. Use it as a context manager.
 
     It is a new interpreter that exchanges JSON, not a fork: it shares no memory, and no script needs a guard for it.
     """

@@ -23,7 +23,7 @@ from bidnerf_core.settings import Above, Range, Settings
 from bidnerf_core.voxel_grid import VoxelGrid
 
 WITNESSES = 8
-"""How many other views each point is compared with, at most."""
+"""Largest number of other views with which each point is compared."""
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,14 @@ from bidnerf_core.robust import geman_mcclure_inlier
 from bidnerf_core.se3 import SE3, skew
 
 SURFEL_RADIUS = 1.5
-"""How far along its plane a surfel reaches, in cells of the surface's grid."""
+"""Radius of a surfel's disc, in cells of the surface's grid."""
 MOST_COLOUR_CHANGE = 0.2
-"""The largest change of a surfel's colour along its plane that its gradient is trusted for."""
+"""Largest change of a surfel's colour along its plane to which its gradient is extrapolated."""
 
 
 @dataclass(frozen=True)
 class PointScales:
-    """The residuals at which a point is half an inlier, and what colour counts beside distance."""
+    """The residuals at which a point's inlier weight is one half, and the weight of colour relative to distance."""
 
     distance: float  # metres
     colour: float = 0.15  # norm of the difference over the three channels, each in [0, 1]
