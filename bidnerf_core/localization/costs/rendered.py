@@ -52,8 +52,8 @@ class Residuals:
     def cost(self) -> Float[Tensor, "h"]:
         """Return ``2 sum weight rho(r)``, the plain weighted sum of squares if residuals are small.
 
-        The confidence weights the equations of a step, but not this cost. Otherwise a step could lower the cost by moving rays
-        to where residuals are steep and their confidence is low.
+        The confidence weights the equations of a step, but not this cost. Otherwise a step could lower the cost by moving
+        rays to where residuals are steep and their confidence is low.
         """
         return 2 * (self.weights * self.objective.rho(self.value)).sum((-1, -2)).cpu()
 
