@@ -30,7 +30,7 @@ class Observations:
 
     @staticmethod
     def from_points(points: Float[Tensor, "n 3"], T_ref_sensor: SE3) -> Observations:
-        """Distances to ``points`` (metres), measured by a sensor at the origin of their frame; float64.
+        """Return rays to ``points`` (metres), as measured by a sensor at the origin of their frame; float64.
 
         Points that are not finite or lie at the origin are the returns that a lidar did not get, and are left out. Raises
         ``InputError`` where none is left.
@@ -54,14 +54,14 @@ class Observations:
 
     @staticmethod
     def joined(parts: Sequence[Observations]) -> Observations:
-        """All rays of ``parts``, which share a reference frame, along the first axis."""
+        """Concatenate the rays of ``parts``, which share a reference frame, along the first axis."""
         return Observations(
             *(torch.cat(values) for values in zip(*(part._tensors() for part in parts), strict=True))
         )
 
     @staticmethod
     def stacked(parts: Sequence[Observations]) -> Observations:
-        """Equally many rays of each part, with a new first axis: one row a part."""
+        """Stack parts with equally many rays along a new first axis."""
         return Observations(
             *(torch.stack(values) for values in zip(*(part._tensors() for part in parts), strict=True))
         )
@@ -104,7 +104,7 @@ class Observations:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Observations:
-        """``count`` of the rays, uniformly with replacement; all of them where there are no more than that."""
+        """Draw ``count`` of the rays uniformly with replacement; return all of them if there are no more."""
         if count >= len(self):
             return self.to(device, dtype)
         index = torch.randint(len(self), (count,), generator=generator)
@@ -119,7 +119,7 @@ class Observations:
         return Observations(origins, directions, rgb, distance, self.coloured.to(device=device))
 
     def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
-        """The half-lines in the world, limited to the scene's bounds; differentiable in the transform.
+        """Return the rays in the world, clipped to the scene's bounds; differentiable with respect to the transform.
 
         A batch of transforms (h) gives rays of shape (h *p).
         """

@@ -1,4 +1,4 @@
-"""Which pixels are looked at, and what they say.
+"""Selection of pixels, and their conversion to measured rays.
 
 A ``PixelDrawer`` picks pixels of a frame; ``observe`` turns them into rays of the view's reference frame with the colour
 and distance that were measured there. This is where planar depth becomes distance along the ray, once.
@@ -77,7 +77,7 @@ def draw(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
 ) -> Observations:
-    """``count`` pixels shared out equally among the views; every tensor has leading axes (views, pixels a view).
+    """Draw ``count`` pixels, equally many from each view; every tensor has leading axes (views, pixels per view).
 
     Images may lie anywhere; what was drawn lies on ``device``, by default where the images are.
     """
@@ -87,7 +87,7 @@ def draw(
 
 
 def depth_rays_of(views: Sequence[View]) -> Observations:
-    """Every pixel at which ``views`` measured depth, as rays without colour in their reference frame; float64.
+    """Return all pixels with measured depth as rays without colour, in the views' reference frame; float64.
 
     For depth images of few points, such as those of structure from motion, which pixels drawn at random would miss. Raises
     ``InputError`` where nothing was measured.
@@ -97,7 +97,7 @@ def depth_rays_of(views: Sequence[View]) -> Observations:
 
 
 def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"] | None:
-    """The median by axis of the points that ``views`` measured, in their reference frame; None where there are none."""
+    """Return the median, axis by axis, of the measured points, in the views' reference frame; None if there are none."""
     points = []
     for view in views:
         pixels = observe(view, all_pixels(view.frame)[::stride], torch.float64, "cpu")
@@ -118,7 +118,7 @@ REACH, ROUNDS = 5, 3
 
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Corners (column, row) after Shi and Tomasi 1994, "Good features to track"; none where nothing stands out."""
+    """Return corners (column, row) by Shi and Tomasi 1994, "Good features to track"; possibly none."""
     if min(frame.rgb.shape[:2]) <= BORDER:
         return torch.zeros((0, 2), dtype=torch.long)
     grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
@@ -128,7 +128,7 @@ def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
 
 
 def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Interest points and their surroundings, row by row."""
+    """Return the interest points of a frame and the pixels around them, row by row."""
     columns, rows = interest_points(frame).unbind(-1)
     mask = torch.zeros((1, 1, *frame.rgb.shape[:2]))
     mask[0, 0, rows, columns] = 1
@@ -158,7 +158,7 @@ class Among:
 
 
 def drawer(name: DrawerName) -> PixelDrawer:
-    """A pixel drawer by name, which remembers what it finds in a frame."""
+    """Return a pixel drawer by name; it caches the interest points of each frame."""
     if name == "uniform":
         return uniform
     return Among(interest_points if name == "interest-points" else interest_regions)

@@ -126,7 +126,7 @@ def to_flat(settings: Any) -> dict[str, Any]:
 
 
 def from_flat(kind: type[S], values: dict[str, Any], where: str, renamed: dict[str, str] | None = None) -> S:
-    """Return an instance of the settings ``kind`` with ``values`` by flat name in place of its defaults.
+    """Return an instance of the settings class ``kind``, with ``values`` (by flat name) in place of defaults.
 
     ``renamed`` maps names of earlier versions to today's. Raises ``InputError``, which begins with ``where``, for an
     unknown name, a value of another type than declared, and a value out of range.

@@ -72,7 +72,7 @@ class JsonLinesFile:
         return found
 
     def repair(self) -> None:
-        """Cut off what a kill left half-written, and end the last line."""
+        """Remove an incomplete last line, and end the last complete one with a newline."""
         file, whole, content = self._opened(), self._whole, self._content
         if whole < len(content):
             file.truncate(whole)

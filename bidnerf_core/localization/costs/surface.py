@@ -111,8 +111,10 @@ class Correspondences:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceCost:
-    """Mean over points of ``(1 - n) + w (1 - n a)``: n falls from 1 to 0 with the distance from the nearest surfel, a with
-    the difference between the colour there and the measured one.
+    """The cost of measured points on a surface: the mean over points of ``(1 - n) + w (1 - n a)``.
+
+    The inlier weight n falls from 1 to 0 with the distance from the nearest surfel; a falls likewise with the difference
+    between the surfel's colour and the measured one; w is ``colour_weight``.
 
     Its normal equations are those of iteratively reweighted least squares: the gradient is exact, the Hessian positive
     semidefinite.

@@ -18,7 +18,7 @@ from bidnerf_core.residuals import Objective
 
 @dataclass(frozen=True)
 class RayCounts:
-    """How many rays are drawn."""
+    """The numbers of rays to draw."""
 
     pixels: int  # in all, shared out equally among the views
     depth_rays: int = 0  # besides, of a sensor with rays of its own
