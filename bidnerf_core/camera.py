@@ -76,7 +76,7 @@ class Intrinsics:
         return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=dtype)
 
     def unproject(self, pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p 3"]:
-        """Points on the plane z = 1 that are seen at ``pixels`` (u, v); not unit vectors."""
+        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); they are not unit vectors."""
         if self.distortion:
             flat = undistort_points(
                 pixels.reshape(-1, 2).double(), self.matrix(), self._coefficients(), num_iters=20
@@ -87,7 +87,7 @@ class Intrinsics:
         return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
     def project(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 2"]:
-        """Where points of the camera frame are seen; those at or behind the camera come out not finite."""
+        """Return the pixels (u, v) of points in the camera frame; not finite for points at or behind the camera."""
         z = torch.where(points[..., 2] > 0, points[..., 2], torch.nan)
         u = points[..., 0] / z * self.fx + self.cx
         v = points[..., 1] / z * self.fy + self.cy

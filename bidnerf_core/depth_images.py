@@ -90,7 +90,7 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
 
 
 def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
-    """Masks of the values that stand for "not measured", by what a message calls them; no pixel is in two."""
+    """Return masks of the values that mean "not measured", by their name in messages; no pixel is in two of them."""
     if values.dtype.kind != "f":
         largest = np.iinfo(values.dtype).max
         saturated = values == largest

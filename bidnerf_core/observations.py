@@ -1,7 +1,7 @@
-"""Measured rays: what a sensor saw, and how far away, along half-lines of a reference frame.
+"""Measured rays: colours and distances that sensors measured along half-lines in a reference frame.
 
-The same bundle serves pixels of an RGB-D image, the returns of a lidar and the points of structure from motion. A ray says
-of itself what was measured along it: ``coloured`` marks the rays with a colour, ``distance`` is 0 where none was measured.
+The same bundle serves pixels of an RGB-D image, the returns of a lidar and the points of structure from motion. Each ray
+holds what was measured along it: ``coloured`` marks rays with a colour, and ``distance`` is 0 where none was measured.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Observations:
 
     @staticmethod
     def from_points(points: Float[Tensor, "n 3"], T_ref_sensor: SE3) -> Observations:
-        """Distances to ``points`` (metres), measured by a sensor at the origin of their frame; float64.
+        """Return rays to ``points`` (metres), as measured by a sensor at the origin of their frame; float64.
 
         Points that are not finite or lie at the origin are the returns that a lidar did not get, and are left out. Raises
         ``InputError`` where none is left.
@@ -46,7 +46,7 @@ class Observations:
     def of_depth(
         origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], distance: Float[Tensor, "n"]
     ) -> Observations:
-        """Rays along which a distance (metres, > 0) was measured and no colour. Raises ``InputError`` where there are none."""
+        """Return rays along which a distance (metres, > 0) but no colour was measured. Raises ``InputError`` for none."""
         if len(distance) == 0:
             raise InputError("depth rays: nothing was measured, expected at least one finite point in front")
         coloured = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
@@ -54,14 +54,14 @@ class Observations:
 
     @staticmethod
     def joined(parts: Sequence[Observations]) -> Observations:
-        """All rays of ``parts``, which share a reference frame, along the first axis."""
+        """Concatenate the rays of ``parts``, which share a reference frame, along the first axis."""
         return Observations(
             *(torch.cat(values) for values in zip(*(part._tensors() for part in parts), strict=True))
         )
 
     @staticmethod
     def stacked(parts: Sequence[Observations]) -> Observations:
-        """Equally many rays of each part, with a new first axis: one row a part."""
+        """Stack parts with equally many rays along a new first axis."""
         return Observations(
             *(torch.stack(values) for values in zip(*(part._tensors() for part in parts), strict=True))
         )
@@ -84,12 +84,12 @@ class Observations:
         return self.origins + self.distance[..., None] * self.directions
 
     def without_colour(self) -> Observations:
-        """The rays along which a distance was measured, without their colours. Raises ``InputError`` where there are none."""
+        """Return the rays along which a distance was measured, without colours. Raises ``InputError`` for none."""
         measured = self[self.measured]
         return Observations.of_depth(measured.origins, measured.directions, measured.distance)
 
     def flattened(self) -> Observations:
-        """The same rays along one axis."""
+        """Return these rays flattened to one axis."""
         origins, directions, rgb = (part.reshape(-1, 3) for part in (self.origins, self.directions, self.rgb))
         return Observations(origins, directions, rgb, self.distance.reshape(-1), self.coloured.reshape(-1))
 
@@ -104,14 +104,14 @@ class Observations:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Observations:
-        """``count`` of the rays, uniformly with replacement; all of them where there are no more than that."""
+        """Draw ``count`` of the rays uniformly with replacement; return all of them if there are no more."""
         if count >= len(self):
             return self.to(device, dtype)
         index = torch.randint(len(self), (count,), generator=generator)
         return self[index.to(self.distance.device)].to(device, dtype)
 
     def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:
-        """The same on another device and in another floating-point type."""
+        """Return a copy on another device and in another floating-point type."""
         origins, directions, rgb, distance = (
             part.to(device=device, dtype=dtype)
             for part in (self.origins, self.directions, self.rgb, self.distance)
@@ -119,7 +119,7 @@ class Observations:
         return Observations(origins, directions, rgb, distance, self.coloured.to(device=device))
 
     def rays(self, T_world_ref: SE3, bounds: SceneBounds) -> Rays:
-        """The half-lines in the world, limited to the scene's bounds; differentiable in the transform.
+        """Return the rays in the world, clipped to the scene's bounds; differentiable with respect to the transform.
 
         A batch of transforms (h) gives rays of shape (h *p).
         """

@@ -1,4 +1,4 @@
-"""Which pixels are looked at, and what they say.
+"""Selection of pixels, and their conversion to measured rays.
 
 A ``PixelDrawer`` picks pixels of a frame; ``observe`` turns them into rays of the view's reference frame with the colour
 and distance that were measured there. This is where planar depth becomes distance along the ray, once.
@@ -24,20 +24,20 @@ from bidnerf_core.observations import Observations
 
 @runtime_checkable
 class PixelDrawer(Protocol):
-    """Picks ``count`` pixels (column, row) of a frame; ``generator`` is on the CPU, and so is the answer."""
+    """Draws ``count`` pixels (column, row) of a frame; ``generator`` and the result are on the CPU."""
 
     def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]: ...
 
 
 def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
-    """Every pixel as likely as any other."""
+    """Draw pixels uniformly, with replacement."""
     columns = torch.randint(frame.intrinsics.width, (count,), generator=generator)
     rows = torch.randint(frame.intrinsics.height, (count,), generator=generator)
     return torch.stack([columns, rows], dim=-1)
 
 
 def all_pixels(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Row by row. Centres lie at +0.5, so that truncation gives the index."""
+    """Return all pixels of a frame, row by row. Centres lie at +0.5, so that truncation gives the index."""
     return frame.intrinsics.pixel_centres().long().reshape(-1, 2)
 
 
@@ -47,7 +47,10 @@ def observe(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
 ) -> Observations:
-    """What ``view`` measured at ``pixels``, as half-lines of its reference frame, on ``device`` (default: the image's)."""
+    """Return the measurements of ``view`` at ``pixels``, as half-lines in its reference frame.
+
+    They lie on ``device``, by default the image's.
+    """
     frame = view.frame
     pixels = pixels.cpu()  # few, and a camera computes there
     columns, rows = pixels.to(frame.rgb.device).unbind(-1)
@@ -74,7 +77,7 @@ def draw(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
 ) -> Observations:
-    """``count`` pixels shared out equally among the views; every tensor has leading axes (views, pixels a view).
+    """Draw ``count`` pixels, equally many from each view; every tensor has leading axes (views, pixels per view).
 
     Images may lie anywhere; what was drawn lies on ``device``, by default where the images are.
     """
@@ -84,7 +87,7 @@ def draw(
 
 
 def depth_rays_of(views: Sequence[View]) -> Observations:
-    """Every pixel at which ``views`` measured depth, as rays without colour in their reference frame; float64.
+    """Return all pixels with measured depth as rays without colour, in the views' reference frame; float64.
 
     For depth images of few points, such as those of structure from motion, which pixels drawn at random would miss. Raises
     ``InputError`` where nothing was measured.
@@ -94,7 +97,7 @@ def depth_rays_of(views: Sequence[View]) -> Observations:
 
 
 def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"] | None:
-    """The median by axis of the points that ``views`` measured, in their reference frame; None where there are none."""
+    """Return the median, axis by axis, of the measured points, in the views' reference frame; None if there are none."""
     points = []
     for view in views:
         pixels = observe(view, all_pixels(view.frame)[::stride], torch.float64, "cpu")
@@ -105,9 +108,9 @@ def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"
 
 DrawerName = Literal["uniform", "interest-points", "interest-regions"]
 QUALITY = 0.01
-"""Corner response, in parts of the image's strongest, from which a local maximum is an interest point."""
+"""Least corner response of an interest point, as a share of the strongest response in the image."""
 FAINTEST = 1e-5
-"""The same, absolute: above what noise of a grey level (1/255) does to a blank wall."""
+"""Least corner response of an interest point in any image. A blank wall with noise of 1/255 stays below it."""
 BORDER = 3
 """Observations around each that the corner detector looks at; it does not take smaller images."""
 REACH, ROUNDS = 5, 3
@@ -115,7 +118,7 @@ REACH, ROUNDS = 5, 3
 
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Corners (column, row) after Shi and Tomasi 1994, "Good features to track"; none where nothing stands out."""
+    """Return corners (column, row) by Shi and Tomasi 1994, "Good features to track"; possibly none."""
     if min(frame.rgb.shape[:2]) <= BORDER:
         return torch.zeros((0, 2), dtype=torch.long)
     grey = rgb_to_grayscale(frame.rgb.detach().float().cpu().permute(2, 0, 1)[None])
@@ -125,7 +128,7 @@ def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
 
 
 def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Interest points and their surroundings, row by row."""
+    """Return the interest points of a frame and the pixels around them, row by row."""
     columns, rows = interest_points(frame).unbind(-1)
     mask = torch.zeros((1, 1, *frame.rgb.shape[:2]))
     mask[0, 0, rows, columns] = 1
@@ -155,7 +158,7 @@ class Among:
 
 
 def drawer(name: DrawerName) -> PixelDrawer:
-    """A pixel drawer by name, which remembers what it finds in a frame."""
+    """Return a pixel drawer by name; it caches the interest points of each frame."""
     if name == "uniform":
         return uniform
     return Among(interest_points if name == "interest-points" else interest_regions)

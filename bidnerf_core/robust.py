@@ -22,28 +22,28 @@ RobustName = Literal["huber", "l2", "l1", "cauchy", "geman-mcclure"]
 
 
 def huber(residual: Float[Tensor, "*p"], delta: float) -> Float[Tensor, "*p"]:
-    """Huber's rho: ``r^2 / 2`` up to ``delta``, then linear with slope ``delta``."""
+    """Return Huber's rho: ``r^2 / 2`` up to ``delta``, then linear with slope ``delta``."""
     size = residual.abs()
     return torch.where(size <= delta, 0.5 * size**2, delta * (size - 0.5 * delta))
 
 
 def l2(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """``r^2 / 2``, whatever the scale."""
+    """Return ``r^2 / 2``; the scale has no effect."""
     return 0.5 * residual**2
 
 
 def l1(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """``scale |r|``; its derivative at 0 is 0."""
+    """Return ``scale |r|``; its derivative at 0 is taken as 0."""
     return scale * residual.abs()
 
 
 def cauchy(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """``c^2 log(1 + (r/c)^2 / 2)``: far residuals pull the less, the farther they are."""
+    """Return ``c^2 log(1 + (r/c)^2 / 2)``: the influence of a residual decreases as it grows large."""
     return scale**2 * torch.log1p(0.5 * (residual / scale) ** 2)
 
 
 def geman_mcclure(residual: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """``2 c^2 r^2 / (r^2 + 4 c^2)``: bounded by ``2 c^2``, so that far residuals pull hardly at all."""
+    """Return ``2 c^2 r^2 / (r^2 + 4 c^2)``, which is bounded by ``2 c^2``: large residuals have almost no influence."""
     squared = (residual / scale) ** 2
     return scale**2 * 2 * squared / (squared + 4)
 
@@ -85,5 +85,5 @@ class Robust:
         return LOSSES[self.name](residual, self.scale)
 
     def weight(self, residual: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
-        """``rho'(r) / r``: what a square must count for to pull as this loss does (Holland and Welsch 1977)."""
+        """Return ``rho'(r) / r``, the weight of iteratively reweighted least squares (Holland and Welsch 1977)."""
         return WEIGHTS[self.name](residual, self.scale)

@@ -38,12 +38,12 @@ class SE3:
 
     @staticmethod
     def exp(tangent: Float[Tensor, "*b 6"]) -> SE3:
-        """Exponential map (Sola et al., eq. 172): ``[exp(phi), V(phi) rho]``."""
+        """Return the exponential map (Sola et al., eq. 172): ``[exp(phi), V(phi) rho]``."""
         rho, phi = tangent[..., :3], tangent[..., 3:]
         return SE3(axis_angle_to_rotation_matrix(phi), _matvec(so3_left_jacobian(phi), rho))
 
     def log(self) -> Float[Tensor, "*b 6"]:
-        """Inverse of ``exp``, with the rotation angle in [0, pi] (eq. 173)."""
+        """Return the inverse of ``exp``, with the rotation angle in [0, pi] (eq. 173)."""
         phi = rotation_matrix_to_axis_angle(self.rotation)
         return torch.cat([_matvec(so3_left_jacobian_inverse(phi), self.translation), phi], dim=-1)
 
@@ -60,33 +60,33 @@ class SE3:
         return SE3(transposed, -_matvec(transposed, self.translation))
 
     def apply(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*q 3"]:
-        """Points of the right-hand frame in the left-hand one; the batch broadcasts against leading axes."""
+        """Transform points from the right-hand frame to the left-hand one; the batch broadcasts against leading axes."""
         return _matvec(self.rotation, points) + self.translation
 
     def rotate(self, vectors: Float[Tensor, "*p 3"]) -> Float[Tensor, "*q 3"]:
-        """Directions have no place: they turn, but do not move."""
+        """Rotate directions, which the translation does not affect."""
         return _matvec(self.rotation, vectors)
 
     def retract(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
-        """Right update ``self @ exp(tangent)``."""
+        """Return the right update ``self @ exp(tangent)``."""
         return self @ SE3.exp(tangent)
 
     def adjoint(self) -> Float[Tensor, "*b 6 6"]:
-        """``T exp(xi) T^-1 = exp(adjoint(T) xi)`` (eq. 175)."""
+        """Return the adjoint matrix, for which ``T exp(xi) T^-1 = exp(adjoint(T) xi)`` (eq. 175)."""
         turned = skew(self.translation) @ self.rotation
         top = torch.cat([self.rotation, turned], dim=-1)
         bottom = torch.cat([torch.zeros_like(self.rotation), self.rotation], dim=-1)
         return torch.cat([top, bottom], dim=-2)
 
     def normalized(self) -> SE3:
-        """The nearest rigid transform: long products drift off the group by rounding."""
+        """Return the nearest rigid transform: rounding makes long products drift off the group."""
         u, _, vh = torch.linalg.svd(self.rotation)
         sign = torch.ones_like(self.translation)
         sign = torch.cat([sign[..., :2], torch.linalg.det(u @ vh)[..., None]], dim=-1)
         return SE3(u @ (sign[..., None] * vh), self.translation)
 
     def is_rigid(self, tolerance: float = 1e-3) -> Bool[Tensor, "*b"]:
-        """Finite, orthonormal to ``tolerance``, and no mirror image."""
+        """Return whether the transform is finite and its rotation orthonormal to ``tolerance``, with determinant 1."""
         eye = torch.eye(3, dtype=self.rotation.dtype, device=self.rotation.device)
         off = (self.rotation.mT @ self.rotation - eye).abs().amax(dim=(-1, -2))
         finite = torch.isfinite(self.translation).all(dim=-1)
@@ -96,11 +96,11 @@ class SE3:
         return SE3(self.rotation.detach(), self.translation.detach())
 
     def to(self, *args: Any, **kwargs: Any) -> SE3:
-        """Another dtype or device, as ``Tensor.to`` takes them."""
+        """Convert to another dtype or device, given as for ``Tensor.to``."""
         return SE3(self.rotation.to(*args, **kwargs), self.translation.to(*args, **kwargs))
 
     def __getitem__(self, index: Any) -> SE3:
-        """A part of the batch; indices count batch axes only."""
+        """Return a part of the batch; indices refer to batch axes only."""
         return SE3(self.rotation[index], self.translation[index])
 
     @staticmethod
@@ -111,19 +111,19 @@ class SE3:
 
     @staticmethod
     def cat(batches: list[SE3]) -> SE3:
-        """Batches along one axis, one after the other."""
+        """Concatenate batches along one axis."""
         return SE3(torch.cat([b.rotation for b in batches]), torch.cat([b.translation for b in batches]))
 
 
 def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """``skew(a) @ b = a x b``."""
+    """Return the matrix [a]x, for which ``skew(a) @ b = a x b``."""
     x, y, z = vector.unbind(-1)
     o = torch.zeros_like(x)
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
 
 
 def so3_left_jacobian(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """V(phi) (eq. 145): ``I + (1 - cos t)/t^2 [phi]x + (t - sin t)/t^3 [phi]x^2``."""
+    """Return V(phi) (eq. 145): ``I + (1 - cos t)/t^2 [phi]x + (t - sin t)/t^3 [phi]x^2``."""
     squared, small, angle = _guarded_angle(phi)
     b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - angle.cos()) / angle**2)
     c = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - angle.sin()) / angle**3)
@@ -131,7 +131,7 @@ def so3_left_jacobian(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def so3_left_jacobian_inverse(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """V(phi)^-1 (eq. 146): ``I - 1/2 [phi]x + (1/t^2 - (1 + cos t) / (2 t sin t)) [phi]x^2``."""
+    """Return V(phi)^-1 (eq. 146): ``I - 1/2 [phi]x + (1/t^2 - (1 + cos t) / (2 t sin t)) [phi]x^2``."""
     squared, small, angle = _guarded_angle(phi)
     half = angle / 2  # (1 + cos t) / sin t = 1 / tan(t / 2): finite at pi
     series = 1 / 12 + squared / 720 + squared**2 / 30240
@@ -140,7 +140,10 @@ def so3_left_jacobian_inverse(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3
 
 
 def se3_left_jacobian(tangent: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]:
-    """``exp(xi + d) = exp(J d) exp(xi)`` to first order (eqs. 179-180; Barfoot, "State estimation for robotics", 7.86)."""
+    """Return J, for which ``exp(xi + d) = exp(J d) exp(xi)`` to first order.
+
+    See eqs. 179-180, and Barfoot, "State estimation for robotics", 7.86.
+    """
     rho, phi = tangent[..., :3], tangent[..., 3:]
     jacobian = so3_left_jacobian(phi)
     top = torch.cat([jacobian, _coupling(rho, phi)], dim=-1)
@@ -148,12 +151,12 @@ def se3_left_jacobian(tangent: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]
 
 
 def se3_right_jacobian(tangent: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]:
-    """``exp(xi + d) = exp(xi) exp(J d)`` to first order: the left one at ``-xi`` (eq. 76)."""
+    """Return J, for which ``exp(xi + d) = exp(xi) exp(J d)`` to first order: the left Jacobian at ``-xi`` (eq. 76)."""
     return se3_left_jacobian(-tangent)
 
 
 def _coupling(rho: Float[Tensor, "*b 3"], phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Q(rho, phi), eq. 180."""
+    """Return Q(rho, phi), eq. 180."""
     squared, small, angle = _guarded_angle(phi)
     sin, cos = angle.sin(), angle.cos()
     a = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - sin) / angle**3)
@@ -179,7 +182,7 @@ def _guarded_angle(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _polynomial(phi: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """``I + b [phi]x + c [phi]x^2``."""
+    """Return ``I + b [phi]x + c [phi]x^2``."""
     s = skew(phi)
     eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
     return eye + b[..., None, None] * s + c[..., None, None] * (s @ s)

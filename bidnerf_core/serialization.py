@@ -18,7 +18,7 @@ LARGEST_NUMBER = sys.float_info.max  # JSON knows NaN, 1e999 and integers that n
 
 
 def to_plain(value: Any, where: str = "") -> Any:
-    """Dataclasses as dicts, tuples as lists. Raises ``InputError`` for what strict JSON cannot hold."""
+    """Convert dataclasses to dicts and tuples to lists. Raises ``InputError`` for values that strict JSON cannot hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [f.name for f in dataclasses.fields(value) if f.init]
         return {name: to_plain(getattr(value, name), _inside(where, name)) for name in fields}
@@ -34,7 +34,7 @@ def to_plain(value: Any, where: str = "") -> Any:
 
 
 def from_plain(kind: type[_T], value: Any, where: str) -> _T:
-    """An instance of the dataclass ``kind``; missing keys take their defaults. ``where`` opens the error's line.
+    """Return an instance of the dataclass ``kind``; missing keys take their defaults. Errors begin with ``where``.
 
     Raises ``InputError`` for a key that ``kind`` does not have, for one that it lacks, for a value of another type than
     declared, and for values that ``kind`` itself refuses.
@@ -71,7 +71,7 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _converted(kind: Any, value: Any, where: str) -> Any:
-    """``value`` as JSON holds it, as the type ``kind``."""
+    """Convert ``value``, as read from JSON, to the type ``kind``."""
     origin, arguments = typing.get_origin(kind) or kind, typing.get_args(kind)
     if kind is Any or (origin is typing.Literal and value in arguments):
         return value
@@ -120,7 +120,7 @@ def _name(kind: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    """A found value on one line, cut where it is long."""
+    """Return a value as text on one line, truncated if it is long."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 

@@ -24,7 +24,7 @@ S = TypeVar("S")
 
 @dataclass(frozen=True)
 class Range:
-    """The values that a setting may take: ``least`` to ``most``, both included."""
+    """The range of a setting: ``least`` to ``most``, both included."""
 
     least: float
     most: float = math.inf
@@ -40,7 +40,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Above(Range):
-    """The values that a setting may take: more than ``least``, and ``most`` at most."""
+    """The range of a setting that excludes its lower limit ``least`` and includes its upper limit ``most``."""
 
     def __contains__(self, value: float) -> bool:
         return super().__contains__(value) and value != self.least
@@ -58,7 +58,7 @@ def _written(limit: float) -> str:
 # Compared and hashed by identity, since the command line's parser hashes it and a table has no hash.
 @dataclass(frozen=True, eq=False)
 class OneOf:
-    """The names that a setting may take, where they are those of a table that users may extend."""
+    """The names that a setting accepts: the keys of a table, which users may extend."""
 
     table: Mapping[str, Any]
 
@@ -82,7 +82,7 @@ Positive = Annotated[float, Above(0.0, 1e6)]
 
 
 class Settings:
-    """A base of frozen dataclasses that checks each field against the range or the names beside it.
+    """Base class of frozen dataclasses whose fields are checked against the ranges or names in their annotations.
 
     Raises ``InputError``, with the setting's name, its value and what was expected, as soon as an instance is made.
     """
@@ -126,7 +126,7 @@ def to_flat(settings: Any) -> dict[str, Any]:
 
 
 def from_flat(kind: type[S], values: dict[str, Any], where: str, renamed: dict[str, str] | None = None) -> S:
-    """Return an instance of the settings ``kind`` with ``values`` by flat name in place of its defaults.
+    """Return an instance of the settings class ``kind``, with ``values`` (by flat name) in place of defaults.
 
     ``renamed`` maps names of earlier versions to today's. Raises ``InputError``, which begins with ``where``, for an
     unknown name, a value of another type than declared, and a value out of range.

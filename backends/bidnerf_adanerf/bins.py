@@ -39,10 +39,11 @@ class Bins:
 
 @dataclass(frozen=True)
 class Sparse:
-    """The bins that the oracle chooses, at least one of each ray that meets the scene: a ``RaySampler``.
+    """A ``RaySampler`` that keeps only the bins that the oracle scores highest.
 
-    Of the bins whose score is above ``threshold`` these are the best ``most``, nearest first. The choice carries no
-    gradient; the derivative by the pose comes from the positions of the chosen bins.
+    Each ray keeps at most ``most`` of the bins whose score exceeds ``threshold``, ordered from near to far, and at least
+    one bin if it meets the scene. The choice carries no gradient; the derivative with respect to the pose comes from the
+    positions of the chosen bins.
     """
 
     oracle: Oracle

@@ -86,7 +86,7 @@ def demo(
 ) -> None:
     """Train a closed-form scene, localize unseen frames in it, draw the result.
 
-    The frames are RGB-D images from poses that are not in the training. Each is localized twice: by method auto with no
+    The frames are RGB-D images from poses that training never saw. Each is localized twice: by method auto with no
     start, and by method bid from a start far from its pose.
     """
     require("--frames", frames, 1)

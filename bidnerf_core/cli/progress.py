@@ -56,7 +56,10 @@ class StoppableBar:
 
 
 class StoredTraining(StoppableBar):
-    """The ``Report`` of a training that keeps its map in a folder. Use as a context: Ctrl-C then stops after a step."""
+    """The ``Report`` of a training that keeps its map in a folder.
+
+    As a context manager, it makes Ctrl-C stop training after the current step.
+    """
 
     def __init__(
         self, folder: Path, info: MapInfo, state: TrainingState | None, total: int, checkpoint_seconds: float

@@ -49,7 +49,7 @@ class QuerySource(Protocol):
     def names(self) -> Sequence[str]: ...
 
     def read(self, place: int) -> Query:
-        """Read a query. Raises ``InputError`` where a file of it is missing or not usable."""
+        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable."""
         ...
 
 

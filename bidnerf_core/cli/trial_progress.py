@@ -20,7 +20,10 @@ from bidnerf_core.evaluation.trial import TrialResult
 
 
 class TrialProgress(StoppableBar):
-    """A progress bar of trials. Use as a context: Ctrl-C waits for the trials under way, a second Ctrl-C does not."""
+    """A progress bar of trials.
+
+    As a context manager, it makes Ctrl-C wait for the running trials, and a second Ctrl-C stop them.
+    """
 
     def __init__(self, total: int, at_once: int) -> None:
         self.total, self.count, self.right = total, 0, 0

@@ -1,4 +1,4 @@
-"""Readers of posed images, and a writer. Conventions are converted here and nowhere else."""
+"""Readers of posed images, and a writer. All conventions of file formats are converted here."""
 
 from __future__ import annotations
 
@@ -26,7 +26,11 @@ __all__ = [
 
 @runtime_checkable
 class Reader(Protocol):
-    """A reader of one format. ``expected`` names the files that its folders hold, for messages."""
+    """A reader of one dataset format.
+
+    ``expected`` names the files that its folders hold, for error messages. ``recognises`` returns whether a folder has its
+    format. ``open`` returns the dataset and raises ``InputError`` if the folder cannot be used.
+    """
 
     @property
     def expected(self) -> str: ...

@@ -51,7 +51,7 @@ class Dataset(Protocol):
 
 
 def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], where: str) -> list[int]:
-    """Return the places of the requested frames among ``names``.
+    """Return the indices of the requested frames in ``names``.
 
     Raises ``InputError``, whose message begins with ``where``, for a name that is unknown or ambiguous.
     """

@@ -1,7 +1,7 @@
-"""Files of one JSON object a line that only grow, safe against a kill at any moment.
+"""Append-only files of one JSON object per line, which stay valid if the process is killed at any moment.
 
-A line is on the disk before the work behind it counts as done. What a kill left half-written at the end is cut off when
-the file is next opened; anything else that is no JSON is an error that names the line and is never thrown away.
+A line is on the disk before its work counts as done. A line that a kill left half-written at the end is cut off when the
+file is next opened. Anything else that is not JSON raises an error that names the line, and is never deleted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ from bidnerf_core.files import open_binary, write_file
 
 @dataclass(frozen=True)
 class LineFormat:
-    """How the lines of a file begin, and what writes them. Of a file whose lines begin otherwise nothing is cut off."""
+    """The format of a JSON Lines file: how each of its lines begins, and how errors describe the expected content.
+
+    An incomplete last line is dropped only if it begins like the others; any other is an error, so no foreign file is cut.
+    """
 
     opening: bytes
     expected: str  # ends the error about a line that is something else
@@ -50,7 +53,7 @@ class LineFormat:
 
 
 class JsonLinesFile:
-    """A file of JSON lines that is open for one process. Use as a context; a second process is refused meanwhile."""
+    """A JSON Lines file, locked by the process that has it open. Use it as a context manager."""
 
     def __init__(self, path: Path, kind: LineFormat) -> None:
         self.path, self._kind = path, kind
@@ -69,7 +72,7 @@ class JsonLinesFile:
         return found
 
     def repair(self) -> None:
-        """Cut off what a kill left half-written, and end the last line."""
+        """Remove an incomplete last line, and end the last complete one with a newline."""
         file, whole, content = self._opened(), self._whole, self._content
         if whole < len(content):
             file.truncate(whole)
@@ -135,9 +138,9 @@ class JsonLinesFile:
 
 
 class RowStore:
-    """Rows by key for scripts that go on where they stopped. Use as a context.
+    """A file of results by key, from which an interrupted script resumes. Use it as a context manager.
 
-    Each row is made once and kept in a line ``{"key": KEY, "row": ROW}``.
+    Each row is computed once and stored as a line ``{"key": KEY, "row": ROW}``.
     """
 
     FORMAT = LineFormat(b'{"key": ', "lines as a benchmark keeps its rows")
@@ -162,7 +165,7 @@ class RowStore:
         self._file.close()
 
     def get(self, key: list[Any], make: Callable[[], Any]) -> Any:
-        """Return the row of ``key``, which is made, and kept, where the file does not hold it."""
+        """Return the row of ``key``; if the file does not hold it, compute it with ``make`` and store it."""
         text = json.dumps(key)
         if text not in self._rows:
             row = make()
@@ -177,7 +180,7 @@ def as_line(plain: Any) -> bytes:
 
 
 def _parsed(line: bytes) -> Any:
-    """Return the object of a line. Raises ``ValueError`` also for text with half of a surrogate pair, which no file holds."""
+    """Return the object of a line. Raises ``ValueError`` also for text with half of a surrogate pair."""
     plain = json.loads(line)
     if b"\\ud" in line.lower():
         json.dumps(plain, ensure_ascii=False).encode()

@@ -46,9 +46,10 @@ def perturb(T_true: SE3, translation: float, rotation_deg: float, seed: int) -> 
 
 
 def inerf_start(T_true: SE3, seed: int) -> SE3:
-    """Return the start of iNeRF (Yen-Chen et al. 2021, IV-A), up to 40 degrees and 0.2 along each axis off.
+    """Return a perturbed start as in iNeRF (Yen-Chen et al. 2021, IV-A): off by up to 40 degrees, and 0.2 along each axis.
 
-    The camera turns about a random axis through its own centre, and the offsets are uniform in -0.2 to 0.2.
+    The camera is rotated about a random axis through its own centre by an angle that is uniform in -40 to 40 degrees; the
+    offsets are uniform in -0.2 to 0.2.
     """
     generator = torch.Generator().manual_seed(seed)
     axis = random_units(1, generator)[0]

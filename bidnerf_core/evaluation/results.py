@@ -19,7 +19,7 @@ RESULT_LINES = LineFormat(b'{"T_world_camera": ', "lines as 'bidnerf evaluate' w
 
 
 def key_of(trial: Trial) -> Key:
-    """Return what two trials share exactly where they are one and the same, on any machine."""
+    """Return a key that is equal for two trials if and only if they are the same trial, on any machine."""
     return json.dumps(to_plain(trial.portable), sort_keys=True)
 
 
@@ -42,7 +42,7 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
 
 
 class ResultsFile:
-    """Results that grow. Use as a context; another process that opens the same file meanwhile is refused."""
+    """A file to which results are appended, locked by the process that has it open. Use it as a context manager."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -71,7 +71,7 @@ class ResultsFile:
         self.results[key_of(result.trial)] = result
 
     def put_in_order(self, trials: Sequence[Trial]) -> None:
-        """Write the results of ``trials`` in their order, after everything else the file holds; all at once or not at all."""
+        """Write the results of ``trials`` in their order, after everything else the file holds, in one atomic step."""
         self._file.check_there()
         wanted = [key_of(trial) for trial in trials]
         asked = set(wanted)

@@ -12,7 +12,7 @@ from bidnerf_core.evaluation.summary import NEVER, applies, median, steps_of
 
 @dataclass(frozen=True)
 class PairTest:
-    """Two groups of one situation, compared by one criterion. All p values are two-sided."""
+    """Tests of whether two groups of trials in the same situation differ, by one criterion. All p values are two-sided."""
 
     first: str
     second: str
@@ -33,7 +33,7 @@ def pairwise_tests(groups: Sequence[Group], criterion: str) -> list[PairTest]:
 
 
 def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
-    """Return the tests of two groups by one criterion."""
+    """Test whether two groups differ in success rate or in steps to success, by one criterion."""
     from scipy.stats import fisher_exact, mannwhitneyu  # here: the import takes a second
 
     steps = [steps_of(group.results, criterion) for group in (first, second)]

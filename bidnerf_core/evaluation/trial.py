@@ -42,7 +42,7 @@ class Trial:
 
     @property
     def portable(self) -> Trial:
-        """The same trial with folders' names instead of their paths, which differ from machine to machine."""
+        """Return this trial with the names of folders instead of their paths, which differ from machine to machine."""
         points = None if self.depth_points is None else "/".join(_parts(self.depth_points)[-2:])  # sparse/0
         return replace(self, map=_name(self.map), data=_name(self.data), depth_points=points)
 

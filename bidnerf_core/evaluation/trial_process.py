@@ -36,7 +36,7 @@ class Measured:
 
 
 class TrialProcess:
-    """A process that runs trials one after another and keeps its map in memory. Use as a context: leaving it ends it.
+    """A process that runs trials one after another and keeps its map in memory. Use it as a context manager.
 
     It is a new interpreter that exchanges JSON, not a fork: it shares no memory, and no script needs a guard for it.
     """
@@ -48,7 +48,7 @@ class TrialProcess:
         )  # fmt: skip
 
     def run(self, trial: Trial) -> Measured:
-        """Run a trial. Raises ``InputError`` where the trial is impossible, and where the process ended before its result."""
+        """Run a trial. Raises ``InputError`` if it is impossible, or if the process ends before its result."""
         try:
             _send(self._process.stdin, to_plain(trial))
             line = self._process.stdout.readline() if self._process.stdout else ""

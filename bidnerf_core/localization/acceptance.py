@@ -1,7 +1,7 @@
-"""Acceptance: whether an answer is to be trusted, judged without knowledge of the true pose.
+"""Acceptance: decide whether to trust an answer, without knowledge of the true pose.
 
-Every method's judgement is made here. Diagnostics are measured where the answer was found; thresholds turn them into an
-``Outcome`` and a sentence.
+The answers of all methods are judged here. The code that finds an answer measures its diagnostics; thresholds turn these
+into an ``Outcome`` and a sentence.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from bidnerf_core.se3 import SE3
 WELL_BEFORE = 0.04
 """Share of the extent by which a line of sight must meet the surface too early to count as a violation."""
 SIGHT_LINES = 300
-"""Lines of sight that are traced, at most."""
+"""Largest number of lines of sight that are traced."""
 IMAGE_MARGIN = 0.01
-"""Share of its cost by which the next best answer of a search by images must be worse."""
+"""Least relative difference in cost between the best and the next best answer of a search by images."""
 FLAT = 0.02
-"""Standard deviation of an image's colours, in [0, 1], below which a gain and a bias fit it to any view."""
+"""Standard deviation of an image's colours, in [0, 1], below which a gain and a bias make any view fit it."""
 AMBIGUOUS = Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
 
 
 @dataclass(frozen=True)
 class SurfaceThresholds:
-    """What an answer on the baked surface must show."""
+    """Thresholds for accepting an answer on the baked surface."""
 
     on_surface: float = 0.85  # share of the measured points that lie on the surface, at least
     colour_inliers: float = 0.42  # share that lies there and has its colour, at least
@@ -44,7 +44,7 @@ class SurfaceThresholds:
 
 @dataclass(frozen=True)
 class SurfaceDiagnostics:
-    """What measured points show of a pose; all but the margin are shares between 0 and 1."""
+    """Measures of how well a pose explains the measured points; all but the margin are shares between 0 and 1."""
 
     on_surface: float
     colour_inliers: float
@@ -53,7 +53,7 @@ class SurfaceDiagnostics:
     rendered_inliers: float = 1.0  # where nothing was rendered
 
     def rejection(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict | None:
-        """Return the gravest reason against the pose, or None."""
+        """Return the most serious reason to reject the pose, or None."""
         if self.on_surface < thresholds.on_surface:
             return Verdict(
                 Outcome.OFF_SURFACE, f"only {self.on_surface:.0%} of the measured points lie on the surface"
@@ -77,10 +77,10 @@ class SurfaceDiagnostics:
 
 
 def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDiagnostics:
-    """Measure how the points of ``judge`` lie on the surface from one pose.
+    """Measure how well the points of ``judge`` lie on the surface from one pose.
 
-    Each point counts by how much of an inlier it is, so that no threshold on single points decides. Points without a
-    colour count for the colour inliers only where no point has one.
+    Each point counts by its inlier weight, so no hard threshold on single points is involved. Points without a colour are
+    left out of the colour inliers, unless no point has a colour.
     """
     near, alike = judge.inliers(judge.correspondences(T[None]))
     coloured = judge.cloud.coloured
@@ -91,7 +91,7 @@ def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDia
 
 @dataclass(frozen=True)
 class LandmarkThresholds:
-    """What a pose by landmarks must show. No threshold has a unit: they hold for every scene and every image."""
+    """Thresholds for accepting a pose by landmarks. They have no units, so they suit every scene and image."""
 
     log10_nfa: float = -12.0  # logarithm of the number of such agreements expected by chance, at most
     inliers: int = 15  # correspondences within three standard deviations, at least
@@ -100,7 +100,7 @@ class LandmarkThresholds:
 
 
 def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = LandmarkThresholds()) -> Verdict:
-    """Judge a pose by how many landmarks agree with it, beyond what chance would give, and over how much of the image."""
+    """Judge a pose by how many landmarks agree with it, compared with chance, and how much of the image they cover."""
     share = f"{found.inliers} landmarks agree"
     if found.log10_nfa > thresholds.log10_nfa or found.inliers < thresholds.inliers:
         return Verdict(Outcome.TOO_FEW_MATCHES, f"only {share} ({found.agreeing} of {found.matches} matches)")

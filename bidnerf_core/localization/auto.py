@@ -1,9 +1,9 @@
 """Method ``auto``: find the pose with a start or without one, by whatever was measured, and say whether to trust it.
 
-What it does is decided here and nowhere else. Where the map has landmarks, they propose first, and what they find is fused
-with measured depth and rendered rays. Where they do not convince, the surface searches: where enough depth was measured and the map has a surface, measured points are
-aligned with it; images without depth are compared with renderings of the surface; a map without a surface needs a start, and
-``auto`` then descends as ``bid`` does.
+All its decisions are made here. If the map has landmarks, they are matched first, and their pose is fused with measured
+depth and rendered rays. If that pose is not accepted, the surface is searched: measured points are aligned with it where
+there is enough depth, and otherwise the images are compared with its renderings. A map without a surface needs a start,
+from which ``auto`` descends as ``bid`` does.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import EXPERT, Range, Settings
 
 LEAST_POINTS = 50
-"""Measured pixels below which there is no shape to recognise."""
+"""Least number of measured depths from which the shape of the scene can be recognised."""
 WORSE = 0.05
-"""How much refinement may raise the cost on the surface; a field that asks for more does not show what was baked."""
+"""Largest increase of the cost on the surface by refinement; with more, field and surface contradict each other."""
 MANY_LANDMARKS = 500
-"""Landmarks from which on a scene has texture: an image of it in which none are recognised shows something else."""
+"""With this many landmarks a scene is textured: if an image matches none of them, it shows something else."""
 LOSS_POINTS = 200
-"""Points on which the losses of the path are computed."""
+"""Number of points on which the losses along the path are computed."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ class AutoConfig(Settings):
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
-    """Find the pose by depth where there is enough of it, else by colour, else by descent from a start.
+    """Find the pose by landmarks, else by depth on the surface, else by colour on it, else by descent from a start.
 
-    Raises ``InputError`` where a start is needed, for want of a baked surface, and there is none.
+    Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
     """
     began, answer = time.perf_counter(), None
     if problem.matcher is not None and config.landmarks:
@@ -132,7 +132,7 @@ def _by_points(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
 def _searched(
     problem: Problem, search: PointSearch, config: AutoConfig, generator: Generator
 ) -> SearchResult:
-    """Search in rounds until an answer is acceptable; return the best."""
+    """Search in rounds until an answer is acceptable, and return the best one."""
     answers: list[SearchResult] = []
     while True:
         answers.append(search(problem.start, config.hypotheses, generator))
@@ -148,7 +148,7 @@ def _diagnostics(search: PointSearch, found: SearchResult) -> SurfaceDiagnostics
 def _refined(
     problem: Problem, search: PointSearch, found: SearchResult, config: AutoConfig, generator: Generator
 ) -> tuple[SearchResult, float]:
-    """Return a finer pose, and the share of rendered rays that agree there with what was measured.
+    """Return a refined pose, and the share of rendered rays that agree with the measurements there.
 
     The surface is as coarse as its cells; the field has seen every pixel of the training images.
     """
@@ -170,7 +170,7 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer."""
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
     search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
-    # Over a background, images were rendered and are as bright as the map; others may have been exposed otherwise.
+    # Images with a plain background were rendered and are as bright as the map; photos may have another exposure.
     refinement = replace(config.by_colour.refinement, exposure=not search.has_background)
     by_colour = replace(config.by_colour, refinement=refinement)
     known = Surroundings(SE3.from_matrix(surface.keyframes), surface.extent, torch.zeros(3), search.middle)
@@ -189,7 +189,7 @@ def _has_texture(problem: Problem) -> bool:
 
 
 def _doubted(found: Localization) -> Localization:
-    """Return an answer by whole images as rejected, in a map whose landmarks should have recognised the place."""
+    """Return the answer as rejected: in a map with this many landmarks, some should have matched the image."""
     if not found.converged:
         return found
     why = f"no landmarks were recognised; {found.reason}"

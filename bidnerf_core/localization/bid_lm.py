@@ -33,7 +33,7 @@ ExpertRays = Annotated[int, Range(7, 10**7), EXPERT]
 
 @dataclass(frozen=True)
 class BidLmStages(Settings):
-    """From many poses and few rays at the coarsest level to one pose and many rays in full detail."""
+    """Settings of the stages, from many poses and few rays at the coarsest level to one pose and many rays."""
 
     search_rays: ExpertRays = 128  # for each of the poses about the start
     coarse_poses: Poses = 6  # the best of these, which take steps at the coarsest level

@@ -1,4 +1,4 @@
-"""Poses by colour alone: a search by small images, then second-order steps on rendered rays, then a verdict."""
+"""Poses by colour alone: search with small images, refine with second-order steps on rendered rays, then judge."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from bidnerf_core.settings import EXPERT, Range, Settings
 
 @dataclass(frozen=True)
 class ColourRefinementSettings(Settings):
-    """The last steps on colour alone."""
+    """Settings of the last steps on colour alone."""
 
     # of each pose that the search left, coarsest level
     coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = 4
@@ -49,7 +49,7 @@ class ByColourConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class ColourAnswer:
-    """A search, the refinement of what it found, and what fresh rays show of that."""
+    """The result of a search, its refinement, and the verdict on it."""
 
     search: SearchResult
     refined: RefinementResult
@@ -59,7 +59,7 @@ class ColourAnswer:
 def refine_by_colour(
     problem: Problem, search: SearchResult, config: ByColourConfig, generator: Generator
 ) -> ColourAnswer:
-    """Refine the poses that a search left, on colour alone."""
+    """Refine the poses found by a search, on colour alone, and judge the result."""
     s, scale, sigma = config.steps, config.colour.colour_scale, config.refinement.surface_sigma
     count = len(search.T.translation)
     stages = (
@@ -76,13 +76,13 @@ def localization_of(
 ) -> Localization:
     """Return an answer as a localization.
 
-    The path through the search and over rendered rays is one; it begins at the start where there is one, since choosing a
+    Its path joins those of the search and of the refinement. If there is a start, the path begins there, since choosing a
     hypothesis is part of the first step.
     """
     refined, search = answer.refined, answer.search
     path = [T[i] for T in (search.path[:-1], refined.poses) for i in range(len(T.translation))]
     path[0] = problem.start or path[0]
-    # Neighbouring rays err alike, so that those of a view count for a few independent ones only.
+    # The errors of neighbouring rays are correlated, so the rays of a view count as a few independent ones only.
     covariance = refined.covariance * max(1.0, config.steps.fine_rays / (INDEPENDENT * len(problem.views)))
     return Localization(
         T_world_camera=refined.T.normalized(),

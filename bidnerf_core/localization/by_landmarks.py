@@ -1,4 +1,4 @@
-"""Poses by landmarks: features of the query matched with the map's, fused with measured depth and with rendered rays."""
+"""Poses by landmarks: match the query's features with the map's, then fuse with measured depth and rendered rays."""
 
 from __future__ import annotations
 
@@ -31,32 +31,33 @@ from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.se3 import SE3
 
 POINTS = 2000
-"""Measured points that are fused, at most."""
+"""Largest number of measured points that are fused."""
 SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
-"""How many independent measurements the points on the surface and the rendered rays of a view count for beside landmarks."""
+"""Numbers of independent measurements that a view's points on the surface and its rendered rays count as."""
 FUSION_STEPS = 6
-"""Second-order steps on the sum of all terms."""
+"""Number of second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
 INFLATION = 3.0
-"""Factor on the covariance of a pose by landmarks. It counts errors of keypoints and of the map's own poses as independent,
-which within an image they are not; set by the normalised errors of a fifth of the test images of four scenes.
+"""Factor on the covariance of a pose by landmarks, which treats the errors of keypoints and of the map's poses as
+independent, although they are correlated within an image. It was set by the normalised errors of a fifth of the test images
+of four scenes.
 """
 FOCAL_OFF, FOCAL_NOISE = 0.035, 1.5
-"""Logarithm of a focal length's estimated factor, and ratio of reprojection noise with the given to that with the estimated
-one, beyond which the given focal length is taken to be wrong.
+"""Limits beyond which the given focal length is taken to be wrong: the logarithm of the estimated factor, and the ratio of
+the reprojection noise with the given focal length to that with the estimated one.
 """
 FOCAL_PRIOR, FOCAL_ESTIMATED = 0.003, 0.01
-"""Standard deviations, as a share of it, of a calibrated focal length and of one that was estimated along: its random error
-is in the fit's own covariance, but errors of lens and landmarks bias it by a percent or more.
+"""Relative standard deviations of a calibrated focal length and of one that was estimated with the pose. The random error of
+the latter is part of the fit's covariance, but errors of the lens model and the landmarks bias it by a percent or more.
 """
 DEPTH_SCALE_PRIOR = 0.02
-"""Standard deviation of a depth sensor's scale."""
+"""Relative standard deviation of a depth sensor's scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class FusedTerm:
-    """A cost with the variance of its residuals, so that terms of different units can be added."""
+    """A cost with the variance of its residuals, so that costs in different units can be added."""
 
     cost: Cost
     variance: float
@@ -69,7 +70,7 @@ class FusedTerm:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkAnswer:
-    """What landmarks found, and the pose after it was fused with what else was measured."""
+    """A pose by landmarks, and the pose after fusing it with the other measurements."""
 
     found: LandmarkPose
     T: SE3
@@ -80,9 +81,9 @@ class LandmarkAnswer:
 def answer_by_landmarks(
     problem: Problem, matcher: LandmarkMatcher, rays: int, seed: int
 ) -> LandmarkAnswer | None:
-    """Find the pose by landmarks and refine it on all terms at once. Returns None where too few features match.
+    """Find the pose by landmarks and refine it on all terms at once. Returns None if too few features match.
 
-    ``rays``: rendered for the refinement; 0: none.
+    ``rays`` is the number of rays rendered for the refinement; 0 leaves rendering out.
     """
     found = _found(problem, matcher, seed)
     if found is None:
@@ -99,7 +100,7 @@ def answer_by_landmarks(
 
 
 def _found(problem: Problem, matcher: LandmarkMatcher, seed: int) -> LandmarkPose | None:
-    """Find the pose with the given focal length; with a free one where that is nominal, or where it does not fit."""
+    """Find the pose with the given focal length, or estimate the focal length if it is only nominal or does not fit."""
     views = problem.views
     if len(views) == 1 and views[0].frame.focal_is_approximate:
         return propose(matcher, views, seed=seed, unknown_focal=True)
@@ -113,7 +114,7 @@ def _found(problem: Problem, matcher: LandmarkMatcher, seed: int) -> LandmarkPos
 
 
 def _pose_covariance(found: LandmarkPose) -> Float[Tensor, "6 6"]:
-    """Return the covariance of a pose by landmarks with what the calibration contributes, by a prior on the focal length."""
+    """Return the covariance of a pose by landmarks, including the uncertainty of the focal length."""
     covariance = INFLATION * found.map_covariance
     if found.focal_check is None:
         return covariance
@@ -127,7 +128,7 @@ def _is_sharp(problem: Problem) -> bool:
 
 
 def _surface_term(problem: Problem, found: LandmarkPose, generator: Generator) -> FusedTerm:
-    """Return the term of measured points on the surface, at the depth scale that landmarks and prior agree on."""
+    """Return the term of measured points on the surface, after correcting the scale of measured depth."""
     assert problem.surface is not None
     cloud = PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator)
     cloud = replace(cloud, points=cloud.origins + _depth_scale(found) * (cloud.points - cloud.origins))
@@ -138,17 +139,17 @@ def _surface_term(problem: Problem, found: LandmarkPose, generator: Generator) -
 
 
 def _depth_scale(found: LandmarkPose) -> float:
-    """Return the factor on measured depth: the landmarks' where they tell it, drawn to 1 by the prior."""
+    """Return the factor on measured depth that landmarks give, shrunk towards 1 by the prior; 1 if they give none."""
     if found.depth_scale is None:
         return 1.0
-    # The median of the ratios of a few landmarks' depths is about this certain.
+    # This is about the variance of a median over a few landmarks.
     variance = 0.01**2
     weight = DEPTH_SCALE_PRIOR**2 / (DEPTH_SCALE_PRIOR**2 + variance)
     return 1 + weight * (found.depth_scale - 1)
 
 
 def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator) -> FusedTerm:
-    """Return the term of what the field renders against what was photographed."""
+    """Return the term that compares rendered rays with the images."""
     cell = 0.01 if problem.surface is None else problem.surface.cell
     stage = RefinementStage(FUSION_STEPS, rays, depth_scale=6 * cell)
     depth = DepthSettings() if problem.has_depth else None
@@ -162,10 +163,10 @@ def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generat
 
 
 def _fused(found: LandmarkPose, terms: dict[str, FusedTerm], about: Pivot) -> LandmarkAnswer:
-    """Take steps on the sum of the terms.
+    """Minimize the sum of the landmarks' Gaussian prior and the other terms, and return the fused pose.
 
-    The covariance counts the additional terms as ``INDEPENDENT`` measurements only: their errors are alike over large parts
-    of an image, and are not those of the steps' residuals.
+    The covariance counts each additional term as only ``INDEPENDENT`` measurements, because its errors are correlated over
+    large parts of an image.
     """
     covariance = _pose_covariance(found)
     if not terms:

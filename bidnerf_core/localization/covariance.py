@@ -1,4 +1,4 @@
-"""How certain a pose is: covariances of a right update at the camera, translation (metres) before rotation (radians)."""
+"""Covariances of poses: right updates at the camera, translation (metres) before rotation (radians)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from bidnerf_core.localization.costs.surface import PointScales, SurfaceCost
 from bidnerf_core.se3 import SE3
 
 INDEPENDENT = 10
-"""Independent measurements in an image. Errors of a map and of a sensor are alike over large parts of an image, so that its
-thousands of pixels count for few; set by the normalised errors on several maps and sensors: rendered images are more certain
-than this, those of a hand-held Kinect less.
+"""Number of independent measurements in an image. The errors of a map and of a sensor are correlated over large parts of an
+image, so its thousands of pixels count as few. The number was set by the normalised errors on several maps and sensors. It
+is pessimistic for rendered images, and optimistic for those of a hand-held Kinect.
 """
 LEAST_VARIANCE = 1e-9
-"""Variance of a residual, in units of its scale, below which there is only rounding."""
+"""Lower limit of the variance of residuals, in units of their scale; below it there are only rounding errors."""
 FINEST = 2.0
 """Scale of distances at the end of a search, in cells of the surface's grid."""
 
@@ -27,10 +27,10 @@ def sandwich_covariance(
 ) -> Float[Tensor, "h 6 6"]:
     """Return ``H^-1 (sum_r s_r s_r^T) H^-1`` with the score ``s_r`` of each ray (Huber 1967).
 
-    The residuals themselves tell how noisy each kind of measurement is, and the channels of one ray may err together.
-    Infinite where the rays do not determine the pose.
+    The noise of each kind of measurement is estimated from the residuals themselves, and the channels of one ray may be
+    correlated. The covariance is infinite if the rays do not determine the pose.
     """
-    scores = scores - scores.mean(1, keepdim=True)  # the slope that is left is not noise
+    scores = scores - scores.mean(1, keepdim=True)  # the remaining mean gradient is not noise
     used = int((scores != 0).any(-1).any(0).sum())
     if used <= 6:
         return torch.full_like(hessian, torch.inf)
@@ -47,8 +47,8 @@ def sandwich_covariance(
 def surface_covariance(cost: SurfaceCost, T: SE3, views: int = 1) -> Float[Tensor, "6 6"]:
     """Return the covariance of a pose that aligns measured points with the surface; positive definite.
 
-    It is the inverse of the normal equations over the variance of the residuals. What the points do not determine, such as
-    the way along a bare wall, has the size of the scene and half a turn.
+    It is the inverse of the Hessian divided by the variance of the residuals. Directions that the points do not determine,
+    such as the way along a bare wall, have the size of the scene or half a turn as standard deviation.
     """
     finest = PointScales(FINEST * cost.surface.cell)
     cost = SurfaceCost(cost.surface, cost.cloud, finest)

@@ -1,4 +1,4 @@
-"""How much brighter an image is than the map: a gain and a bias for each colour channel."""
+"""The exposure of an image relative to the map: a gain and a bias for each colour channel."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def fit_exposure(
 ) -> Exposure:
     """Return the gain and the bias of weighted least squares with Gaussian priors about 1 and 0.
 
-    A precision is the inverse variance of its prior, in the unit of ``weights``: what a channel of a single colour cannot
-    tell, the prior decides.
+    A precision is the inverse variance of its prior, in the unit of ``weights``. The prior decides where the data do not,
+    as in a channel that is constant over the image.
     """
     off = measured - rendered
     total = weights.sum(-1).expand(rendered.shape[:2]) + bias_precision
     mean, square = (weights * rendered).sum(-1), (weights * rendered**2).sum(-1) + gain_precision
     shift, grow = (weights * off).sum(-1), (weights * rendered * off).sum(-1)
-    # Of no weight at all: no correction.
+    # If all weights are 0, there is no correction.
     determinant = (total * square - mean**2).clamp(min=torch.finfo(rendered.dtype).tiny)
     gain = 1 + (total * grow - mean * shift) / determinant
     return Exposure(gain, (square * shift - mean * grow) / determinant)

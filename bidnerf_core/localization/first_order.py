@@ -1,4 +1,4 @@
-"""Methods that follow Adam down the loss of sampled rays: what ``bid`` and ``inerf`` are settings of."""
+"""First-order methods: Adam on the loss of sampled rays, of which ``bid`` and ``inerf`` are two configurations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from bidnerf_core.settings import EXPERT, Above, Count, Settings
 
 @dataclass(frozen=True)
 class DescentSettings(Settings):
-    """The rays of a step."""
+    """Settings of the rays of a step, and of the frame of updates."""
 
     rays: Count = 2048  # in all, shared out equally among the views
     level: int | None = None  # of the field: 0 is the coarsest, None the field itself
@@ -40,7 +40,7 @@ def descended(
     problem: Problem, rays: DescentSettings, adam: AdamSettings, objective: Objective, depth_rays: int, seed: int,
     method: str,
 ) -> Localization:  # fmt: skip
-    """Follow Adam from ``problem.start`` (Alg. 1)."""
+    """Descend with Adam from ``problem.start`` (Alg. 1) and judge the answer."""
     began = time.perf_counter()
     start, generator = problem.start_for(method), torch.Generator().manual_seed(seed)
     counts = RayCounts(rays.rays, depth_rays)

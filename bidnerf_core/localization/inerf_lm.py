@@ -31,7 +31,7 @@ StepCount = Annotated[int, Range(1, 10**5), EXPERT]
 
 @dataclass(frozen=True)
 class ImageSearchSettings(Settings):
-    """Small renderings of the poses about the start, ever larger and of ever fewer."""
+    """Settings of the search with small renderings, which become larger as poses become fewer."""
 
     search_poses: StepCount = 24  # the best of the poses, which take steps on small renderings
     search_steps: StepCount = 8  # that each of them takes

@@ -1,4 +1,4 @@
-"""``Localizer``: a map made ready once, then called with frames."""
+"""``Localizer``: prepares a map once, and is then called with frames."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Localizer:
 
     @torch.no_grad()
     def _warm_up(self) -> None:
-        """Render some rays and compute what a surface derives once: threads, caches and lazy modules are then ready."""
+        """Render some rays and fill the caches of the surface, so that lazy initialisation does not delay the first call."""
         bounds, field = self.map.bounds, self.map.field
         device = next((p.device for p in getattr(field, "parameters", list)()), torch.device("cpu"))
         middle = torch.tensor([bounds.lower, bounds.upper], device=device).mean(0)

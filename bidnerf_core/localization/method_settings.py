@@ -1,4 +1,4 @@
-"""Groups of settings that methods share, and the stages of coarse-to-fine methods."""
+"""Groups of settings that several methods share, and the stages of coarse-to-fine methods."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Posi
 
 @dataclass(frozen=True)
 class ColourSettings(Settings):
-    """The photometric term."""
+    """Settings of the photometric term."""
 
     colour_loss: RobustName = "huber"  # robust loss of colour differences
     colour_scale: Positive = 0.1  # colour difference, in [0, 1], at which outliers begin
@@ -32,7 +32,7 @@ class ColourSettings(Settings):
 
 @dataclass(frozen=True)
 class DepthSettings(Settings):
-    """The depth term, where depth was measured."""
+    """Settings of the depth term, which applies where depth was measured."""
 
     depth_weight: NotNegative = 1.0  # lambda_d, beside the photometric term's 1
     depth_loss: RobustName = "huber"  # robust loss of depth differences
@@ -49,9 +49,9 @@ def objective_of(
     depth_scale: float | None = None,
     miss_scales: float | None = None,
 ) -> Objective:
-    """Return the objective of some settings; scales in place of theirs are those of a stage.
+    """Return the objective that the settings describe; a stage may replace their scales by its own.
 
-    ``miss_scales``: what the depth residual of a ray is that meets nothing, in depth scales; None: the paper's.
+    ``miss_scales`` is the depth residual, in depth scales, of a ray that meets nothing; None stands for the paper's.
     """
     terms = [colour_term(colour.robust(colour_scale))]
     if depth is not None and (depth.depth_weight > 0 or depth.free_space_weight > 0):
@@ -66,7 +66,7 @@ def objective_of(
 
 @dataclass(frozen=True)
 class AdamSettings(Settings):
-    """Adam's steps, and when they end."""
+    """Settings of Adam's steps and of when they end."""
 
     max_steps: Count = 200  # at most
     learning_rate: Annotated[float, Above(0.0, 1e3)] = 0.01  # metres and radians a step, at first
@@ -83,7 +83,7 @@ class AdamSettings(Settings):
 
 @dataclass(frozen=True)
 class SpreadSettings(Settings):
-    """Poses about the start that are tried beside it."""
+    """Settings of the poses near the start that are tried as well."""
 
     poses: Annotated[int, Range(1, 10**5)] = 32  # how many, the start among them; 1: the start alone
     spread_translation: NotNegative = 0.3  # standard deviation along each axis of the camera, metres
@@ -92,7 +92,7 @@ class SpreadSettings(Settings):
 
 @dataclass(frozen=True)
 class RefinementSettings(Settings):
-    """Second-order steps on rendered rays."""
+    """Settings of second-order steps on rendered rays."""
 
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
     # what an update turns about: middle of the scene, camera, world
@@ -107,7 +107,7 @@ class RefinementSettings(Settings):
 
 @dataclass(frozen=True)
 class RenderedThresholds(Settings):
-    """What fresh rendered rays must show for an answer to be accepted."""
+    """Thresholds for accepting an answer, measured on fresh rendered rays."""
 
     converged_inliers: NotNegative = 0.93  # share of the rays that render what was measured, at least
     converged_step: NotNegative = 0.02  # length of the step that they ask for, at most (metres, radians)
@@ -115,7 +115,7 @@ class RenderedThresholds(Settings):
 
 @dataclass(frozen=True)
 class RefinementStage:
-    """Some steps at one level of detail on one draw of rays; without steps, poses are only ranked."""
+    """A stage of refinement: steps at one level of detail on one draw of rays; without steps, poses are only ranked."""
 
     steps: int
     rays: int  # a pose

@@ -1,4 +1,4 @@
-"""Methods by name."""
+"""The table of methods, by name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bidnerf_core.settings import from_flat
 
 @dataclass(frozen=True)
 class Method:
-    """A way to find a pose, and the frozen dataclass of its settings."""
+    """A localization method: its function, the frozen dataclass of its settings, and whether it needs a start."""
 
     run: Callable[[Problem, Any, int], Localization]
     config_type: type
@@ -42,7 +42,7 @@ METHODS = {
 }
 
 RENAMED = {"play": "surface_sigma"}
-"""Settings that earlier versions stored under other names."""
+"""Current names of settings, by the names under which earlier versions stored them."""
 
 
 def find_method(name: str) -> Method:

@@ -1,4 +1,4 @@
-"""A cost of poses and its quadratic model: what costs compute and solvers use."""
+"""The costs of poses and their quadratic models, which costs compute and solvers use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf_core.se3 import SE3
 
 ROUNDING = 1e-9
-"""Damping that is always added, so that a direction to which the cost is blind can be solved for; the step is 0 along it."""
+"""Damping that is always added; along a direction on which the cost does not depend, the step is then 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class NormalEquations:
 
 @runtime_checkable
 class Cost(Protocol):
-    """How badly each of a batch of poses explains what was measured."""
+    """Computes how badly each pose of a batch explains the measurements, with the normal equations of that cost."""
 
     def __call__(self, T: SE3) -> NormalEquations: ...
 
@@ -68,7 +68,7 @@ class Sum:
 
 @dataclass(frozen=True)
 class Scaled:
-    """A cost times a constant: its weight beside others."""
+    """A cost multiplied by a constant, its weight relative to others."""
 
     cost: Cost
     factor: float

@@ -1,4 +1,4 @@
-"""Pivots: the frame in which updates of a pose are written, and about which they turn."""
+"""Pivots: the frames in which pose updates are expressed, and about whose origins they rotate."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ PivotName = Literal["scene", "camera", "world"]
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """A point fixed to the camera, or the world's origin."""
+    """The point about which updates rotate: one fixed to the camera, or the world's origin."""
 
     T_camera_pivot: SE3 | None  # a translation; None: the world's own frame
 
     @staticmethod
     def at_point(point: Float[Tensor, "3"]) -> Pivot:
-        """Return the pivot at a point of the camera's frame, metres."""
+        """Return the pivot at a point given in the camera's frame, metres."""
         return Pivot(SE3(torch.eye(3, dtype=torch.float64), point.to("cpu", torch.float64)))
 
     @property
     def reach(self) -> float:
-        """Metres by which a turn of one radian moves the camera, at least 1.
+        """Distance (metres) by which a rotation of one radian moves the camera, but at least 1.
 
-        It balances steps of translation and of rotation; in the world's frame iNeRF does not balance them.
+        It balances steps of translation and rotation. In the world's frame it is 1, since iNeRF does not balance them.
         """
         return 1.0 if self.T_camera_pivot is None else max(1.0, float(self.T_camera_pivot.translation.norm()))
 
     def moved(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Return ``T``, one pose or a batch, after the update ``delta``; differentiable in it."""
+        """Return ``T``, one pose or a batch, after the update ``delta``; differentiable with respect to ``delta``."""
         if self.T_camera_pivot is None:
             return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
 
     def at(self, T: SE3) -> SE3:
-        """Return T_world_pivot, in which ``moved`` makes a right update, for poses with any leading axes."""
+        """Return T_world_pivot, of which ``moved`` is a right update, for poses with any leading axes."""
         return T @ (T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot)
 
     def at_camera(self, T: SE3, covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
@@ -51,15 +51,16 @@ class Pivot:
         return carried @ covariance @ carried.mT
 
     def update_at_camera(self, T: SE3) -> Float[Tensor, "*h 6 6"]:
-        """Return the matrix that converts an update at the pivot to the right update of ``T`` that moves it alike."""
+        """Return the matrix that converts an update at the pivot to the equivalent right update of ``T``."""
         return (T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot).adjoint()
 
 
 def pivot(name: PivotName, problem: Problem) -> Pivot:
     """Return a pivot by name: the camera (the paper's), the world's origin (iNeRF's), or the middle of what is seen.
 
-    To a camera some metres away a turn and a sideways motion look almost alike: in its own frame the objective is a long
-    narrow valley, along which first-order steps crawl. About the middle of what the camera sees, the two separate.
+    For a scene some metres away, rotating the camera and moving it sideways change the image in almost the same way. In the
+    camera's frame the objective is therefore a long narrow valley, in which first-order steps are slow. About the middle of
+    what the camera sees, the two motions decouple.
     """
     if name == "world":
         return Pivot(None)

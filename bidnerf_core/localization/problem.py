@@ -1,4 +1,4 @@
-"""The localization problem: images with known relative poses in a map, and what is known of the pose sought."""
+"""The localization problem: images with known relative poses, a map, and what is known about the pose to find."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _Item = TypeVar("_Item")
 
 @runtime_checkable
 class SceneMap(Protocol):
-    """What a localization needs of a map; ``bidnerf_core.Map`` is one."""
+    """The parts of a map that localization uses; ``bidnerf_core.Map`` has them."""
 
     @property
     def field(self) -> RadianceField: ...
@@ -35,7 +35,7 @@ class SceneMap(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """K images with known relative poses in a map; the pose sought is that of the last image's camera.
+    """K images with known relative poses in a map; the pose to find is that of the last image's camera.
 
     ``views[i].T_ref_camera`` is T_K_i, camera i in the frame of the last camera K, so the last view's is the identity.
     """
@@ -59,7 +59,7 @@ class Problem:
                 raise InputError(f"pose of {what} is not a rigid transform: {pose.matrix().tolist()}")
 
     def start_for(self, method: str) -> SE3:
-        """Return the start. Raises ``InputError`` where there is none, for a method that cannot do without."""
+        """Return the start. Raises ``InputError``, which names ``method``, if there is none."""
         if self.start is None:
             raise InputError(f"method {method!r} needs a start; give one, or take method 'auto'")
         return self.start
@@ -88,11 +88,11 @@ class Problem:
 
     @property
     def exposure_varies(self) -> bool:
-        """Whether images may be exposed otherwise than the map: those of cameras, not those rendered over a background."""
+        """Whether the images may have another exposure than the map: photos may, images with an alpha channel do not."""
         return all(view.frame.alpha is None for view in self.views)
 
     def without_depth(self) -> Problem:
-        """Return the problem with colours alone."""
+        """Return the problem without measured depth."""
         views = tuple(replace(view, frame=replace(view.frame, depth=None)) for view in self.views)
         return replace(self, views=views, depth_rays=None)
 

@@ -1,7 +1,7 @@
 """Second-order refinement on rendered rays, for any differentiable field, from coarse to fine.
 
-Within a stage the rays stay the same, so that a step which does not lower the cost can be recognised and taken back; each
-stage draws its own. Poses are a batch axis: several are refined at once, and each stage goes on with the best of them.
+Each stage draws rays once and keeps them, so that a step that does not lower the cost can be detected and undone. Poses form
+a batch axis: several are refined at once, and each stage continues with the best of them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class RefinementResult:
-    """The best pose, and what rays show of it that it was not fitted to."""
+    """The best pose, and its assessment on rays to which it was not fitted."""
 
     T: SE3
     loss: float  # by the measure of the last stage
@@ -35,7 +35,7 @@ class RefinementResult:
     covariance: Float[
         Tensor, "6 6"
     ]  # of a right update at the camera: translation (metres), rotation (radians)
-    step: float  # length of the step that these rays ask for (metres, radians)
+    step: float  # length of the Gauss-Newton step on these rays (metres, radians)
     poses: SE3  # (steps + 1): the first pose given, then the best one after each step
     losses: Float[Tensor, "s"]  # before each step
     contrast: float = math.inf  # standard deviation of the measured colours, in [0, 1]; infinite with depth
@@ -48,9 +48,9 @@ def refine(
     settings: RenderedCostSettings,
     generator: Generator,
 ) -> RefinementResult:
-    """Refine poses (h), of which each stage takes the best; ``problem.start`` plays no part.
+    """Refine poses (h), of which each stage keeps the best; ``problem.start`` is not used.
 
-    The answer is the best of the last two stages' poses on rays that neither was fitted to.
+    The answer is the better of the last two stages' poses, compared on rays to which neither was fitted.
     """
     about = pivot(settings.refinement.pivot, replace(problem, start=start[0]))
     history = History([start[0]])
@@ -67,7 +67,7 @@ def refine(
 
 @dataclass(frozen=True, eq=False)
 class FewSteps:
-    """Where a few steps from a pose led."""
+    """The result of ``take_few_steps``."""
 
     poses: SE3  # (s + 1)
     inliers: float  # share of the rays that render what was measured from the last of them
@@ -78,8 +78,8 @@ def take_few_steps(
 ) -> FewSteps:
     """Take up to ``stage.steps`` second-order steps from one pose that is nearly right, on one draw of rays.
 
-    It ends before a step that does not lower the cost. The last pose is assessed on the same rays and without derivatives,
-    at half of what ``refine`` costs.
+    It stops before a step that would not lower the cost. The last pose is assessed on the same rays and without derivatives,
+    which costs half as much as ``refine``.
     """
     about = pivot(settings.refinement.pivot, replace(problem, start=start))
     cost = settings.drawn(problem, stage, about, generator)
@@ -130,7 +130,7 @@ def _assessed(cost: RenderedCost, T: SE3, history: History) -> RefinementResult:
 
 
 def _contrast(cost: RenderedCost) -> float:
-    """Return the largest standard deviation of a measured colour channel, where nothing but colour was measured."""
+    """Return the largest standard deviation of a measured colour channel; infinite if depth was measured too."""
     weights, rgb = cost.rays.weights, cost.rays.observed.rgb
     if bool((weights[:, 3:] > 0).any()):
         return math.inf

@@ -1,4 +1,4 @@
-"""The answer of a localization, whatever the method."""
+"""The result of a localization, common to all methods."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bidnerf_core.se3 import SE3
 
 
 class Outcome(StrEnum):
-    """Why a pose is accepted or rejected. Only ``CONVERGED`` accepts it."""
+    """The reason why a pose is accepted or rejected; only ``CONVERGED`` means accepted."""
 
     CONVERGED = "converged"
     AMBIGUOUS = "ambiguous"  # another pose explains the measurements about as well
@@ -56,9 +56,9 @@ class Localization:
     method: str
     poses: SE3  # (steps + 1): the start or the winning hypothesis, then the pose after each step
     losses: Float[Tensor, "s"]  # at the start and before each further step
-    # Of a right update at the camera: translation in metres first, then rotation in radians. None where unknown.
+    # Covariance of a right update at the camera: translation (metres) before rotation (radians). None if unknown.
     covariance: Float[Tensor, "6 6"] | None = None
-    focal_factor: float = 1.0  # true focal length over the given one, where it was estimated along
+    focal_factor: float = 1.0  # true over given focal length; 1 if it was not estimated
 
     @property
     def converged(self) -> bool:
@@ -66,7 +66,10 @@ class Localization:
         return self.outcome is Outcome.CONVERGED
 
     def plain(self) -> dict[str, Any]:
-        """Return the answer as JSON can hold it, with the keys of ``bidnerf localize --json``; not finite numbers as None."""
+        """Return the result as JSON values, with the keys of ``bidnerf localize --json``.
+
+        Numbers that are not finite are None.
+        """
         finite = bool(self.T_world_camera.matrix().isfinite().all())
         return {
             "T_world_camera": self.T_world_camera.matrix().tolist() if finite else None,
@@ -82,5 +85,5 @@ class Localization:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write ``plain()`` as a JSON file, whole or not at all. ``localize --start`` reads it back as a start."""
+        """Write ``plain()`` to a JSON file atomically. ``localize --start`` reads it back as a start."""
         write_file(Path(path), (json.dumps(self.plain(), indent=1, allow_nan=False) + "\n").encode())

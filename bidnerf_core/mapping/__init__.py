@@ -1,4 +1,4 @@
-"""What is baked beside a field: its surface, as surfels with a grid that finds the nearest one in constant time."""
+"""Data baked from a field and its images: the surface, as surfels in a grid, and landmarks, as points with descriptors."""
 
 from bidnerf_core.mapping.baking import BakeConfig, bake
 from bidnerf_core.mapping.surface_map import SurfaceMap

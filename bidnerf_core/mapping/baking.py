@@ -23,7 +23,7 @@ from bidnerf_core.settings import Above, Range, Settings
 from bidnerf_core.voxel_grid import VoxelGrid
 
 WITNESSES = 8
-"""How many other views each point is compared with, at most."""
+"""Largest number of other views with which each point is compared."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ def bake(
 ) -> SurfaceMap:
     """Return the surface that the measured depth of ``views`` and depth rendered from ``cameras`` (T_world_camera) agree on.
 
-    Points that several of these images agree on are kept, fused_surfels into surfels and indexed by a grid. Measured depth is closer
-    to the truth than a field that was trained on it, so rendered depth is meant for where none was measured. Raises
-    ``InputError`` where there is no image or no point that they agree on.
+    Points on which several of these images agree are kept, fused into surfels and indexed by a grid. Measured depth is more
+    accurate than a field that was trained on it, so render depth only where none was measured. Raises ``InputError`` if
+    there is no image, or no point on which they agree.
     """
     total = len(views) + len(cameras)
     if not total:

@@ -1,6 +1,6 @@
-"""Keypoints of an image: where they are, and descriptors by which they are found again in another image.
+"""Keypoints of an image and their descriptors, by which they are matched with other images.
 
-A ``Features`` is the seam: any detector, a learned one included, that turns an image into ``Keypoints``.
+Any detector that turns an image into ``Keypoints``, a learned one included, can serve as ``Features``.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 
 NORM = 512.0
-"""Length of a quantised descriptor (Lowe 2004, section 6.1, scales SIFT so, which uses the range of a byte well)."""
+"""Length of a quantised descriptor, as is customary for SIFT: it makes good use of the range of a byte."""
 FIRST_CENTRE = 0.5
-"""OpenCV puts the centre of the first pixel at (0, 0), we put it at (0.5, 0.5)."""
+"""Offset from OpenCV's pixel coordinates to ours: the centre of the first pixel is (0, 0) there, (0.5, 0.5) here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Keypoints:
     """Keypoints of one image. Descriptors are compared by Euclidean distance."""
 
     pixels: Float[Tensor, "n 2"]  # (u, v), the centre of the first pixel at (0.5, 0.5)
-    sizes: Float[Tensor, "n"]  # pixels: diameter of the region that the descriptor describes the middle of
+    sizes: Float[Tensor, "n"]  # pixels: diameter of the keypoint's neighbourhood, as OpenCV defines it
     descriptors: UInt8[Tensor, "n d"]
 
     def __len__(self) -> int:
@@ -39,9 +39,9 @@ class Keypoints:
 
 @runtime_checkable
 class Features(Protocol):
-    """Detects and describes keypoints; the number of a descriptor's channels is always the same.
+    """Detects and describes keypoints; all its descriptors must have the same number of channels.
 
-    It must be callable from several threads at once. ``quantized`` turns float descriptors into bytes.
+    It must be safe to call from several threads at once. ``quantized`` turns float descriptors into bytes.
     """
 
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints: ...
@@ -51,10 +51,8 @@ class Features(Protocol):
 class Sift:
     """SIFT (Lowe 2004) by OpenCV, with the root normalisation of Arandjelovic and Zisserman 2012."""
 
-    count: int = 2000  # keypoints, at most: those of highest contrast
-    contrast: float = (
-        0.01  # under which an extremum is no keypoint; OpenCV's default of 0.04 leaves few indoors
-    )
+    count: int = 2000  # largest number of keypoints: those of highest contrast are kept
+    contrast: float = 0.01  # least contrast of a keypoint; OpenCV's default of 0.04 leaves few indoors
 
     # Pixels along the longer side above which an image is reduced first: a phone's twelve megapixels hold no more
     # keypoints of the sizes that maps are made of, and take half a minute.
@@ -85,13 +83,13 @@ class Sift:
 
 
 def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Square roots of the shares of each non-negative channel; of unit length, and Euclidean distance is Hellinger's."""
+    """Return the square roots of L1-normalised, non-negative descriptors; their Euclidean distance is the Hellinger one."""
     total = descriptors.sum(-1, keepdim=True).clamp(min=torch.finfo(descriptors.dtype).tiny)
     return (descriptors / total).sqrt()
 
 
 def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
-    """Descriptors of unit length as bytes; those with negative channels are shifted, which keeps distances."""
+    """Return descriptors of unit length as bytes; if any channel is negative, all are shifted, which keeps distances."""
     negative = len(descriptors) > 0 and float(descriptors.min()) < 0
     scaled = descriptors * (NORM / 2 if negative else NORM) + (128 if negative else 0)
     return scaled.round().clamp(0, 255).to(torch.uint8)
@@ -100,7 +98,7 @@ def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
 def squared_distances(
     a: UInt8[Tensor, "n d"] | Float[Tensor, "n d"], b: UInt8[Tensor, "m d"] | Float[Tensor, "m d"]
 ) -> Float[Tensor, "n m"]:
-    """Squared Euclidean distances between all pairs; exact for bytes, whose sums of squares a float32 holds."""
+    """Return squared Euclidean distances between all pairs; exact for bytes, whose sums of squares fit a float32."""
     x, y = a.float(), b.float()
     return torch.addmm((x * x).sum(-1)[:, None] + (y * y).sum(-1), x, y.T, alpha=-2).clamp_(min=0)
 
@@ -111,7 +109,7 @@ def paired_squared_distances(
     rows: Int[Tensor, "p"],
     columns: Int[Tensor, "p"],
 ) -> Float[Tensor, "p"]:
-    """Squared Euclidean distances of the pairs ``a[rows]`` and ``b[columns]`` alone."""
+    """Return the squared Euclidean distance of each pair ``a[rows]``, ``b[columns]``."""
     return (a[rows].float() - b[columns].float()).square_().sum(-1)
 
 

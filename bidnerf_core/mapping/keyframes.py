@@ -1,4 +1,4 @@
-"""Keyframes: images that a field renders from known places, and how well it renders those that it was trained on."""
+"""Keyframes: images that a field renders from known poses, and how well it reproduces its training images."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Camera = tuple[Intrinsics, SE3]
 """Intrinsics and T_world_camera."""
 
 KEYFRAME_SIDE = 400
-"""Pixels along the longer side of a rendered keyframe, at most."""
+"""Largest number of pixels along the longer side of a rendered keyframe."""
 MOST = 100
-"""Keyframes that are rendered, at most: evenly many of the cameras."""
+"""Largest number of keyframes that are rendered, from cameras at regular intervals."""
 NOISE_RAYS = 4096
 """Rays on which the colour noise is measured."""
 

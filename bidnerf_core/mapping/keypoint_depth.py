@@ -1,4 +1,4 @@
-"""Points placed by the depth that was measured at their keypoints."""
+"""Placing points by the depth that was measured at their keypoints."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
 
 EDGE = 0.05
-"""Share of the depth by which it may change about a keypoint; with more, it lies on the edge of something."""
+"""Largest relative change of the depth around a keypoint; more indicates a depth edge."""
 HEARD = 6
-"""Pixels of the nine about a keypoint that must have measured depth."""
+"""Least number of the nine pixels around a keypoint that must have measured depth."""
 DEFAULT_NOISE = 0.01
-"""Share of the depth: its standard deviation where nothing tells of it."""
+"""Relative standard deviation of depth that is assumed if it cannot be estimated."""
 ENOUGH_DEPTHS = 30
-"""Triangulated observations with depth from which on its noise is estimated."""
+"""Least number of triangulated observations with depth from which the depth noise is estimated."""
 EDGE_APART = 3.0
-"""Standard deviations from the mean of its track beyond which a depth does not count."""
+"""A depth farther from the mean of its track than this many standard deviations is an outlier."""
 
 
 def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Median of the depth of the 3x3 pixels about each of ``pixels`` (u, v), metres; 0 at edges and where too little was
-    measured.
+    """Return the median depth (metres) of the 3x3 pixels around each of ``pixels`` (u, v).
+
+    It is 0 at depth edges and where too few of the pixels have measured depth.
     """
     if frame.depth is None or not len(pixels):
         return torch.zeros(len(pixels), dtype=torch.float64)
@@ -45,7 +46,7 @@ def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, 
 
 
 def depth_noise(sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]) -> float:
-    """Standard deviation of measured depth as a share of it, robustly, from points that were triangulated."""
+    """Return a robust relative standard deviation of measured depth, by comparison with triangulated points."""
     known = depth > 0
     if int(known.sum()) < ENOUGH_DEPTHS:
         return DEFAULT_NOISE
@@ -56,10 +57,10 @@ def depth_noise(sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float
 def placed(
     observations: TrackedKeypoints, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Weighted mean of the back-projected points of each track without those that disagree, and its covariance.
+    """Return the inliers, the weighted mean of each track's back-projected points (metres, world), and its covariance.
 
-    ``depth`` is what was measured at each observation, 0 where nothing was; ``relative`` its noise as a share.
-    Tracks most of whose depths disagree are dropped.
+    ``depth`` is the depth measured at each observation (metres, 0: none), ``relative`` its relative noise, and
+    ``pixel_noise`` that of the keypoints (pixels). Tracks without a majority of inliers are dropped.
     """
     observations, _ = observations[depth > 0].compacted()
     sightings, depth = observations.sightings, depth[depth > 0]
@@ -79,7 +80,7 @@ def placed(
 def _information(
     sightings: Sightings, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
 ) -> Float[Tensor, "m 3 3"]:
-    """Inverse covariance of back-projected points: of the depth along the ray, of the keypoint across it."""
+    """Return the inverse covariance of back-projected points: depth noise along the ray, keypoint noise across it."""
     d = sightings.directions()
     along = d[:, :, None] * d[:, None]
     across = torch.eye(3, dtype=d.dtype) - along
@@ -90,7 +91,7 @@ def _information(
 def _weighted(
     values: Float[Tensor, "m 3"], information: Float[Tensor, "m 3 3"], point: Int[Tensor, "m"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Weighted mean by point, and its covariance."""
+    """Return the weighted mean of the values of each point, and its covariance."""
     count = int(point.max()) + 1 if len(point) else 0
     total = torch.zeros((count, 3, 3), dtype=values.dtype).index_add_(0, point, information)
     weighted = (information @ values[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""Building landmarks: keypoints of posed images, matched, joined_tracks into tracks, and triangulated or placed by depth."""
+"""Building landmarks: match the keypoints of posed images, join them into tracks, and triangulate or place them by depth."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ Result = TypeVar("Result")
 
 SIFT = Sift()
 TOLERANCES = (10.0, 4.0, 2.0)
-"""Pixels from the projection beyond which an observation leaves its track, round by round."""
+"""Largest reprojection error (pixels) of an observation that stays in its track, round by round."""
 TWO_VIEWS = 1.5
-"""Pixels, where only two images testify."""
+"""Largest reprojection error (pixels) in a track of only two images."""
 
 
 @dataclass(frozen=True)
 class LandmarkConfig:
-    """How landmarks are built."""
+    """Settings of building landmarks."""
 
     neighbours: int = 8  # images that each image is matched with
     parallax: float = 2.0  # degrees between the rays, at least; with less, measured depth places a point
@@ -67,10 +67,10 @@ def build_landmarks(
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
-    """Build landmarks from ``views``, whose poses are those of the world; their depth is used where there is any.
+    """Build landmarks from ``views``, whose poses are T_world_camera, and from their measured depth where they have it.
 
-    ``progress`` gets the images and pairs of images that are done, and how many there are; ``report`` a sentence where
-    landmarks had to be dropped. Raises ``InputError`` where not one landmark was found.
+    ``progress`` is called with the number of images and image pairs done and their total, and ``report`` with a sentence if
+    landmarks had to be dropped. Raises ``InputError`` if no landmark was found.
     """
     if not views:
         raise InputError("nothing to build landmarks from: expected at least one view")
@@ -104,7 +104,7 @@ def _detected(view: View, features: Features) -> PosedKeypoints:
 def _located(
     observations: TrackedKeypoints, depth: Float[Tensor, "m"], config: LandmarkConfig
 ) -> LandmarkMap:
-    """Landmarks that are triangulated; then those placed by depth, of the keypoints that are left."""
+    """Return the triangulated landmarks, then those that measured depth places, made from the remaining keypoints."""
     tracked = torch.bincount(observations.point)[observations.point] > 1
     kept, positions, covariance = _triangulated(observations[tracked], radians(config.parallax))
     sightings = kept.sightings
@@ -123,9 +123,9 @@ def _located(
 def _triangulated(
     observations: TrackedKeypoints, least: float
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """TrackedKeypoints that agree, the points they show, and the points' covariance for a noise of one pixel.
+    """Return the consistent keypoints, the points that they show, and the points' covariance for a noise of one pixel.
 
-    ``least`` is the parallax (radians) that a point needs.
+    ``least`` is the smallest parallax (radians) of a point.
     """
     observations, _ = observations.compacted()
     count = observations.count
@@ -140,7 +140,7 @@ def _triangulated(
 
 
 def _believable(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """TrackedKeypoints that fit, of points that fit in at least two images."""
+    """Return which keypoints fit their points, for points that at least two keypoints fit."""
     fit = fitting(sightings, points, tolerance)
     seen = observations_per_point(sightings[fit], len(points))
     pairs = seen[sightings.point] == 2
@@ -149,7 +149,7 @@ def _believable(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: f
 
 
 def _bounded(landmarks: LandmarkMap, most: int, report: Callable[[str], None]) -> LandmarkMap:
-    """At most ``most`` landmarks: those that the most images saw."""
+    """Return at most ``most`` landmarks: those that were seen in the most images."""
     if len(landmarks) <= most:
         return landmarks
     report(f"{len(landmarks)} landmarks found, {most} kept: those that the most images show")
@@ -158,13 +158,13 @@ def _bounded(landmarks: LandmarkMap, most: int, report: Callable[[str], None]) -
 
 
 def _mapped(work: Callable[[_Item], Result], items: Sequence[_Item]) -> Iterator[Result]:
-    """Results in the order of ``items``, made by as many threads as torch has been given."""
+    """Yield ``work`` of each item, in order, computed by as many threads as torch uses."""
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         yield from pool.map(work, items)
 
 
 class _Counter:
-    """Counts what is done in several loops towards one total."""
+    """Counts the progress of several loops towards one total."""
 
     def __init__(self, progress: Callable[[int, int], None], total: int) -> None:
         self._progress, self._total, self._done = progress, total, 0

@@ -1,4 +1,4 @@
-"""One landmark from the keypoints that show it."""
+"""Fusing the keypoints that show a point into one landmark."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bidnerf_core.mapping.triangulation import Sightings
 
 @dataclass(frozen=True, eq=False)
 class TrackedKeypoints:
-    """Keypoints and the points that they show; the keypoints of all images, image by image, have one numbering."""
+    """Keypoints and the points that they show. One numbering, image by image, covers the keypoints of all images."""
 
     images: Sequence[PosedKeypoints]
     point: Int[Tensor, "m"]
@@ -26,13 +26,13 @@ class TrackedKeypoints:
         return TrackedKeypoints(self.images, self.point[index], self.number[index])
 
     def compacted(self) -> tuple[TrackedKeypoints, Int[Tensor, "n"]]:
-        """Number the points that are left from 0; also returns their numbers of before."""
+        """Renumber the remaining points from 0, and return their former numbers as well."""
         found, point = self.point.unique(return_inverse=True)
         return TrackedKeypoints(self.images, point, self.number), found
 
     @property
     def count(self) -> int:
-        """How many points there are."""
+        """The number of points."""
         return int(self.point.max()) + 1 if len(self.point) else 0
 
     @property
@@ -51,7 +51,7 @@ class TrackedKeypoints:
 
     @property
     def sizes(self) -> Float[Tensor, "m"]:
-        """Pixels: diameters of the keypoints."""
+        """The diameters of the keypoints, pixels."""
         return torch.cat([p.keypoints.sizes for p in self.images])[self.number]
 
     @property
@@ -65,9 +65,9 @@ def fused_landmarks(
     covariance: Float[Tensor, "n 3 3"],
     noise: float,
 ) -> LandmarkMap:
-    """Landmarks at ``positions`` (metres, world) with their covariance; every one of them has an observation.
+    """Return landmarks at ``positions`` (metres, world) with their covariance; each of them needs an observation.
 
-    Their images are taken to be where they are said to be.
+    ``noise`` is that of a keypoint, in pixels. The poses of the images are taken as exact: ``pose_covariance`` is 0.
     """
     count, sightings = len(positions), observations.sightings
     away = sightings.centre - positions[sightings.point]
@@ -93,7 +93,7 @@ def fused_landmarks(
 def _across_and_along(
     covariance: Float[Tensor, "n 3 3"], directions: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 2"]:
-    """Standard deviations: the mean one across a direction, and the one along it."""
+    """Return the standard deviation across a direction, averaged over both axes, and that along the direction."""
     along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
     across = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along) / 2
     return torch.stack([across, along], dim=-1).clamp(min=0).sqrt()
@@ -102,7 +102,7 @@ def _across_and_along(
 def _mean_descriptors(
     descriptors: UInt8[Tensor, "m d"], point: Int[Tensor, "m"], count: int
 ) -> UInt8[Tensor, "n d"]:
-    """Means, brought to the mean length of the descriptors: a mean is shorter, hence nearer to any other descriptor."""
+    """Return mean descriptors, rescaled to the mean length, since a shorter descriptor is nearer to all others."""
     values = descriptors.float()
     mean = _mean(values, point, count)
     length = _mean(torch.linalg.vector_norm(values, dim=-1, keepdim=True), point, count)

@@ -1,4 +1,4 @@
-"""Landmarks as named tensors, for storage, and back."""
+"""Conversion of landmarks to named tensors, for storage, and back."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ LANDMARK_KINDS = {
     "noise": ((), torch.float64),
     "pose_covariance": ((6, 6), torch.float64),
 }
-"""Shape, -1 for any length, and dtype."""
+"""Shape (-1: any length) and dtype of each tensor."""
 
 
 def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
-    """Return copies of the parts of ``landmarks`` by name."""
+    """Return copies of the tensors of ``landmarks``, by name and in the dtypes of ``LANDMARK_KINDS``."""
     found = {
         name: torch.as_tensor(getattr(landmarks, name), dtype=kind)
         for name, (_, kind) in LANDMARK_KINDS.items()
@@ -34,7 +34,10 @@ def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
 
 
 def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
-    """Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, kind or content."""
+    """Return the landmarks that ``landmark_tensors`` gave as ``tensors``.
+
+    Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
+    """
     for name, (shape, kind) in LANDMARK_KINDS.items():
         value = tensors[name]
         fits = value.dim() == len(shape) and all(

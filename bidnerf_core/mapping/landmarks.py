@@ -1,4 +1,4 @@
-"""Landmarks: points of the scene that are recognised by their look, and where they are."""
+"""Landmarks: points of the scene with descriptors by which images recognise them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMap:
-    """Points of the world frame (metres) with descriptors, on the CPU."""
+    """Points in the world frame (metres) with descriptors; all tensors are on the CPU."""
 
     positions: Float[Tensor, "n 3"]
     deviations: Float[Tensor, "n 2"]  # metres: standard deviation across and along ``directions``
     descriptors: UInt8[Tensor, "n d"]  # mean over the views; see ``mapping.features``
-    directions: Float[Tensor, "n 3"]  # unit, from the landmark towards the middle of the cameras that saw it
+    directions: Float[Tensor, "n 3"]  # unit, from the landmark: the mean direction to the cameras that saw it
     cones: Float[Tensor, "n"]  # radians: greatest angle between ``directions`` and such a camera
     sizes: Float[Tensor, "n"]  # metres: diameter of the keypoint, measured at its distance
     views: Int[Tensor, "n"]  # how many images saw it, int32
     noise: float  # pixels: standard deviation of a keypoint along each axis, in the images of the map
-    # How the poses of those images scatter about what the landmarks say, as right updates (translation in metres
-    # first). A pose found by landmarks differs from one that the same source of poses would give by as much.
+    # Covariance of the right updates (translation in metres first) from the given poses of the map's images to those that
+    # the landmarks imply: the error that the source of the poses adds to a pose found by landmarks.
     pose_covariance: Float[Tensor, "6 6"]  # float64
 
     def __len__(self) -> int:
@@ -34,16 +34,16 @@ class LandmarkMap:
 
     @property
     def megabytes(self) -> float:
-        """Size of the tensors, 10^6 bytes."""
+        """The size of the landmarks' tensors in megabytes (10^6 bytes)."""
         parts = [getattr(self, name) for name in PER_LANDMARK]
         return sum(part.numel() * part.element_size() for part in parts) / 1e6
 
 
 PER_LANDMARK = ("positions", "deviations", "descriptors", "directions", "cones", "sizes", "views")
-"""The parts of a map that have a row for each landmark."""
+"""The tensors of a map that have one row per landmark."""
 
 
 def concatenated(maps: list[LandmarkMap]) -> LandmarkMap:
-    """All landmarks of ``maps``, which have descriptors of one length; what else there is comes from the first one."""
+    """Return the landmarks of all ``maps``, whose descriptors must have one length, with the other fields of the first."""
     joined: dict[str, Any] = {name: torch.cat([getattr(m, name) for m in maps]) for name in PER_LANDMARK}
     return replace(maps[0], **joined)

@@ -1,4 +1,4 @@
-"""How far the given poses of the images are from what the points that they see say."""
+"""The errors of the map's given poses, estimated by resecting its images from the triangulated points."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from bidnerf_core.mapping.resection import ObservedPoints, resect
 from bidnerf_core.mapping.triangulation import Sightings
 
 SEEN = 20
-"""Points that an image needs for its pose to be found from them."""
+"""Least number of points from which the pose of an image is estimated."""
 ENOUGH_IMAGES = 8
-"""Images from which on a covariance of six numbers is estimated."""
+"""Least number of images from which the 6x6 covariance is estimated."""
 WEIGHT_ROUNDS = 10
-"""Of reweighting; the weights hardly change after five."""
+"""Number of rounds of reweighting; after five, the weights hardly change."""
 
 
 def pose_scatter(
     tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"], noise: float
 ) -> Float[Tensor, "6 6"]:
-    """Covariance of the right updates from the given poses to those that resect the points best; zero for too few images.
+    """Return the covariance of the right updates from given to resected poses; zero if there are too few images.
 
-    ``noise`` is that of the keypoints, pixels. An image takes part in the triangulation of what it sees and draws it to
-    its own error, which is allowed for: of k views of a point, a resect shows the share 1 - 1/k of the variance, while another
-    image would be off by 1 + 1/k.
+    ``noise`` is that of the keypoints, pixels. Each image takes part in triangulating the points that it sees and pulls them
+    towards its own error, which is corrected for: if a point has k views, resection shows the factor 1 - 1/k of the pose
+    variance, whereas the pose of a new image would show 1 + 1/k.
     """
     sightings, image = tracked.sightings, tracked.image
     seen = torch.bincount(sightings.point)[sightings.point].double()
@@ -54,8 +54,10 @@ def _seen_by(sightings: Sightings, positions: Float[Tensor, "n 3"]) -> ObservedP
 
 
 def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
-    """Covariance about zero by weights that bound the influence of a value (Maronna 1976), scaled so that half of the values are within
-    the median of the chi-squared distribution.
+    """Return an M-estimate of the covariance about zero (Maronna 1976).
+
+    Weights bound the influence of each value. The scale is such that half of the squared Mahalanobis distances are below the
+    median of the chi-squared distribution.
     """
     channels = values.shape[1]
     scale = values.square().median(0).values.clamp(min=1e-30)

@@ -1,4 +1,4 @@
-"""Resection: the pose of a camera or a rig from points that it sees, by robust Levenberg-Marquardt in pixels."""
+"""Resection: estimate the pose of a camera or a rig from known points, by robust Levenberg-Marquardt in pixels."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 from bidnerf_core.se3 import SE3, skew
 
 RESECTION_STEPS = 20
-"""At most; a good start takes four or five."""
+"""Largest number of steps; from a good start, four or five suffice."""
 FIRM = 1e-6
-"""Squared step (in standard deviations of the pose) under which nothing changes any more."""
+"""Squared length of a step, in standard deviations of the pose, below which the iteration has converged."""
 SETTLED = 0.01
-"""Change of the noise (as a share) under which it counts as found."""
+"""Relative change of the estimated noise below which it has converged."""
 LEAST_NOISE = 0.05
-"""Pixels: no detector is more exact."""
+"""Lower limit of the estimated noise, pixels: no detector is more accurate."""
 SCALE = 2.0
-"""Standard deviations at which Cauchy's loss halves a residual's weight."""
+"""Scale of the Cauchy loss: the residual, in standard deviations, whose weight is one half."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoints:
-    """Points of the world and where the cameras of a rig saw them. Float64."""
+    """Points of the world and their observations by the cameras of a rig. Float64."""
 
     points: Float[Tensor, "m 3"]  # metres, world
     deviations: Float[Tensor, "m 2"]  # metres, of the points, across and along ``directions``
@@ -42,23 +42,23 @@ class ObservedPoints:
         return ObservedPoints(*(getattr(self, name)[index] for name in (f.name for f in fields(self))))
 
     def with_focal(self, factor: float) -> ObservedPoints:
-        """The same pixels in cameras whose focal lengths are ``factor`` times those that were given."""
+        """Return the same pixels, seen by cameras whose focal lengths are ``factor`` times as long."""
         return replace(self, image=self.image / factor, focal=self.focal * factor)
 
     def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
-        """The points in the frame of the camera that shows them."""
+        """Return each point in the frame of the camera that observed it."""
         rig = T_world_rig.inverse().apply(self.points)
         return (self.rotation @ rig[..., None])[..., 0] + self.translation
 
     def residuals(self, T_world_rig: SE3) -> Float[Tensor, "m 2"]:
-        """Projection less observation, pixels; infinite for points behind the camera."""
+        """Return projection minus observation, pixels; infinite for points behind the camera."""
         local = self.in_camera(T_world_rig)
         z = local[:, 2:]
         off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
         return torch.where(z > 0, off, torch.inf)
 
     def normalized_residuals(self, T_world_rig: SE3, noise: float) -> Float[Tensor, "m 2"]:
-        """Return the residuals in standard deviations; ``noise`` is that of keypoints (pixels), to which the points' add."""
+        """Return the residuals in standard deviations, which combine the keypoints' ``noise`` (pixels) with the points'."""
         z = self.in_camera(T_world_rig)[:, 2]
         deviation = _deviation(self, T_world_rig, self.focal / torch.where(z > 0, z, 1), noise)
         return self.residuals(T_world_rig) / deviation[:, None]
@@ -66,10 +66,10 @@ class ObservedPoints:
 
 @dataclass(frozen=True, eq=False)
 class ReprojectionFit:
-    """A pose (and, where it was sought, a factor of the focal length) with its uncertainty."""
+    """A pose with its uncertainty and, if it was estimated, a factor on the focal length."""
 
     T_world_rig: SE3
-    focal_factor: float  # true focal length as a multiple of the given one; 1 where it was not sought
+    focal_factor: float  # true over given focal length; 1 if it was not estimated
     noise: float  # pixels: standard deviation of a residual along each axis, robustly
     covariance: Float[
         Tensor, "p p"
@@ -79,9 +79,10 @@ class ReprojectionFit:
 def resect(
     data: ObservedPoints, start: SE3, noise: float, free_focal: bool = False, focal_factor: float = 1.0
 ) -> ReprojectionFit:
-    """Minimize Cauchy's loss of the residuals in standard deviations; those of the landmarks count too.
+    """Minimize the Cauchy loss of the reprojection errors in standard deviations of keypoint and landmark together.
 
-    ``noise`` is a first guess (pixels). It is estimated anew after every step, so that the answer does not depend on it.
+    ``noise`` is a first guess at the keypoints' noise (pixels), which is re-estimated after every accepted step until it
+    settles. ``focal_factor`` multiplies the focal lengths; with ``free_focal`` it is estimated too, from that start.
     """
     T, log_factor, damping = start, torch.tensor(focal_factor, dtype=torch.float64).log(), 1e-4
     system = _linearized(data, T, log_factor, noise, free_focal)
@@ -115,18 +116,18 @@ class _System:
     hessian: Float[Tensor, "p p"]
     curvature: Float[
         Tensor, "p p"
-    ]  # of the robust cost itself, where the Hessian is that of its reweighted squares
+    ]  # of the robust cost itself; the Hessian is that of the reweighted squares
     scatter: Float[Tensor, "p p"]  # of the single gradients
     spread: float  # residuals in standard deviations, robustly: 1 where the noise is right
 
 
 def _linearized(data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, free_focal: bool) -> _System:
-    """Residuals and derivatives at ``T``, in standard deviations."""
+    """Linearize the residuals, in standard deviations, about ``T`` and the focal factor."""
     local = data.in_camera(T)
     front = local[:, 2] > 1e-9
     z = torch.where(front, local[:, 2], 1)
     focal = data.focal * log_factor.exp()
-    # Observed are pixels: what was divided by the given focal length is multiplied by it again.
+    # The observations are pixels, hence their image coordinates are multiplied by the given focal length, not the new one.
     off = local[:, :2] / z[:, None] * focal[:, None] - data.image * data.focal[:, None]
     deviation = _deviation(data, T, focal / z, noise)
     residual = torch.where(front[:, None], off / deviation[:, None], 30.0)
@@ -150,15 +151,16 @@ def _linearized(data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, 
 
 
 def _deviation(data: ObservedPoints, T: SE3, pixels_per_metre: Tensor, noise: float) -> Float[Tensor, "m"]:
-    """Return the standard deviation of a residual along each axis (pixels): the keypoint's and the point's together."""
+    """Return the standard deviation (pixels) of each residual along an axis, from the keypoint's and the point's noise."""
     return (noise**2 + _landmark_variance(data, T) * pixels_per_metre**2).sqrt()
 
 
 def _landmark_variance(data: ObservedPoints, T: SE3) -> Tensor:
-    """Variance (square metres) of the points across the line of sight, the mean of both axes.
+    """Return the variance (square metres) of the points perpendicular to the line of sight, averaged over both axes.
 
-    Along the axis that is across the line of sight and ``directions``, it is that across; along the other one it has
-    the share of that along which the angle between them lets be seen.
+    Along the axis perpendicular to both the line of sight and ``directions``, this is the point's variance across. Along the
+    other axis it is a mixture of the variances across and along, by the squared cosine and sine of the angle between the
+    line of sight and ``directions``.
     """
     sight = data.points - T.apply(_centres(data))
     cosine = (sight * data.directions).sum(-1) / torch.linalg.vector_norm(sight, dim=-1).clamp(min=1e-12)
@@ -168,14 +170,14 @@ def _landmark_variance(data: ObservedPoints, T: SE3) -> Tensor:
 
 
 def _centres(data: ObservedPoints) -> Tensor:
-    """Centres of the cameras in the frame of the rig."""
+    """Return the centres of the cameras in the frame of the rig, metres."""
     return -(data.rotation.mT @ data.translation[..., None])[..., 0]
 
 
 def _jacobian(
     data: ObservedPoints, T: SE3, local: Tensor, z: Tensor, focal: Tensor, free_focal: bool
 ) -> Tensor:
-    """Derivative of the projection (pixels) by the right update of ``T`` and the logarithm of the focal length."""
+    """Return the derivative of the projection (pixels) by a right update of ``T`` and by the log of the focal length."""
     x, y, zero, inverse = local[:, 0] / z, local[:, 1] / z, torch.zeros_like(z), focal / z
     rows = torch.stack([inverse, zero, -x * inverse, zero, inverse, -y * inverse], dim=-1).unflatten(
         -1, (2, 3)
@@ -190,7 +192,7 @@ def _jacobian(
 
 
 def _spread(residual: Float[Tensor, "m 2"], unknowns: int) -> float:
-    """Robust standard deviation along an axis, with the pose's own freedom allowed for."""
+    """Return a robust standard deviation along an axis, corrected for the number of unknowns that were fitted."""
     spare = max(1.0, 2 * len(residual) - unknowns) / (2 * len(residual))
     return 1.4826 * float(residual.abs().median()) / spare**0.5
 
@@ -201,8 +203,8 @@ def _solved(hessian: Tensor, damping: float, gradient: Tensor) -> Tensor:
 
 
 def _sandwich(system: _System) -> Float[Tensor, "p p"]:
-    """Covariance of an M-estimator (Huber 1981, section 6.3): ``A^-1 S A^-1`` of curvature A and scatter S."""
-    # Few or evil residuals can make the curvature indefinite; it is never far below the Hessian of good ones.
+    """Return the covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, section 6.3)."""
+    # With few residuals or many outliers the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
     values, vectors = torch.linalg.eigh(system.curvature)
     least = 0.2 * torch.linalg.eigvalsh(system.hessian)
     inverse = vectors @ torch.diag(1 / values.maximum(least).clamp(min=1e-12)) @ vectors.mT

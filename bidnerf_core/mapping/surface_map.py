@@ -42,8 +42,10 @@ class SurfaceMap:
 
     @cached_property
     def reach(self) -> float:
-        """Distance from a surfel at which a ray counts as having met it (metres). It follows from how far the fourth
-        neighbour is for nine tenths of the surfels: large enough to leave few holes between them, small enough to keep edges.
+        """Distance from a surfel at which a ray counts as having met it (metres).
+
+        It is a share of the distance to the fourth neighbour, which nine tenths of the surfels do not exceed: large enough
+        to leave few holes between them, small enough to keep edges.
         """
         points = self.surfels.positions.numpy()
         away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=min(5, len(points)))
@@ -54,7 +56,7 @@ class SurfaceMap:
 
     @cached_property
     def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Corners (metres, world) of the box that holds nine tenths of the surfels along each axis, without the stray ones."""
+        """Corners (metres, world) of the box that holds the middle nine tenths of the surfels along each axis."""
         ordered = self.surfels.positions.sort(0).values
         last = len(ordered) - 1
         return ordered[round(0.05 * last)], ordered[round(0.95 * last)]
@@ -64,8 +66,9 @@ class SurfaceMap:
         _ = self.extent, self.reach
 
     def nearest(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
-        """Return the index of the surfel nearest to each point (metres, world), to within a cell. A point outside the grid
-        has the one nearest to its place on the grid's border.
+        """Return the index of the surfel nearest to each point (metres, world), to within a cell.
+
+        A point outside the grid is first clamped to the grid's border.
         """
         return self.grid.at(self.nearest_in_cell, points).long()
 
@@ -75,7 +78,10 @@ class SurfaceMap:
 
 
 def nearest_surfels(occupied: Int[Tensor, "n"], shape: tuple[int, int, int]) -> Int[Tensor, "x y z"]:
-    """Return for each cell of a grid of ``shape`` which of the ``occupied`` cells (their numbers, one surfel each) is nearest."""
+    """Return, for each cell of a grid of ``shape``, the index in ``occupied`` of the nearest occupied cell.
+
+    ``occupied`` holds the flat numbers of the cells that contain a surfel. Raises ``InputError`` if it is empty.
+    """
     if not len(occupied):
         raise InputError("no surface to bake: no point that several views agree on")
     empty = torch.ones(shape, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Surfels: small discs of a surface, fused_surfels from points."""
+"""Surfels: small discs of a surface, fused from points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 SURFEL_NEIGHBOURS = 12
-"""How many surfels the plane and the colour gradient of one of them are fitted to."""
+"""Number of surfels to which the plane and the colour gradient of each surfel are fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[
 
 
 def fused_surfels(positions: Float[Tensor, "n 3"], rgb: Float[Tensor, "n 3"]) -> Surfels:
-    """Return surfels of merged points: to each its neighbours' plane is fitted, and it is moved onto that plane."""
+    """Return surfels of merged points: fit a plane to the neighbours of each point and move it onto that plane."""
     near = _neighbours(positions, SURFEL_NEIGHBOURS)
     offsets = positions[near] - positions[:, None]
     mean = offsets.mean(1)
@@ -59,7 +59,10 @@ def _neighbours(positions: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n k
 def _gradient(
     offsets: Float[Tensor, "n k 3"], normals: Float[Tensor, "n 3"], rgb: Float[Tensor, "n k 3"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Return the least-squares gradient of colour within the plane (Park et al. 2017, "Colored point cloud registration", eq. 10)."""
+    """Return the least-squares gradient of colour within the plane.
+
+    See Park et al. 2017, "Colored point cloud registration", eq. 10.
+    """
     flat = offsets - (offsets * normals[:, None]).sum(-1, keepdim=True) * normals[:, None]
     spread = flat.mT @ flat
     size = spread.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=torch.finfo(flat.dtype).tiny)

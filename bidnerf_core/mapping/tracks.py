@@ -14,21 +14,21 @@ from bidnerf_core.mapping.features import Keypoints, squared_distances
 from bidnerf_core.se3 import SE3
 
 BAND = 2.0
-"""Pixels from the epipolar line within which the partner of a keypoint is sought."""
+"""Largest distance (pixels) of a match from the epipolar line."""
 TRACK_RATIO = 0.95
-"""Distance of the descriptors as a share of that to the next best of all keypoints of the image, at most."""
+"""Largest ratio of a match's descriptor distance to that of the next best among all keypoints of the image."""
 RATIO_IN_BAND = 0.85
-"""The same share, of the next best one near the epipolar line."""
+"""Largest ratio of a match's descriptor distance to that of the next best near the epipolar line."""
 TRACK_APART = 4.0
-"""Pixels from which on two keypoints of an image are different ones: SIFT gives one for each dominant orientation."""
+"""Keypoints closer together than this (pixels) are one: SIFT returns one for each dominant orientation."""
 
 ONE_KEYPOINT = 1e-12
-"""Metres between cameras under which there are no epipolar lines."""
+"""Distance (metres) between two cameras below which epipolar lines are undefined."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedKeypoints:
-    """Keypoints of an image without its distortion, and where its camera is."""
+    """The keypoints of an image, as undistorted rays, and the pose of its camera."""
 
     keypoints: Keypoints
     rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
@@ -38,16 +38,17 @@ class PosedKeypoints:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Keypoints of two images that look alike and lie on one another's epipolar lines."""
+    """Pairs of keypoints of two images that look alike and lie on each other's epipolar lines."""
 
     pairs: Int[Tensor, "p 2"]
     ambiguity: Float[Tensor, "p"]  # distance of the descriptors as a share of that to the next best
 
 
 def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
-    """Keypoints of ``a`` and ``b`` that are one another's best partner near the epipolar lines.
+    """Return the pairs of keypoints of ``a`` and ``b`` that are mutual nearest neighbours near the epipolar lines.
 
-    A match must stand out among all keypoints of ``b`` as well: what resembles many of them is on the line by chance.
+    A match must also pass the ratio test among all keypoints of ``b``, because a keypoint that resembles many of them finds
+    one near the line by chance.
     """
     if not len(a.keypoints) or not len(b.keypoints):
         return Matches(torch.zeros((0, 2), dtype=torch.long), torch.zeros(0))
@@ -66,10 +67,10 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
 
 
 def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
-    """Whether a keypoint of ``b`` lies within ``BAND`` of the epipolar half-line of one of ``a``.
+    """Return whether each keypoint of ``b`` lies within ``BAND`` of the epipolar half-line of each keypoint of ``a``.
 
-    The half-line begins at the image of the infinitely far point of the ray; between cameras at one place it is that
-    beginning and nothing else.
+    The half-line begins at the image of the ray's point at infinity. If the cameras are at the same place, it reduces to
+    that point.
     """
     T_b_a = b.T_world_camera.inverse() @ a.T_world_camera
     rays, base = T_b_a.rotate(a.rays), T_b_a.translation
@@ -87,16 +88,16 @@ def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
         torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen
         for axis in (sideways, forward)
     )
-    # A ray that points behind the other camera has no beginning in its image; all of the line stays.
+    # The point at infinity of a ray that points behind the other camera has no image, so the whole line is admitted.
     least = torch.where(front > 0, -band, -torch.inf).float()
     return (across.abs_() <= band) & (along >= least)
 
 
 def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[int]) -> Int[Tensor, "m"]:
-    """Join matches (image, image, keypoints) into tracks: the track of each keypoint, in the numbering of all images.
+    """Join matches (image, image, keypoints) into tracks and return the track of each keypoint, numbered across all images.
 
-    The least ambiguous matches come first, and one that would bring two keypoints of an image together is left out: a
-    single wrong match would otherwise spoil two good tracks. ``sizes`` are the numbers of the keypoints of the images.
+    The least ambiguous matches are joined first. A match that would put two keypoints of one image into the same track is
+    left out, because a single wrong match would spoil two good tracks. ``sizes`` are the numbers of keypoints per image.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
     ends = np.concatenate(
@@ -114,7 +115,7 @@ def joined_tracks(matches: Sequence[tuple[int, int, Matches]], sizes: Sequence[i
 
 
 def _root(parent: list[int], number: int) -> int:
-    """The representative of a set (union-find with path halving, Tarjan and van Leeuwen 1984)."""
+    """Return the representative of a set (union-find with path halving, Tarjan and van Leeuwen 1984)."""
     while parent[number] != number:
         parent[number] = parent[parent[number]]
         number = parent[number]

@@ -1,4 +1,4 @@
-"""Triangulation: points from the rays of posed cameras that see them, with their covariance."""
+"""Triangulation: estimate points and their covariance from the rays of posed cameras."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 TRIANGULATION_STEPS = 8
-"""Gauss-Newton steps; from the linear answer, four or five are enough."""
+"""Number of Gauss-Newton steps; from the linear solution, four or five are enough."""
 DAMPING = 1e-6
-"""Of the mean diagonal: holds what rays without parallax leave open."""
+"""Damping relative to the mean diagonal, which keeps the equations solvable for rays without parallax."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Observations of points: which point, from where, in which direction. Float64, world frame unless said."""
+    """Observations of points: the point, the camera's pose, and the image position. Float64."""
 
     point: Int[Tensor, "m"]
     rotation: Float[Tensor, "m 3 3"]  # R_camera_world
-    centre: Float[Tensor, "m 3"]
+    centre: Float[Tensor, "m 3"]  # of the camera, metres, world
     image: Float[Tensor, "m 2"]  # on the plane z = 1 of the camera
     focal: Float[Tensor, "m"]  # pixels; residuals are multiplied by it
 
@@ -31,17 +31,17 @@ class Sightings:
         return len(self.point)
 
     def directions(self) -> Float[Tensor, "m 3"]:
-        """Unit vectors from the camera towards what was seen."""
+        """Return unit vectors (world) from the cameras towards the observed points."""
         ray = torch.cat([self.image, torch.ones_like(self.image[:, :1])], dim=-1)
         world = (self.rotation.mT @ ray[..., None])[..., 0]
         return world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
 
     def in_camera(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
-        """The points that were seen, each in the frame of the camera that saw it."""
+        """Return the observed point of each observation in the frame of its camera."""
         return (self.rotation @ (points[self.point] - self.centre)[..., None])[..., 0]
 
     def residuals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 2"]:
-        """Projection less observation, pixels; infinite behind the camera."""
+        """Return projection minus observation, pixels; infinite for points behind the camera."""
         local = self.in_camera(points)
         z = local[:, 2:]
         off = local[:, :2] / torch.where(z > 0, z, 1) - self.image
@@ -49,7 +49,7 @@ class Sightings:
 
 
 def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
-    """The point nearest to all rays of each of ``count`` points, by linear least squares."""
+    """Return, for each of ``count`` points, the point nearest to all its rays, by linear least squares."""
     d = sightings.directions()
     across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
     matrix = _summed(across, sightings.point, count)
@@ -60,9 +60,9 @@ def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
 def refined(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Minimize the robust reprojection errors; Cauchy's loss of ``scale`` pixels.
+    """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels.
 
-    Returns the points and the inverse of their normal matrices: the covariance for a noise of one pixel.
+    Returns the points and the inverses of their normal matrices, which are the covariances for a noise of one pixel.
     """
     for _ in range(TRIANGULATION_STEPS):
         matrix, gradient = _normal_equations(sightings, points, scale)
@@ -91,7 +91,7 @@ def _normal_equations(
 
 
 def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Radians: the greatest angle of a ray to the mean ray of its point, twice; 0 for points that nothing sees."""
+    """Return twice the largest angle (radians) between a point's rays and their mean; 0 for points without observations."""
     away = points[sightings.point] - sightings.centre
     d = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-300)
     mean = _summed(d, sightings.point, len(points))
@@ -106,12 +106,12 @@ def observations_per_point(sightings: Sightings, count: int) -> Int[Tensor, "n"]
 
 
 def fitting(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
-    """Observations within ``tolerance`` pixels of the projection of their point."""
+    """Return which observations lie within ``tolerance`` pixels of the projection of their point."""
     return torch.linalg.vector_norm(sightings.residuals(points), dim=-1) <= tolerance
 
 
 def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
-    """Standard deviation of an observation along each axis (pixels), robustly, with the points' own freedom allowed for."""
+    """Return a robust standard deviation of observations along each axis (pixels), corrected for the fitted points."""
     if not len(sightings):
         return 1.0
     seen = observations_per_point(sightings, len(points))

@@ -1,4 +1,4 @@
-"""Which pairs of posed images are likely to show the same things."""
+"""Selecting the pairs of posed images that are likely to show the same part of the scene."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from bidnerf_core.frames import View
 
 
 def likely_pairs(views: Sequence[View], neighbours: int) -> Int[Tensor, "p 2"]:
-    """Pairs (i < j) of each view with the ``neighbours`` views likeliest to show the same, without duplicates.
+    """Return pairs (i < j) of each view with ``neighbours`` views that are likely to show the same, without duplicates.
 
-    Half of them are the likeliest. The others are spread over the three times as many that come next: successive images of a video
-    are taken from nearly one place, and a point is triangulated well only from different ones.
+    Half of the neighbours are those with the most similar poses. The others are spread over the next ones, every third,
+    because successive images of a video have too little baseline for triangulation.
     """
     order = _unlikeness(views).argsort(dim=1, stable=True)
     ranks = _ranks(neighbours, len(views) - 1)
@@ -26,14 +26,17 @@ def likely_pairs(views: Sequence[View], neighbours: int) -> Int[Tensor, "p 2"]:
 
 
 def _ranks(count: int, others: int) -> list[int]:
-    """Places in the order of likeliness: the first half one after the other, then every third."""
+    """Return the ranks of the chosen neighbours: the first half are consecutive, then every third is taken."""
     near = (count + 1) // 2
     ranks = [*range(near), *(near + 2 + 3 * i for i in range(count - near))]
     return [rank for rank in ranks if rank < others] or list(range(others))
 
 
 def _unlikeness(views: Sequence[View]) -> Float[Tensor, "v v"]:
-    """Distance of the centres as a share of the mean distance, plus 1 - cosine between the axes; infinite to itself."""
+    """Return how dissimilar two poses are: relative distance of the centres plus 1 - cosine between the optical axes.
+
+    It is infinite between a view and itself.
+    """
     centres = torch.stack([view.T_ref_camera.translation.cpu().double() for view in views])
     axes = torch.stack([view.T_ref_camera.rotation[:, 2].cpu().double() for view in views])
     away = torch.cdist(centres, centres)

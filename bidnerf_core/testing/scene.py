@@ -25,14 +25,17 @@ SIDE = max(BOUNDS.size)  # metres
 
 @cache
 def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
-    """Return a toy from six sides with exact depth: with alpha or, as a sensor sees it, before white without."""
+    """Return six views of a toy with exact depth.
+
+    With ``coverage`` they have an alpha channel; without, they show the toy before white, as a sensor would see it.
+    """
     seen = seen_from(demo_object(), CAMERA, orbit(3.5, 6))
     return tuple(v if coverage else replace(v, frame=replace(v.frame, alpha=None)) for v in seen)
 
 
 @cache
 def rgb_views() -> tuple[View, ...]:
-    """Return the toy from six sides before white, without depth and alpha."""
+    """Return six views of the toy before white, without depth or alpha."""
     return tuple(replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views(coverage=False))
 
 

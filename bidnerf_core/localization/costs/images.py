@@ -1,7 +1,7 @@
-"""The cost of whole small images: how a map looks from many poses against what was photographed.
+"""The cost of whole small images: compare renderings of a map from many poses with the photo.
 
-How the colours of a small rendered image change as the camera moves follows from the image's own slopes and from how far
-away things are, whatever rendered it; nothing is differentiated automatically.
+The derivative of a rendered image with respect to the pose follows from the image's gradient and its depth, whatever the
+renderer; automatic differentiation is not needed.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from bidnerf_core.robust import geman_mcclure_inlier
 from bidnerf_core.se3 import SE3
 
 UNKNOWN_COST = 0.7
-"""Cost of a pixel that shows what the map does not hold."""
+"""Cost of a pixel for which the map renders nothing."""
 IMAGE_EXPOSURE_ROUNDS = 2
 """Rounds of robust reweighting in which the exposure is fitted."""
 
 
 @dataclass(frozen=True)
 class ColourScales:
-    """How colours are compared, and how far an image's exposure may differ from the map's."""
+    """Scales of the comparison of colours, and priors on an image's exposure relative to the map."""
 
     colour: float = 0.2  # norm of the difference over the three channels at which a pixel is half an inlier
     gain: float = 0.2  # standard deviation of the prior about 1
@@ -41,8 +41,8 @@ class RenderedView:
 
     rgb: Float[Tensor, "h 3 n"]  # smooth
     slopes: Float[Tensor, "h 3 n 2"]  # of it, per unit on the plane z = 1
-    known: Float[Tensor, "h n"]  # the part of what a pixel shows that the map holds
-    points: Float[Tensor, "h n 3"]  # what is seen: metres, last camera's frame
+    known: Float[Tensor, "h n"]  # share of the pixel that the map renders, 0 to 1
+    points: Float[Tensor, "h n 3"]  # points seen by the pixels: metres, last camera's frame
     depth: Float[Tensor, "h n"]  # metres, in the thumbnail's camera
 
 

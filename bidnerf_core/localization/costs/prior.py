@@ -1,4 +1,4 @@
-"""Gaussian knowledge of a pose as a cost: what landmarks, a previous frame or another sensor say."""
+"""A Gaussian prior on a pose as a cost, from landmarks, a previous frame or another sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bidnerf_core.se3 import SE3, se3_right_jacobian
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """The squared Mahalanobis distance of poses from a mean; updates turn about ``pivot``."""
+    """The squared Mahalanobis distance of poses from a mean; updates are expressed about ``pivot``."""
 
     mean: SE3  # T_world_camera
     covariance: Float[Tensor, "6 6"]  # of a right update of the mean (metres, radians); float64

@@ -27,11 +27,11 @@ from bidnerf_core.sampling import AroundDepth, Resampled
 from bidnerf_core.se3 import SE3
 
 MISS_SCALES = 3.0
-"""Depth residual of a ray that meets nothing, in depth scales: an outlier, but not by the whole distance."""
+"""Depth residual of a ray that meets nothing, in depth scales: that of an outlier, but less than the whole distance."""
 EXPOSURE_ROUNDS = 3
 """Rounds of robust reweighting in which the exposure is fitted."""
 EXPOSURE_PRIOR = 0.001
-"""Precision of the gain's prior, relative to all weights: it decides only where all that is seen has one colour."""
+"""Precision of the gain's prior, relative to all weights. It matters only if everything in view has one colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,10 @@ class Residuals:
         return self.weights * self.confidence**2 * self.objective.robust_weights(self.confidence * self.value)
 
     def cost(self) -> Float[Tensor, "h"]:
-        """Return ``2 sum weight rho(r)``, the plain weighted sum of squares where residuals are small.
+        """Return ``2 sum weight rho(r)``, the plain weighted sum of squares if residuals are small.
 
-        Confidence steers a step, but does not judge it: a step would otherwise be rewarded for finding steep places.
+        The confidence weights the equations of a step, but not this cost. Otherwise a step could lower the cost by moving
+        rays to where residuals are steep and their confidence is low.
         """
         return 2 * (self.weights * self.objective.rho(self.value)).sum((-1, -2)).cpu()
 
@@ -122,7 +123,7 @@ class RenderedCost:
 
 @dataclass(frozen=True)
 class RenderedCostSettings:
-    """What all stages of a refinement share."""
+    """The settings of the rendered cost that all stages of a refinement share."""
 
     colour: ColourSettings
     depth: DepthSettings | None  # None: colour alone
@@ -131,7 +132,7 @@ class RenderedCostSettings:
     def drawn(
         self, problem: Problem, stage: RefinementStage, pivot: Pivot, generator: Generator
     ) -> RenderedCost:
-        """Draw a stage's rays."""
+        """Draw the rays of a stage and return the cost on them."""
         depth = self.depth
         objective = objective_of(self.colour, depth, stage.colour_scale, stage.depth_scale, MISS_SCALES)
         counts = RayCounts(stage.rays, 0 if depth is None else depth.depth_rays)
@@ -142,10 +143,10 @@ class RenderedCostSettings:
 def _residuals(
     found: Linearization, rays: WeightedRays, objective: Objective, exposure: bool, surface_sigma: float
 ) -> Residuals:
-    """Turn a linearization into weighted residuals; with ``exposure``, rendered as bright as the image was taken.
+    """Turn a linearization into weighted residuals; with ``exposure``, the rendering is first corrected to the image's.
 
-    ``surface_sigma`` (metres): a residual varies by its steepness times that, beside its own scale, and counts for so much
-    less.
+    ``surface_sigma`` (metres) is the uncertainty of the map's surfaces. It adds the variance (slope x sigma)^2 to that of
+    each residual, so steep residuals receive less weight.
     """
     value, jacobian, weights = found.residuals.double(), found.jacobian.double(), rays.weights.double()
     if exposure:
@@ -175,7 +176,7 @@ def _robust_exposure(
 def _without_exposure(
     rendered: Float[Tensor, "h n 3"], jacobian: Float[Tensor, "h n c 6"], weights: Float[Tensor, "n c"], fitted: Exposure
 ) -> Float[Tensor, "h n c 6"]:  # fmt: skip
-    """Return the Jacobian less what a change of gain and bias could do as well (variable projection)."""
+    """Return the Jacobian with the exposure eliminated: gain and bias are projected out (variable projection)."""
     by_pose = fitted.gain[:, None, :, None] * jacobian[..., :3, :]
     share = weights[:, :3] / weights[:, :3].sum(0).clamp(min=torch.finfo(weights.dtype).tiny)
     basis = rendered - (share * rendered).sum(1, keepdim=True)

@@ -19,7 +19,7 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(eq=False)
 class SampledLoss:
-    """A loss that calls evaluate at a pose, on pixels drawn anew at each call or once for all."""
+    """The loss at a pose, on pixels that are drawn anew at each call or once for all."""
 
     problem: Problem
     objective: Objective

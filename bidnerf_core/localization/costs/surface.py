@@ -19,14 +19,14 @@ from bidnerf_core.robust import geman_mcclure_inlier
 from bidnerf_core.se3 import SE3, skew
 
 SURFEL_RADIUS = 1.5
-"""How far along its plane a surfel reaches, in cells of the surface's grid."""
+"""Radius of a surfel's disc, in cells of the surface's grid."""
 MOST_COLOUR_CHANGE = 0.2
-"""The largest change of a surfel's colour along its plane that its gradient is trusted for."""
+"""Largest change of a surfel's colour along its plane to which its gradient is extrapolated."""
 
 
 @dataclass(frozen=True)
 class PointScales:
-    """The residuals at which a point is half an inlier, and what colour counts beside distance."""
+    """The residuals at which a point's inlier weight is one half, and the weight of colour relative to distance."""
 
     distance: float  # metres
     colour: float = 0.15  # norm of the difference over the three channels, each in [0, 1]
@@ -111,8 +111,10 @@ class Correspondences:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceCost:
-    """Mean over points of ``(1 - n) + w (1 - n a)``: n falls from 1 to 0 with the distance from the nearest surfel, a with
-    the difference between the colour there and the measured one.
+    """The cost of measured points on a surface: the mean over points of ``(1 - n) + w (1 - n a)``.
+
+    The inlier weight n falls from 1 to 0 with the distance from the nearest surfel; a falls likewise with the difference
+    between the surfel's colour and the measured one; w is ``colour_weight``.
 
     Its normal equations are those of iteratively reweighted least squares: the gradient is exact, the Hessian positive
     semidefinite.

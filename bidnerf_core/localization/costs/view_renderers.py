@@ -1,4 +1,4 @@
-"""Fast renderings without derivatives of what many rays see: from the baked surface, or from a field."""
+"""Fast rendering of many rays, without derivatives, from the baked surface or from a field."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CHUNK = 16384
 
 @dataclass(frozen=True, eq=False)
 class RayColours:
-    """What rays see, on the CPU."""
+    """The rendered colour and distance of rays, on the CPU."""
 
     rgb: Float[Tensor, "r 3"]  # times ``known``, where that is less than 1
     known: Float[Tensor, "r"]  # 0 where a ray leads to where the map has nothing

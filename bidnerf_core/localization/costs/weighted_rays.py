@@ -18,7 +18,7 @@ from bidnerf_core.residuals import Objective
 
 @dataclass(frozen=True)
 class RayCounts:
-    """How many rays are drawn."""
+    """The numbers of rays to draw."""
 
     pixels: int  # in all, shared out equally among the views
     depth_rays: int = 0  # besides, of a sensor with rays of its own
@@ -42,7 +42,7 @@ def draw_weighted_rays(
 ) -> WeightedRays:
     """Draw pixels of all views and, where there are any, rays of depth, with their weights of eqs. 5 and 6.
 
-    ``blur``: colours are means over squares of so many pixels; 1: as they are.
+    Colours are averaged over squares of ``blur`` x ``blur`` pixels; 1 leaves them as they are.
     """
     views = [blurred(view, blur) for view in problem.views] if blur > 1 else problem.views
     seen = draw(views, counts.pixels, drawer(pixels), generator, device=problem.device)

@@ -1,1 +1,1 @@
-"""Search: proposing poses and thinning them out."""
+"""Search: propose poses, and discard all but the best."""

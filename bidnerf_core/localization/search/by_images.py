@@ -1,4 +1,4 @@
-"""Search by colour alone: small renderings of the map, ever larger and of ever fewer poses, against the query's images."""
+"""Search by colour alone: compare the query's images with small renderings of the map, coarse to fine."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from bidnerf_core.mapping.casting import Cast, cast
 from bidnerf_core.se3 import SE3
 
 APART, TURNED = 0.15, math.radians(20)
-"""Share of the extent, and radians, from which on two poses are different answers: farther than one step has to go."""
+"""Two poses farther apart than this (share of the extent, radians) are different answers."""
 OPEN = 0.2
-"""Share of the keyframes' rays that meet nothing, from which on the map counts as having a background."""
+"""The map counts as having a background if more than this share of the keyframes' rays meet nothing."""
 
 
 @dataclass(frozen=True)
 class ImageStage:
-    """Some steps of the poses that are left."""
+    """A stage of the search: steps from all remaining poses, of which the best ``keep`` go on to the next stage."""
 
     width: int  # pixels of the longer side of thumbnails
     steps: int
@@ -58,7 +58,10 @@ class ImageSearch:
 
     @staticmethod
     def on_surface(problem: Problem, surface: SurfaceMap) -> ImageSearch:
-        """Search on a baked surface. Keyframes show how far away things are and whether there is a background."""
+        """Return a search on a baked surface.
+
+        Rays cast from the keyframes give the typical distance of the scene, and whether it has a background.
+        """
         seen = _from_keyframes(surface, thumbnail(problem.views[-1], 16))
         away = float(seen.along[seen.met].median()) if bool(seen.met.any()) else surface.extent
         has_background = float(seen.met.float().mean()) < 1 - OPEN
@@ -68,7 +71,7 @@ class ImageSearch:
 
     @staticmethod
     def in_field(problem: Problem, start: SE3) -> ImageSearch:
-        """Search in a field's coarsest level. A rendering from the start shows how far away things are."""
+        """Return a search in a field's coarsest level; a rendering from the start gives the scene's typical distance."""
         renderer = FieldRenderer(problem.level(0), problem.bounds, problem.device)
         small = thumbnail(problem.views[-1], 16)
         T = start.to(small.flat)
@@ -96,7 +99,7 @@ class ImageSearch:
 
 
 def _from_keyframes(surface: SurfaceMap, small: Thumbnail, most: int = 16) -> Cast:
-    """Return what a thumbnail's rays meet from some of the keyframes."""
+    """Return where a thumbnail's rays, cast from up to about ``most`` keyframes, meet the surface."""
     every = max(1, len(surface.keyframes) // most)
     keyframes = SE3.from_matrix(surface.keyframes[::every]).to(small.flat)
     directions = torch.nn.functional.normalize(small.flat, dim=-1) @ keyframes.rotation.mT

@@ -1,4 +1,4 @@
-"""Search by measured depth: points of the query aligned with the baked surface."""
+"""Search by measured depth: align the points of the query with the baked surface."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
 JUDGED = 0.02
-"""Scale of distances at which poses are compared, as a share of the scene's extent."""
+"""Scale of the distances by which poses are compared, as a share of the scene's extent."""
 COMPARED_POINTS = 200
-"""Points on which they are compared, at least."""
+"""Least number of points on which poses are compared."""
 APART, TURNED = 0.05, math.radians(10)
-"""Share of the extent, and radians, from which on two poses are different answers."""
+"""Two poses farther apart than this (share of the extent, radians) are different answers."""
 
 
 @dataclass(frozen=True)
 class PointStage:
-    """Some steps of all poses that are left."""
+    """A stage of the search: steps from all remaining poses, of which the best ``keep`` go on to the next stage."""
 
     points: int
     steps: int
@@ -47,7 +47,7 @@ POINT_STAGES = (
 
 @dataclass(frozen=True, eq=False)
 class PointSearch:
-    """Aligns measured points with a surface, from hypotheses all over the scene."""
+    """Aligns measured points with a surface, starting from hypotheses all over the scene."""
 
     surface: SurfaceMap
     cloud: PointCloud
@@ -70,12 +70,12 @@ class PointSearch:
         return Surroundings(SE3.from_matrix(surface.keyframes), surface.extent, middle, self.cloud.middle)
 
     def judge(self, points: int | None = None) -> SurfaceCost:
-        """Return the cost at the one scale by which poses are compared, of the first ``points``."""
+        """Return the cost of the first ``points`` (all by default), at the one scale at which poses are compared."""
         cloud = self.cloud if points is None else self.cloud.first(points)
         return SurfaceCost(self.surface, cloud, PointScales(JUDGED * self.surface.extent))
 
     def score(self, T: SE3) -> Float[Tensor, "h"]:
-        """Return what poses are compared by, between 0 and 2."""
+        """Return the score by which poses are compared: 0 (best) to 2."""
         return self.judge().cost(T)
 
     def _stages(self, stages: tuple[PointStage, ...]) -> Iterator[SearchStage]:

@@ -1,7 +1,8 @@
 """Centring: shifting a camera so that what it renders lies where what it measured lies.
 
-Most of a wrong start is that what the camera saw is elsewhere in its image. Shifting the camera until the medians of the
-rendered and of the measured points agree removes that in one rendering of a few rays, from where no gradient leads.
+From a wrong start, most of the error is that the scene appears in another part of the image. Shifting the camera until the
+medians of the rendered and of the measured points agree removes this error with one rendering of a few rays, even where the
+loss has no useful gradient.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from bidnerf_core.se3 import SE3
 
 @torch.no_grad()
 def centred(field: RadianceField, observed: Observations, bounds: SceneBounds, T: SE3) -> SE3:
-    """Return poses (h), each shifted; where nothing was measured or nothing is rendered, a pose stays as it is."""
+    """Return the poses T (h) after centring; a pose stays as it is if nothing is measured or nothing is rendered."""
     if not bool(observed.measured.any()):
         return T
     measured = observed.points[observed.measured].median(0).values
@@ -31,7 +32,7 @@ def centred(field: RadianceField, observed: Observations, bounds: SceneBounds, T
 def rendered_middle(
     field: RadianceField, observed: Observations, bounds: SceneBounds, T: SE3
 ) -> Float[Tensor, "h 3"]:
-    """Return the median by axis of the points that rays meet, in the last camera's frame; NaN where they meet none."""
+    """Return the median, axis by axis, of the rendered points, in the last camera's frame; NaN if no ray meets anything."""
     rays = observed.rays(T, bounds)
     shape = rays.near.shape
     seen = render(field, flattened(rays), bounds.background)

@@ -1,4 +1,4 @@
-"""How likely chance would bring as good an agreement."""
+"""The significance of an agreement: how many equally good ones are expected by chance."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import math
 
 
 def log10_nfa(matches: int, agreeing: int, probability: float, sample: int = 3) -> float:
-    """Logarithm of the number of false alarms (Moisan and Stival 2004, eq. 10): how many poses with so much agreement
-    are to be expected among ``matches`` that are all wrong; below 0 it is no chance.
+    """Return the decimal logarithm of the number of false alarms (Moisan and Stival 2004, eq. 10).
 
-    ``probability`` is that of a wrong match to agree with a pose; ``sample`` correspondences make a pose.
+    This is the expected number of poses with which ``agreeing`` of ``matches`` agree, if all matches are wrong. The lower it
+    is, the less likely the agreement is due to chance. ``probability`` is the probability that a wrong match agrees with a
+    given pose; ``sample`` is the number of correspondences that determine a pose.
     """
     if agreeing <= sample:
         return 0.0

@@ -1,4 +1,4 @@
-"""Pairs of a keypoint and a landmark, in the cameras of a rig."""
+"""Correspondences between the keypoints of a rig's images and landmarks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class QueryImage:
-    """Keypoints of an image that is to be localized, without its distortion; in the frame of the rig's last camera."""
+    """The keypoints of a query image, as undistorted rays, and its camera's pose in the frame of the rig's last camera."""
 
     keypoints: Keypoints
     rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
@@ -30,12 +30,12 @@ class QueryImage:
 
     @property
     def focal(self) -> float:
-        """Pixels: geometric mean of the two focal lengths."""
+        """The geometric mean of the two focal lengths, pixels."""
         return (self.intrinsics.fx * self.intrinsics.fy) ** 0.5
 
 
 def query_images(views: Sequence[View], features: Features) -> list[QueryImage]:
-    """Detect the keypoints of ``views``, whose poses are known in any common frame; the last one is the rig's frame."""
+    """Detect the keypoints of ``views``, whose poses share any common frame; the rig's frame is that of the last camera."""
     T_rig_ref = views[-1].T_ref_camera.to("cpu", torch.float64).inverse()
     return [
         query_image(
@@ -54,7 +54,7 @@ def query_image(frame: Frame, T_rig_camera: SE3, features: Features) -> QueryIma
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMatches:
-    """Which keypoint of which view shows which landmark."""
+    """Matches: each row is a view, one of its keypoints, and the landmark that the keypoint shows."""
 
     view: Int[Tensor, "m"]
     keypoint: Int[Tensor, "m"]
@@ -78,7 +78,7 @@ class LandmarkMatches:
 def observed_points(
     images: Sequence[QueryImage], landmarks: LandmarkMap, found: LandmarkMatches
 ) -> ObservedPoints:
-    """Look up what the correspondences refer to."""
+    """Return the landmarks and the observations that the matches ``found`` refer to, as input of a pose solver."""
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
     number = first[found.view] + found.keypoint
     T_camera_rig = SE3.stack([image.T_rig_camera.inverse() for image in images])

@@ -1,4 +1,4 @@
-"""Guided matching: once a pose is known, a keypoint is compared only with the landmarks that would appear near it."""
+"""Guided matching: given a pose, compare each keypoint only with the landmarks that project near it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.se3 import SE3
 
 CANDIDATES = 6
-"""Landmarks that are compared with a keypoint, at most: the nearest ones in the image."""
+"""Largest number of landmarks that are compared with a keypoint: the nearest ones in the image."""
 GUIDED_RATIO = 0.9
-"""Distance of the descriptors as a share of that to the next best candidate, at most."""
+"""Largest ratio of a match's descriptor distance to that of the next best candidate (Lowe 2004, section 7.1)."""
 OBLIQUE = radians(40)
-"""By how much a landmark may be seen from outside of the cone of directions that it was seen from."""
+"""Largest angle (radians) outside the cone of a landmark's mapped viewing directions from which it is still matched."""
 OCTAVES = 1.0
-"""By how much (binary logarithm) a keypoint may be larger or smaller than its landmark should appear."""
+"""Largest difference (octaves) between the size of a keypoint and the size at which its landmark should appear."""
 
 
 def guided_matches(
@@ -35,10 +35,10 @@ def guided_matches(
     focal_factor: float = 1.0,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> LandmarkMatches:
-    """Correspondences within ``radius`` pixels of the projections under a pose.
+    """Return the matches of keypoints with landmarks that project within ``radius`` pixels of them.
 
-    Descriptors may differ by the squared distance ``most_distance``. ``shift`` (pixels) moves all projections: with one
-    larger than the radius, what is found is found by chance.
+    ``most_distance`` is the largest squared distance between the descriptors of a match. ``shift`` (pixels) is added to all
+    projections: with a shift longer than the radius, every match is due to chance.
     """
     parts = [
         _in_view(number, image, landmarks, T_world_rig, radius, most_distance, focal_factor, shift)
@@ -78,10 +78,10 @@ def _in_view(
 def _visible(
     image: QueryImage, landmarks: LandmarkMap, T_world_camera: SE3, local: Tensor, focal: float, margin: float
 ) -> Bool[Tensor, "n"]:
-    """Landmarks in front of the camera, in its image, seen from about where they were seen before."""
+    """Return which landmarks are in front of the camera, inside its image, and seen from about a mapped direction."""
     camera = image.intrinsics
     half = torch.tensor([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
-    # Distortion moves the edges of the image; keypoints say what was seen, so a wide guess does no harm.
+    # Distortion moves the edges of the image. A generous margin does no harm: landmarks outside match no keypoint.
     inside = (local[:, :2].abs() * focal <= (1.3 * half + margin) * local[:, 2:]).all(-1) & (local[:, 2] > 0)
     towards = T_world_camera.translation.float() - landmarks.positions
     length = torch.linalg.vector_norm(towards, dim=-1).clamp(min=1e-12)
@@ -92,7 +92,7 @@ def _visible(
 def _near(
     observed: Float[Tensor, "k 2"], projected: Float[Tensor, "n 2"], radius: float
 ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Pairs of a keypoint and a projection that are within ``radius`` of one another."""
+    """Return the indices of keypoints and projections that are within ``radius`` (pixels) of one another, pairwise."""
     if not len(observed) or not len(projected):
         return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
     _, found = cKDTree(projected.numpy()).query(observed.numpy(), k=CANDIDATES, distance_upper_bound=radius)
@@ -104,7 +104,7 @@ def _near(
 def _best(
     keypoint: Int[Tensor, "p"], landmark: Int[Tensor, "p"], distance: Float[Tensor, "p"], most: float
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
-    """The most alike pair of each keypoint, where no other is nearly as much alike, once for each landmark."""
+    """Return the best pair of each keypoint that passes the ratio test, at most one for each landmark, and its ambiguity."""
     order = distance.argsort(stable=True)
     order = order[keypoint[order].argsort(stable=True)]
     begins = torch.ones(len(order), dtype=torch.bool)
@@ -122,7 +122,7 @@ def _best(
 def _once(
     chosen: Int[Tensor, "m"], landmark: Tensor, distance: Tensor, ambiguity: Tensor
 ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
-    """Of the pairs ``chosen`` that share a landmark, the most alike."""
+    """Keep only the best of the pairs ``chosen`` that share a landmark."""
     order = distance[chosen].argsort(stable=True)
     order = order[landmark[chosen[order]].argsort(stable=True)]
     ids = landmark[chosen[order]]

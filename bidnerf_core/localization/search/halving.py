@@ -1,4 +1,4 @@
-"""Successive halving: from many poses to one, by ever finer costs of ever fewer poses."""
+"""Successive halving: reduce many poses to one, with costs that become finer as poses become fewer."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class SearchStage:
-    """Some steps of all poses that are left, of which the best are kept."""
+    """A stage: steps from all remaining poses, of which the best ``keep`` go on to the next stage."""
 
     cost: Cost
     pivot: Pivot
     steps: int
     keep: int
     damping: float  # at first
-    # What poses are compared by after the steps; None: the cost.
+    # The score by which poses are compared after the steps; None: the cost.
     score: Callable[[SE3], Float[Tensor, "h"]] | None = None
 
 
 @dataclass(frozen=True)
 class Distinct:
-    """When two poses are different answers, rather than two stages of one descent."""
+    """Decides whether two poses are different answers rather than approximations of the same one."""
 
-    middle: Float[Tensor, "3"]  # what is seen, metres, last camera's frame
-    distance: float  # metres between where the poses put it, from which on they are different
-    angle: float  # radians between them, likewise
+    middle: Float[Tensor, "3"]  # centre of what is seen, metres, last camera's frame
+    distance: float  # poses that put it farther apart than this (metres) are different
+    angle: float  # so are poses whose orientations differ by more than this (radians)
 
     def __call__(self, T: SE3) -> Bool[Tensor, "h"]:
         """Return which of the poses are different from the first."""
@@ -47,7 +47,7 @@ class Distinct:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The poses that were left, and how much better the best is than any different one."""
+    """The poses that remain at the end of a search, and how much better the best is than any different one."""
 
     T: SE3  # (h), best first
     scores: Float[Tensor, "h"]
@@ -59,10 +59,11 @@ class SearchResult:
 def search(
     start: SE3, stages: Iterable[SearchStage], distinct: Distinct, keep_runner_up: bool
 ) -> SearchResult:
-    """Thin out the hypotheses ``start`` (h).
+    """Run the stages on the hypotheses ``start`` (h) and return the poses that remain.
 
-    ``keep_runner_up``: if the best poses of a stage are all one answer, the last of them makes room for a different one,
-    and the last stage tells the margin; otherwise the last stage tells it that had different poses.
+    With ``keep_runner_up``, if the best poses of a stage are all the same answer, the last of them is replaced by the best
+    different one, and the margin is that of the last stage. Without it, the margin is that of the last stage that still had
+    different poses.
     """
     T, paths, margin = start, [start[None]], math.inf
     losses = [torch.zeros((0, len(start.translation)), dtype=torch.float64)]

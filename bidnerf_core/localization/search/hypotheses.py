@@ -1,4 +1,4 @@
-"""Hypotheses: the poses that a search begins with."""
+"""Hypotheses: the poses from which a search starts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bidnerf_core.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What hypotheses are made of: where a scene was seen from, its size, and what the query sees."""
+    """The data from which hypotheses are made: the map's keyframes, the size of the scene, and what the query sees."""
 
     keyframes: SE3  # (k) T_world_camera of the images that the map was made from
     extent: float  # metres: size of the scene
@@ -32,9 +32,9 @@ class Surroundings:
 def hypotheses_for_points(known: Surroundings, start: SE3 | None, count: int, generator: Generator) -> SE3:
     """Return ``count`` poses from which measured points may fit the surface.
 
-    Half are keyframes, moved a little. Half are orientations, three quarters of them about those of keyframes and a quarter
-    uniformly random, each placed so that the middle of what was measured lies on the middle of the scene, as it does where
-    cameras look at an object. Where there is a start, it and its neighbourhood take a quarter of all.
+    Half are keyframes, moved a little. The other half put the middle of the measured points on the middle of the scene, as
+    is right where cameras look at an object; three quarters of their orientations are near those of keyframes, and a quarter
+    are uniformly random. If there is a start, a quarter of all poses are the start and poses near it.
     """
     spread = _deviation(0.1 * known.extent, 0.25)
     near = [] if start is None else [_about(start, known.pivot, max(1, count // 4), spread, generator)]
@@ -52,8 +52,8 @@ def hypotheses_for_points(known: Surroundings, start: SE3 | None, count: int, ge
 def hypotheses_for_images(known: Surroundings, start: SE3 | None, count: int, generator: Generator) -> SE3:
     """Return ``count`` poses from which the map may look like the query's images.
 
-    Half are keyframes as they are, as far as there are so many; the others are keyframes moved about what they look at,
-    every fourth of them rolled by any angle. Where there is a start, it and its neighbourhood take a quarter of all.
+    Up to half are keyframes as they are. The others are keyframes moved about what they look at; every fourth of them is
+    also rolled by a random angle. If there is a start, a quarter of all poses are the start and poses near it.
     """
     near = [] if start is None else [_turned_and_moved(known, start, max(1, count // 4), generator)]
     left = count - sum(len(T.translation) for T in near)
@@ -71,7 +71,7 @@ def neighbours(T: SE3, count: int, translation: float, rotation: float, seed: in
     """Return ``T`` and ``count`` - 1 right updates of it, spread evenly under a normal distribution.
 
     ``translation`` (metres) and ``rotation`` (radians) are its standard deviations along and about each axis of the camera;
-    points are those of Sobol 1967, scrambled by ``seed``. Shape (count).
+    the points are a Sobol sequence, scrambled by ``seed``. Shape (count).
     """
     even = SobolEngine(6, scramble=True, seed=seed).draw(count, dtype=torch.float64)
     xi = _deviation(translation, rotation) * torch.special.ndtri(even.clamp(1e-6, 1 - 1e-6))
@@ -86,13 +86,13 @@ def random_rotations(count: int, generator: Generator) -> Float[Tensor, "h 3 3"]
 
 
 def _about(start: SE3, pivot: Pivot, count: int, spread: Float[Tensor, "6"], generator: Generator) -> SE3:
-    """Return the start, and poses about it."""
+    """Return the start and poses near it."""
     shifts = torch.randn((count, 6), generator=generator, dtype=torch.float64)
     return pivot.moved(start, shifts * spread * (torch.arange(count) > 0)[:, None])
 
 
 def _turned_and_moved(known: Surroundings, start: SE3, count: int, generator: Generator) -> SE3:
-    """Return the start, and poses about it: half turn where they are, half about what they look at."""
+    """Return the start and poses near it: half are perturbed about the camera, half about what the camera looks at."""
     many = SE3(start.rotation.expand(count, 3, 3), start.translation.expand(count, 3))
     half, spread = count // 2, _deviation(0.05 * known.extent, 0.25)
     turns = torch.randn((half, 6), generator=generator, dtype=torch.float64) * spread

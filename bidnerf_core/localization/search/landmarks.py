@@ -1,4 +1,4 @@
-"""Search by landmarks: a pose with its covariance from images alone, without a start."""
+"""Search by landmarks: find a pose and its covariance from images alone, without a start."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from bidnerf_core.se3 import SE3
 
 SIFT = Sift()
 THRESHOLD = 0.005
-"""Share of the image's diagonal within which a correspondence agrees with a pose; 2 pixels at least."""
+"""Largest reprojection error of an inlier, as a share of the image's diagonal; never less than 2 pixels."""
 RADII = (2.0, 1.0)
-"""Radii of guided matching, in multiples of 3 pixels (of an image of 400 x 300, larger for larger ones)."""
+"""Radii of the rounds of guided matching, in units of 1.5 times the inlier threshold."""
 GUIDED_ROUNDS = 3
-"""Rounds of guided matching with the last radius, at most; it ends where correspondences no longer change."""
+"""Largest number of rounds of guided matching with the last radius; they end once the matches no longer change."""
 LOOSE = 1.3
-"""Descriptors of guided matches may be so much more distant than those of nine tenths of the first inliers."""
+"""Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
-"""Share of the depth by which a landmark may be off the depth that was measured at its keypoint."""
+"""Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
 LEAST_INLIERS = 6
-"""Correspondences under which there is no pose."""
+"""Least number of inliers for a pose to be returned at all."""
 
 
 @dataclass(frozen=True, eq=False)
 class FocalCheck:
-    """A resect with a free focal length, from the pose that was found with the given one."""
+    """The result of resection with a free focal length, started from the pose found with the given one."""
 
     factor: float  # of the focal length
     noise: float  # pixels: standard deviation of the reprojection errors with that factor
@@ -60,7 +60,7 @@ class FocalCheck:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkPose:
-    """A pose found by landmarks, and what speaks for it."""
+    """A pose found by landmarks, its covariance, and the evidence for it."""
 
     T_world_camera: SE3  # of the last view, float64
     covariance: Float[
@@ -83,14 +83,13 @@ class LandmarkPose:
     depth_scale: (
         float | None
     )  # by which measured depth has to be multiplied; none where too little was measured
-    # What the same correspondences say of the focal length of a single view: its factor, the noise (pixels) that is left
-    # with it, and how the pose would move with its logarithm (right update). None for several views.
+    # The focal length that the same correspondences give for a single view. None for several views.
     focal_check: FocalCheck | None = None
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
     @property
     def inliers(self) -> int:
-        """Correspondences within three standard deviations."""
+        """The number of correspondences within three standard deviations."""
         return int((torch.linalg.vector_norm(self.normalized_residuals, dim=-1) <= 3).sum())
 
 
@@ -101,10 +100,10 @@ def propose(
     seed: int = 0,
     unknown_focal: bool = False,
 ) -> LandmarkPose | None:
-    """Find the pose of the last of ``views``, whose relative poses are known; ``None`` where landmarks do not tell.
+    """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
-    ``unknown_focal`` takes the focal length of a single view as a guess and finds it too. Raises ``InputError`` for no
-    view, and for several with an unknown focal length.
+    With ``unknown_focal``, the focal length of a single view is only a guess and is estimated along with the pose. Raises
+    ``InputError`` if there is no view, or if there are several and the focal length is unknown.
     """
     if not views:
         raise InputError("nothing to localize: expected at least one view")
@@ -146,7 +145,7 @@ def _first_pose(
 
 
 def _pixels(images: Sequence[QueryImage], share: float) -> float:
-    """A share of the diagonal of the last image; 2 pixels at least."""
+    """Return a share of the last image's diagonal in pixels, at least 2."""
     camera = images[-1].intrinsics
     return max(2.0, share * math.hypot(camera.width, camera.height))
 
@@ -158,7 +157,10 @@ def _refined(
     found: Hypothesis,
     unknown_focal: bool,
 ) -> tuple[LandmarkMatches, ReprojectionFit, float] | None:
-    """Refine on the inliers; then on guided matches, in ever smaller radii, until they no longer change."""
+    """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change.
+
+    Returns the matches, the fit, and the number of matches expected by chance.
+    """
     threshold = _pixels(images, THRESHOLD)
     inliers = matches[found.inliers]
     most = _usual_distance(images, landmarks, inliers)
@@ -198,7 +200,7 @@ def _same(a: LandmarkMatches, b: LandmarkMatches) -> bool:
 
 
 def _usual_distance(images: Sequence[QueryImage], landmarks: LandmarkMap, inliers: LandmarkMatches) -> float:
-    """Squared distance of descriptors up to which guided matches are taken."""
+    """Return the largest squared descriptor distance of a guided match."""
     first = torch.tensor([0, *(len(image.keypoints) for image in images)]).cumsum(0)
     descriptors = torch.cat([image.keypoints.descriptors for image in images])
     number = first[inliers.view] + inliers.keypoint
@@ -207,7 +209,7 @@ def _usual_distance(images: Sequence[QueryImage], landmarks: LandmarkMap, inlier
 
 
 def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
-    """Correspondences at whose keypoint no depth was measured, or one that fits the landmark."""
+    """Return which correspondences have a landmark that fits the depth measured at the keypoint, or no measured depth."""
     z = data.in_camera(T_world_rig)[:, 2]
     known = data.depth > 0
     ratio = torch.where(known, z / torch.where(known, data.depth, 1), 1)
@@ -218,7 +220,7 @@ def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
 def _chance(
     images: Sequence[QueryImage], landmarks: LandmarkMap, best: ReprojectionFit, radius: float, most: float
 ) -> float:
-    """Mean count of guided matches with the projections moved aside in four directions."""
+    """Return the number of guided matches expected by chance: the mean over four shifts of all projections."""
     away = 4 * radius
     counts = [
         len(guided_matches(images, landmarks, best.T_world_rig, radius, most, best.focal_factor, shift))
@@ -271,13 +273,13 @@ def _described(
 
 
 def _probability(images: Sequence[QueryImage], threshold: float) -> float:
-    """That a place drawn uniformly in the image lies within ``threshold`` of another one."""
+    """Return the probability that a uniformly drawn point of the image lies within ``threshold`` pixels of a given one."""
     camera = images[-1].intrinsics
     return min(0.5, math.pi * threshold**2 / (camera.width * camera.height))
 
 
 def _spread(images: Sequence[QueryImage], found: LandmarkMatches, pixels: Float[Tensor, "m 2"]) -> float:
-    """Share of the cells of an 8 x 8 grid that hold a correspondence, the mean of the views."""
+    """Return the share of the cells of an 8 x 8 grid that hold a correspondence, averaged over the views."""
     shares = []
     for number, image in enumerate(images):
         size = torch.tensor([image.intrinsics.width, image.intrinsics.height])
@@ -287,7 +289,7 @@ def _spread(images: Sequence[QueryImage], found: LandmarkMatches, pixels: Float[
 
 
 class _Clock:
-    """Seconds by stage."""
+    """A stopwatch that records the seconds of each stage."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""Which landmarks look like a keypoint: nearest neighbours among descriptors, sublinear in how many there are."""
+"""Nearest-neighbour search among the landmarks' descriptors, in a time that is sublinear in their number."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from bidnerf_core.mapping.features import squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 
 EXACT = 4_000
-"""Landmarks up to which there are no cells."""
+"""Up to this number of landmarks the search is exhaustive, and no cells are built."""
 COMPARISONS = 30_000_000
-"""Of keypoints with landmarks, up to which comparing all of them is faster than looking up cells."""
+"""Up to this number of keypoint-landmark pairs, comparing all of them is faster than searching cells."""
 QUERY_BLOCK = 64
-"""Neighbouring columns whose least value is found first: sorting all of them would take longer than computing them."""
+"""Width of the blocks of columns whose minima are ranked first, because ranking all columns is slower."""
 PROBED = 12
-"""Cells that are searched for each keypoint."""
+"""Number of cells that are searched for each keypoint."""
 SAMPLE = 40
-"""Landmarks for each cell, of those that the cells are found from."""
+"""Number of landmarks per cell in the sample on which k-means runs."""
 K_MEANS_ROUNDS = 6
-"""Of Lloyd's algorithm: cells need not be the best ones, only balanced."""
+"""Iterations of Lloyd's algorithm; the cells need to be balanced, not optimal."""
 ROWS = 256
-"""Keypoints or landmarks that are compared with all others at a time: bounds the memory."""
+"""One sixteenth of the descriptors that are assigned to cells at a time, which bounds the memory."""
 
 
 class LandmarkMatcher:
     """Finds the landmarks whose descriptors are nearest to those of keypoints.
 
-    Above ``EXACT`` landmarks, an inverted file: they are sorted into about sqrt(n) cells by k-means, and only the cells
-    nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). It can be shared between threads.
+    Above ``EXACT`` landmarks it uses an inverted file: k-means divides the landmarks into about sqrt(n) cells, and only the
+    cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a matcher.
     """
 
     def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
@@ -44,9 +44,9 @@ class LandmarkMatcher:
     def nearest(
         self, descriptors: UInt8[Tensor, "q d"], count: int
     ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
-        """Squared distances of the ``count`` nearest landmarks, nearest first, and which they are.
+        """Return the squared distances and the indices of the ``count`` nearest landmarks, nearest first.
 
-        Where there are fewer, distances are infinite and the landmark's number is 0.
+        If there are fewer landmarks, the remaining distances are infinite and the indices 0.
         """
         if self._cells is not None and len(descriptors) * len(self.landmarks) > COMPARISONS:
             return self._cells.nearest(descriptors, count)
@@ -59,7 +59,7 @@ class LandmarkMatcher:
 
 
 class _Cells:
-    """An inverted file: descriptors by cell."""
+    """An inverted file: descriptors sorted by cell."""
 
     def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
         count = round(math.sqrt(len(descriptors)))
@@ -99,7 +99,7 @@ class _Cells:
 def _k_means(
     descriptors: UInt8[Tensor, "n d"], count: int, generator: torch.Generator
 ) -> Float[Tensor, "c d"]:
-    """Centres of cells (Lloyd 1982), from a sample; a centre that loses all of its members stays where it is."""
+    """Return the centres of k-means cells (Lloyd 1982) on a sample; a centre that loses all its members stays in place."""
     sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLE * count]
     values = descriptors[sample].float()
     centres = values[:count].clone()
@@ -116,7 +116,7 @@ def _nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[T
 
 
 def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
-    """The ``count`` least of each row (or all, where there are fewer), least first, and their columns."""
+    """Return the ``count`` smallest values of each row (all, if there are fewer), ascending, and their columns."""
     columns = distances.shape[1]
     if columns <= 4 * QUERY_BLOCK * count:
         found = distances.topk(min(count, columns), dim=1, largest=False)

@@ -1,7 +1,7 @@
-"""A first pose from correspondences most of which may be wrong: minimal solvers in LO-RANSAC, by poselib.
+"""A first pose from matches that are mostly outliers, by poselib's minimal solvers in LO-RANSAC.
 
 One camera: P3P (Persson and Nordberg 2018). Several with known relative poses: generalized P3P (Kukelova et al. 2016).
-Unknown focal length: P4Pf, which poselib has as a solver only; the loop about it is ours.
+Unknown focal length: P4Pf, which poselib provides without a RANSAC loop, so the loop is here.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from bidnerf_core.mapping.resection import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 SUCCESS = 0.9999
-"""Probability of having drawn a sample without outliers at which drawing ends."""
+"""RANSAC stops once a sample without outliers has been drawn with this probability."""
 LEAST_DRAWS, MOST_DRAWS = 50, 20_000
 MOST_DRAWS_WITH_FOCAL = 1500
-"""One draw costs some hundred microseconds there."""
+"""Fewer draws are allowed because each takes some hundred microseconds."""
 FOCAL_RANGE = (0.2, 5.0)
-"""Multiples of the given focal length that are tried."""
+"""Range of the focal length, in multiples of the given one."""
 ONE_PLACE = 1e-6
-"""Of the points' distance: cameras nearer to one another than that have no generalized solution of their own."""
+"""Cameras closer together than this share of the points' distance have no generalized solution of their own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +41,10 @@ class Hypothesis:
 def sample_consensus(
     data: ObservedPoints, view: Int[Tensor, "m"], threshold: float, seed: int
 ) -> Hypothesis | None:
-    """The pose that the most correspondences agree with, within ``threshold`` pixels; they are in the order of trust.
+    """Return the pose with the most inliers within ``threshold`` pixels; None if there are too few matches or no solution.
 
-    A rig also tries each of its cameras alone: the generalized solver is unstable where the cameras are all but in one
-    place. ``None`` where there are too few correspondences, or nothing agrees.
+    The matches in ``data`` must be ordered from the most to the least reliable. For a rig, each camera is also tried alone,
+    because the generalized solver is unstable if the cameras are almost in one place.
     """
     views = view.unique().tolist()
     found = [_single(data, (view == v).nonzero()[:, 0], threshold, seed) for v in views]
@@ -67,7 +67,7 @@ def _options(threshold: float, seed: int) -> dict[str, object]:
 
 
 def _camera(focal: float) -> dict[str, object]:
-    """A pinhole whose pixels are counted from the principal point."""
+    """Return poselib's description of a pinhole camera with its principal point at the origin."""
     return {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
 
 
@@ -99,9 +99,10 @@ def _generalized(
 
 
 def focal_consensus(data: ObservedPoints, threshold: float, seed: int) -> Hypothesis | None:
-    """The pose and focal length of one camera that the most correspondences agree with; those are in the order of trust.
+    """Return the pose and focal length of one camera with the most inliers within ``threshold`` pixels, or None.
 
-    Its focal length is sought within ``FOCAL_RANGE`` of the given one; the principal point is known.
+    The matches in ``data`` must be ordered from the most to the least reliable. The focal length is searched within
+    ``FOCAL_RANGE`` of the given one; the principal point is taken as known.
     """
     if len(data) < 5:
         return None
@@ -110,7 +111,7 @@ def focal_consensus(data: ObservedPoints, threshold: float, seed: int) -> Hypoth
     given, best, needed, draws = float(data.focal[0]), None, MOST_DRAWS_WITH_FOCAL, 0
     while draws < needed:
         draws += 1
-        pool = min(len(points), max(20, len(points) * draws // 200))  # PROSAC: the surest ones first
+        pool = min(len(points), max(20, len(points) * draws // 200))  # PROSAC: the most reliable ones first
         sample = random.choice(pool, 4, replace=False)
         for pose, focal in zip(*poselib.p4pf(pixels[sample], points[sample], True), strict=True):
             if not FOCAL_RANGE[0] <= focal / given <= FOCAL_RANGE[1]:
@@ -133,7 +134,7 @@ def _projected(pose: poselib.CameraPose, points: Float[np.ndarray, "m 3"]) -> Fl
 
 
 def _draws_needed(inliers: float) -> int:
-    """Draws of four after which one without outliers has most likely been among them (Fischler and Bolles 1981)."""
+    """Return how many samples of four to draw so that most likely one has no outlier (Fischler and Bolles 1981)."""
     clean = min(max(inliers, 1e-3) ** 4, 1 - 1e-9)
     return max(LEAST_DRAWS, int(3 * np.log(1 - SUCCESS) / np.log1p(-clean)))
 

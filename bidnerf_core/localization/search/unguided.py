@@ -1,4 +1,4 @@
-"""Matching before there is a pose: the landmark most alike to each keypoint, where it stands out."""
+"""Unguided matching: the nearest landmark of each keypoint in descriptor space, before any pose is known."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.landmarks import LandmarkMap
 
 LOOKED_UP = 4
-"""Landmarks that are looked up for each keypoint: the next best one elsewhere tells how ambiguous the best one is."""
+"""Number of landmarks looked up per keypoint; the best one at another place shows how ambiguous the match is."""
 SAME_PLACE = 2.0
-"""Two landmarks nearer than so many of their diameters are one thing, seen twice."""
+"""Landmarks closer together than this many diameters are duplicates of one point."""
 AMBIGUITY = 0.9
-"""Distance of the descriptors as a share of that to the next best landmark elsewhere, at most."""
+"""Largest ratio of a match's descriptor distance to that of the best landmark at another place (Lowe 2004)."""
 LEAST_MATCHES = 60
-"""Fewer unambiguous matches than that are filled up with the least ambiguous others."""
+"""If there are fewer unambiguous matches, the least ambiguous others are added up to this number."""
 
 
 def unguided_matches(images: Sequence[QueryImage], matcher: LandmarkMatcher) -> LandmarkMatches:
-    """The landmark most alike to each keypoint, where it stands out; the least ambiguous ones first."""
+    """Return the matches of keypoints with their nearest landmarks that pass the ratio test, least ambiguous first."""
     parts = []
     for number, image in enumerate(images):
         distances, index = matcher.nearest(image.keypoints.descriptors, LOOKED_UP)
@@ -41,13 +41,13 @@ def unguided_matches(images: Sequence[QueryImage], matcher: LandmarkMatcher) -> 
 def _ambiguity(
     landmarks: LandmarkMap, distances: Float[Tensor, "q k"], index: Int[Tensor, "q k"]
 ) -> Float[Tensor, "q"]:
-    """Distance to the best landmark as a share of that to the best one elsewhere."""
+    """Return the ratio of the descriptor distances of the nearest landmark and of the best one at another place."""
     if not len(landmarks):
         return torch.ones(len(distances))
     position, size = landmarks.positions[index], landmarks.sizes[index]
     apart = torch.linalg.vector_norm(position - position[:, :1], dim=-1)
     near = SAME_PLACE * torch.maximum(size, size[:, :1]) + 3 * landmarks.deviations[index].amax(-1)
     elsewhere = torch.where(apart > near, distances, torch.inf).amin(1)
-    # Where all that were looked up are in one place, the last of them bounds how near another can be.
+    # If all landmarks looked up are at one place, the last distance is a lower bound on that of any other.
     other = torch.where(elsewhere.isfinite(), elsewhere, distances[:, -1])
     return torch.where(other.isfinite(), (distances[:, 0] / other.clamp(min=1)).sqrt(), 0.0)

@@ -1,1 +1,1 @@
-"""Solvers: how poses move, whatever the cost."""
+"""Solvers, which move poses down any cost."""
