@@ -43,7 +43,7 @@ INFLATION = 3.0
 independent, although they are correlated within an image. It was set by the normalised errors of a fifth of the test images
 of four scenes.
 """
-FOCAL_OFF, FOCAL_NOISE = 0.035, 1.5
+FOCAL_OFF, FOCAL_NOISE = 0.03, 2.0
 """Limits beyond which the given focal length is taken to be wrong: the logarithm of the estimated factor, and the ratio of
 the reprojection noise with the given focal length to that with the estimated one.
 """
@@ -108,7 +108,7 @@ def _found(problem: Problem, matcher: LandmarkMatcher, seed: int) -> LandmarkPos
     check = None if found is None else found.focal_check
     if found is None or check is None:
         return found
-    if abs(math.log(check.factor)) <= FOCAL_OFF and found.noise <= FOCAL_NOISE * check.noise:
+    if abs(math.log(check.factor)) <= FOCAL_OFF or found.noise <= FOCAL_NOISE * check.noise:
         return found
     return propose(matcher, views, seed=seed, unknown_focal=True) or found
 
