@@ -15,7 +15,7 @@ from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.keyframes import LARGEST, MOST, colour_noise, rendered_views
+from bidnerf_core.mapping.keyframes import KEYFRAME_SIDE, MOST, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.sampling import Stratified
 from bidnerf_core.scenes.fields import HomogeneousBall
@@ -52,7 +52,7 @@ def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
         HomogeneousBall(0.5, 1.0, sampler=Stratified(1)), CUBE, [(large, orbit(2.0, 1)[0])]
     )
     camera = small[0].frame.intrinsics
-    assert camera.width == LARGEST
+    assert camera.width == KEYFRAME_SIDE
     assert camera.width / camera.fx == pytest.approx(large.width / large.fx)
     assert small[0].frame.rgb.shape[:2] == (camera.height, camera.width)
 

@@ -29,7 +29,10 @@ class Method:
 
 METHODS = {
     "auto": Method(
-        auto, AutoConfig, "landmarks, then search on the baked surface by depth or colour; no start needed", False
+        auto,
+        AutoConfig,
+        "landmarks, then search on the baked surface by depth or colour; no start needed",
+        False,
     ),
     "bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)", True),
     "inerf": Method(inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)", True),
