@@ -32,7 +32,7 @@ MODES = {  # name: (gradient to the tables, gradient to the points)
 
 
 class PlainEncoding(nn.Module):
-    """The same encoding as straightforward tensor code, with all levels in one table."""
+    """Compute the same encoding by straightforward tensor code, with all levels in one table."""
 
     def __init__(self, ours: HashEncoding) -> None:
         super().__init__()

@@ -39,7 +39,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 SEED = 3
 TOLERANCE = 1e-5
-"""Of pose matrices and losses."""
+"""Largest difference of pose matrices and of losses that counts as equal."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,7 @@ def refine_choices(voxel: float, colour: bool) -> Iterator[Refine]:
 
 
 def gicp_choices(voxel: float, near: bool) -> Iterator[Gicp]:
-    """From an answer that is good already, or from far off."""
+    """Yield settings of GICP for starts that are near the answer, or far off."""
     for size in (voxel / 2, voxel):
         far = ((20,), (10,), (5,), (20, 4), (20, 8, 2), (10, 2))
         for steps in ((1,), (2,), (4,), (2, 1)) if near else far:
@@ -91,7 +91,7 @@ class Open3d:
         self.library.utility.random.seed(seed)
 
     def search(self, measured: Points, config: Ransac) -> Matrix:
-        """With no start."""
+        """Register two clouds without a start."""
         registration = self.library.pipelines.registration
         target, target_features = self.features(config.voxel)
         source, source_features = self._described(self._seen(measured, config.voxel), config.voxel)

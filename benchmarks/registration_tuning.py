@@ -108,7 +108,7 @@ def _searched(library: Open3d, case: Case, setting: Ransac) -> Matrix:
 
 
 def _quickest(results: dict[Ransac, tuple[Score, list[Matrix]]]) -> Ransac:
-    """Of those that succeed most often: what is fine in the end is for the ICP to decide."""
+    """Return the quickest of the settings that succeed most often; ICP does the fine alignment."""
     return max(results, key=lambda setting: (results[setting][0].successes, -results[setting][0].seconds))
 
 
@@ -118,7 +118,7 @@ def _nearest(
     refine: Callable[[Points, Matrix, Any], Matrix],
     choices: Iterable[Setting],
 ) -> Setting:
-    """Of those that succeed most often, the one with the smallest errors."""
+    """Return the settings that succeed most often and, among these, have the smallest errors."""
 
     def score(setting: Setting) -> tuple[int, float]:
         found, seconds = timed(tries, lambda i, case: refine(case.measured, starts[i], setting))

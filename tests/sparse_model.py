@@ -74,7 +74,7 @@ def _sees(view: View, points: torch.Tensor, agree: float) -> torch.Tensor:
 
 
 def write(folder: Path, what: Known) -> Path:
-    """As COLMAP's documentation has the format; the folder."""
+    """Write a model in the format of COLMAP's documentation and return its folder."""
     folder.mkdir(parents=True, exist_ok=True)
     camera = what.views[0].frame.intrinsics
     size = f"{camera.width} {camera.height} {camera.fx} {camera.fy} {camera.cx} {camera.cy}"
@@ -102,6 +102,6 @@ def write(folder: Path, what: Known) -> Path:
 
 
 def _camera_model(view: View) -> SE3:
-    """From the model's frame to the camera's, both in the model's unit."""
+    """Return the transform from the model's frame to the camera's, both in the model's unit."""
     T_model_camera = T_MODEL_WORLD @ view.T_ref_camera.to(torch.float64)
     return SE3(T_model_camera.rotation, T_model_camera.translation / UNIT).inverse()

@@ -136,7 +136,7 @@ def test_the_oracle_is_asked_once_a_call(field: AdaNerfField, rays: Rays) -> Non
 def test_the_pose_is_felt_through_positions_and_not_through_the_choice(
     field: AdaNerfField, rays: Rays
 ) -> None:
-    """With the choice made beforehand, and put on the moving ray, gradients are the same."""
+    """Gradients are the same when the choice is made beforehand and put on the moving ray."""
     origins = rays.origins.clone().requires_grad_()
     samples = field.sampler(rays)
     assert not field.sampler(replace(rays, origins=origins)).starts.requires_grad
@@ -309,7 +309,7 @@ def test_phases_follow_each_other(parts: tuple[float, float]) -> None:
 
 
 def phases(field: AdaNerfField, config: AdaNerfConfig, report: Any) -> list[bool]:
-    """Of each step, whether the oracle learned."""
+    """Return whether the oracle learned in each step."""
     learned, last = [], [p.clone() for p in field.oracle.parameters()]
     step = report.step
 

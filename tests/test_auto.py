@@ -208,7 +208,7 @@ def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_se
 
 
 def test_a_few_depth_rays_are_too_little_to_search_by() -> None:
-    """With fewer points than a shape needs, the images decide."""
+    """The images decide where there are fewer points than a shape needs."""
     view = baked.unseen()[0]
     few = in_camera(view)[: module.LEAST_POINTS - 1]
     problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, few)

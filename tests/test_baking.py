@@ -27,7 +27,7 @@ def ball_views(count: int = 12) -> list[View]:
 
 
 def height(surface: SurfaceMap) -> Tensor:
-    """Of surfels above the ball, in cells."""
+    """Return the heights of surfels above the ball, in cells."""
     return (torch.linalg.vector_norm(surface.surfels.positions, dim=-1) - RADIUS) / surface.cell
 
 

@@ -39,7 +39,7 @@ def test_it_comes_to_the_truth_in_few_steps() -> None:
 
 
 def test_bid_needs_many_more() -> None:
-    """From the same start, with as many steps as the second-order method took at the most."""
+    """Adam starts at the same pose and takes as many steps as the second-order method took at most."""
     problem = single(FIELD, BOUNDS, FRAME, perturb(TRUTH, 0.4, 10.0, seed=1))
     first = localize(problem, "bid", {"rays": 256, "max_steps": 20})
     second = localize(problem, "bid-lm", FEW)

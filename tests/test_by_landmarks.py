@@ -83,7 +83,7 @@ def test_each_further_term_brings_the_pose_nearer(depth: bool, rays: int, terms:
 
 
 def test_more_terms_make_the_covariance_smaller() -> None:
-    """In every direction: what was measured beside the landmarks adds information and takes none away."""
+    """Measurements beside the landmarks add information in every direction and take none away."""
     alone = answer(without_depth(unseen()))
     for more in (
         answer(unseen(), map=textured_map(surface=True)),

@@ -11,7 +11,7 @@ from bidnerf_core.mapping.casting import cast, trace
 
 
 def rays(count: int, generator: Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    """From all around towards somewhere about the middle."""
+    """Return rays from all around towards the neighbourhood of the middle."""
     origins = 3 * torch.nn.functional.normalize(torch.randn((count, 3), generator=generator), dim=-1)
     aims = torch.randn((count, 3), generator=generator)
     return origins, torch.nn.functional.normalize(aims - origins, dim=-1)

@@ -253,7 +253,7 @@ def test_names_are_matched_by_stem_and_by_folders(scene: Known, tmp_path: Path) 
 
 
 def test_splits_in_folders_of_their_own_are_not_mistaken_for_each_other(scene: Known, tmp_path: Path) -> None:
-    """As in NeRF-Synthetic: train/r_0.png and test/r_0.png."""
+    """Names repeat between splits as in NeRF-Synthetic: train/r_0.png and test/r_0.png."""
     stems = [view.frame.name for view in scene.views]
     names = [f"test/{stems[0]}.png", *(f"train/{stem}.png" for stem in stems[:5])]
     model = sparse_model.write(tmp_path, replace(scene, names=names))
@@ -364,7 +364,7 @@ def test_training_is_supervised_by_the_points(model: Path, scene: Known) -> None
 
 
 def test_the_scene_is_bounded_by_points_where_there_is_nothing_better(model: Path, scene: Known) -> None:
-    """With silhouettes those tell; a box of points alone gets a wide margin."""
+    """Silhouettes bound the scene where there are any; a box of points alone gets a wide margin."""
     sparse = opened(model, scene)
     outlined = [sparse.onto(bare(view), "train") for view in scene.views]
     assert estimate_bounds(outlined) == estimate_bounds([bare(view) for view in scene.views])

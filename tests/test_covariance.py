@@ -73,7 +73,7 @@ def test_the_surface_covariance_of_a_plane_is_that_of_a_few_independent_distance
 
 
 def test_the_sandwich_of_independent_noise_is_the_inverse_of_the_information(generator: Generator) -> None:
-    """For residuals of unit variance the scores vary as the Hessian, so that both reduce to its inverse."""
+    """The scores of residuals of unit variance vary as the Hessian, so that both reduce to its inverse."""
     jacobian = torch.randn((1, 20000, 6), generator=generator, dtype=torch.float64)
     noise = torch.randn((1, 20000, 1), generator=generator, dtype=torch.float64)
     hessian = jacobian.mT @ jacobian

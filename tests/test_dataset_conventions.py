@@ -37,7 +37,7 @@ class Agreement:
 
 
 def agreement(pairs: Sequence[tuple[View, View]], first: Mistake, second: Mistake) -> Agreement:
-    """With a mistake made in the views that measure, and one in those that are compared with them."""
+    """A mistake in the views that measure is noticed, and so is one in those that are compared with them."""
     results = torch.tensor([compared(first(a), second(b)) for a, b in pairs])
     return Agreement(*results.mean(dim=0).tolist())
 

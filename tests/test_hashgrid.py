@@ -355,7 +355,7 @@ def test_the_coarse_level_is_smoother(field: HashGridField) -> None:
 
 
 def test_a_scene_of_another_size_is_the_same_scene() -> None:
-    """With lengths in millimetres, an untrained field is as thick to the eye as in metres."""
+    """An untrained field is as opaque with lengths in millimetres as in metres."""
     opacity = []
     for unit in (1.0, 1000.0):
         scaled = SceneBounds(

@@ -42,7 +42,7 @@ def test_keyframes_show_the_field_from_the_cameras() -> None:
 
 
 def test_keyframes_are_as_many_and_as_large_as_is_useful_at_most() -> None:
-    """Of many cameras, evenly many; of a large one, the same view with fewer pixels."""
+    """Many cameras are thinned out evenly, and a large image is rendered with fewer pixels."""
     cameras = [(TINY, T) for T in orbit(2.0, 2 * MOST + 1)]
     found = rendered_views(HomogeneousBall(0.5, 1.0, sampler=Stratified(1)), CUBE, cameras)
     assert len(found) <= MOST

@@ -71,7 +71,7 @@ def test_it_finds_what_scipy_finds() -> None:
 
 
 def test_the_cost_never_rises_and_what_is_not_better_is_taken_back() -> None:
-    """From far away, where full steps overshoot."""
+    """The descent begins far away, where full steps overshoot."""
     found = descend(evaluate, starts(32, spread=0.8), 25, damping=1e-6)
     costs = torch.stack([evaluate(found.poses[i]).cost for i in range(26)])
     assert torch.equal(costs, found.costs)
@@ -91,7 +91,7 @@ def test_poses_are_independent_of_each_other() -> None:
 
 
 def test_no_unit_matters() -> None:
-    """With lengths in millimetres the steps are the same (Marquardt's scaling)."""
+    """Steps are the same with lengths in millimetres (Marquardt's scaling)."""
     scale = torch.tensor([1e3, 1e3, 1e3, 1, 1, 1], dtype=torch.float64)
 
     def in_millimetres(T: SE3) -> NormalEquations:

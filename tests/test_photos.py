@@ -131,7 +131,7 @@ def test_reducing_keeps_the_directions_of_pixels(tmp_path: Path, code: int) -> N
 
 @pytest.mark.data
 def test_photos_of_a_phone_show_what_the_dataset_shows(data_dir: Path) -> None:
-    """The same picture as the dataset's copy at an eighth of the size, but for JPEG and the filter."""
+    """The photo equals the dataset's copy at an eighth of the size, up to JPEG and the filter."""
     doll = data_dir / "phone_doll"
     photos, others = photos_in(doll / "photos")
     assert (len(photos), others) == (2, [])

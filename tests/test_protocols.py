@@ -82,7 +82,7 @@ def test_parallel_draws_what_the_global_generator_of_numpy_does(frames: int) -> 
 
 
 def test_parallel_turns_about_the_axes_of_the_world() -> None:
-    """As scipy has it: extrinsic x, then y the other way round, then z, about the camera's own centre."""
+    """The rotation is scipy's: extrinsic x, then y the other way round, then z, about the camera's own centre."""
     _, angles, moves = parallel_inversion.draw_starts(50)
     for i in range(25):
         start = PROTOCOLS["parallel"].start(TRUE, (), 1234 + i, 50)
@@ -94,7 +94,7 @@ def test_parallel_turns_about_the_axes_of_the_world() -> None:
 
 
 def test_parallel_numbers_are_these() -> None:
-    """Of the 200 frames of a NeRF-Synthetic test split."""
+    """The frames are drawn from the 200 of a NeRF-Synthetic test split."""
     chosen, angles, moves = parallel_inversion.draw_starts(200)
     assert chosen.tolist() == [47, 38, 53, 116, 152]
     assert angles[0, 0] == pytest.approx([8.140797565872, 10.820093141331, -10.480891031817], abs=1e-11)

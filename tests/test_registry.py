@@ -134,7 +134,7 @@ def test_without_a_docstring_the_distribution_speaks(site: Site, source: str) ->
 
 
 def test_listing_imports_nothing(site: Site) -> None:
-    """In a process of its own; an import of any of the modules would be seen, whether it fails or not."""
+    """The listing runs in a process of its own, where an import of any of the modules would show, whether it fails or not."""
     site.module("stranger_loud/__init__.py", "raise SystemExit('imported')")
     site.module("stranger_loud/kind.py", GOOD.format(word="noise"))
     site.plugin("loud", "stranger_loud.kind:backend")

@@ -22,7 +22,7 @@ def residuals(about: str, exposure: bool = False, surface_sigma: float = 0.0) ->
 
 @pytest.mark.parametrize("exposure", [False, True])
 def test_the_gradient_of_the_cost_is_the_numerical_one(exposure: bool) -> None:
-    """With exposure, the brightness that fits best goes along with the pose; its rounds end near, not at, the best."""
+    """The exposure that fits best changes with the pose; its rounds end near, not at, the best."""
     about, step = PIVOTS["scene"], 1e-5
     exact = residuals("scene", exposure).normal_equations().gradient
     for k in range(6):

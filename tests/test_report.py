@@ -29,7 +29,7 @@ STEPS = 10
 
 
 def result(seed: int, reached: int | None, size: float = 0.5, **settings: Any) -> TrialResult:
-    """Of a trial that comes under every bar at step ``reached``, if at all."""
+    """Return the result of a trial that meets every criterion from step ``reached`` on, if at all."""
     far = STEPS + 1 if reached is None else reached
     moved = (*(size for _ in range(far)), *(0.001 for _ in range(STEPS + 1 - far)))
     turned = tuple(12.0 if x == size else 0.1 for x in moved)

@@ -102,7 +102,7 @@ def test_there_are_so_many_more_of_them(name: str) -> None:
 
 
 def test_borders_of_a_contiguous_sampler_are_sorted_together() -> None:
-    """Without gaps: the borders of both, in order (Mildenhall et al. 2020, section 5.2)."""
+    """Intervals leave no gaps and have the borders of both, in order (Mildenhall et al. 2020, section 5.2)."""
     where = rays()
     hits = where.far > where.near
     rough, cut = Stratified(12)(where), finer(Stratified(12))(where)

@@ -152,7 +152,7 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
 class Stopped(BaseException):
-    """As Ctrl-C: no ``Exception``."""
+    """An interruption such as Ctrl-C, which is no ``Exception``."""
 
 
 def outcomes(attempt: Callable[[], object], error: BaseException) -> Iterator[BaseException | None]:

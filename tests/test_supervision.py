@@ -62,7 +62,7 @@ def test_the_derivative_is_the_numerical_one() -> None:
 
 
 def test_weight_is_pulled_to_where_depth_was_measured() -> None:
-    """In thin fog, matter at the measured place lowers the term most, and the farther from it, the less it does."""
+    """Matter at the measured place lowers the term most in thin fog, and the farther from it, the less it does."""
     slope = by_density(torch.full((10,), 0.01, dtype=torch.float64), 3.25)  # the middle of cell 6
     assert int(slope.argmin()) == 6
     assert bool((slope < 0).all())  # any matter beats none: what a ray lacks counts as at the camera

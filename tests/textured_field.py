@@ -23,7 +23,7 @@ from bidnerf_core.se3 import SE3
 BOUNDS = SceneBounds((-1.2, -1.2, -0.3), (1.2, 1.2, 0.3), 0.1, 6.0)
 CAMERA = Intrinsics(130.0, 130.0, 64.0, 48.0, 128, 96)
 POSES = orbit(1.7, 3, elevation=(50.0, 70.0), seed=5)
-"""From which no training image was taken."""
+"""Poses (T_world_camera) from which no training image was taken."""
 DENSITY = 120.0  # per metre, well below the ground
 SOFTNESS = 0.01  # metres over which the density rises
 

@@ -50,7 +50,7 @@ def config(steps: int = STEPS, **changes: Any) -> HashGridConfig:
 
 
 def options(steps: int = STEPS) -> list[str]:
-    """The same for the command line."""
+    """Return the options of the command line that make such a field."""
     plain = {
         f: getattr(ENCODING, f) for f in ("levels", "log2_table_size", "base_resolution", "finest_resolution")
     }

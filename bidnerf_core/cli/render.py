@@ -38,10 +38,10 @@ DEEPEST = 65.535  # metres in a 16-bit image of millimetres
 
 
 def run(arguments: list[str]) -> None:
-    parse("render", render, arguments)
+    parse("render", _render, arguments)
 
 
-def render(
+def _render(
     map: MapFolder,
     data: DataFolder,
     out: Annotated[Path, option("DIR", "folder for the images")],
@@ -62,7 +62,7 @@ def render(
         field = stored.field if level is None else _level(stored, level, map)
         names = [name for group in frame for name in group]
         views = read_views(open_dataset(data, stored.bounds.background), split, names or None)
-        _render(field, stored.bounds, views, out)
+        _render_views(field, stored.bounds, views, out)
 
 
 def _level(stored: Map, number: int, folder: Path) -> RadianceField:
@@ -72,7 +72,7 @@ def _level(stored: Map, number: int, folder: Path) -> RadianceField:
     return offered[number]
 
 
-def _render(field: RadianceField, bounds: SceneBounds, views: Sequence[View], out: Path) -> None:
+def _render_views(field: RadianceField, bounds: SceneBounds, views: Sequence[View], out: Path) -> None:
     rows = []
     with console.status("") as status:
         for number, view in enumerate(views):

@@ -54,7 +54,7 @@ LEAST_POINTS = 50
 WORSE = 0.05
 """Largest increase of the cost on the surface by refinement; with more, field and surface contradict each other."""
 MANY_LANDMARKS = 500
-"""With this many landmarks a scene is textured: if an image matches none of them, it shows something else."""
+"""The number of landmarks from which on a scene is textured: an image that matches none of them shows something else."""
 LOSS_POINTS = 200
 """Number of points on which the losses along the path are computed."""
 

@@ -15,7 +15,7 @@ from bidnerf_core.localization.method_settings import AdamSettings
 from bidnerf_core.localization.pivots import PivotName, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.solvers.adam import descend
+from bidnerf_core.localization.solvers.adam import follow_gradient
 from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.pixels import DrawerName
 from bidnerf_core.residuals import Objective
@@ -46,7 +46,7 @@ def descended(
     counts = RayCounts(rays.rays, depth_rays)
     loss = SampledLoss(problem, objective, counts, rays.pixels, rays.renew, rays.level, rays.wide, generator)
     history = History([start])
-    finite, reason = descend(loss, pivot(rays.pivot, problem), adam, history)
+    finite, reason = follow_gradient(loss, pivot(rays.pivot, problem), adam, history)
     T, mean = history.answer(adam.answer)
     verdict = descent_verdict(mean, adam.converged_loss, finite, reason)
     return Localization(

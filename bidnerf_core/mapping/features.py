@@ -82,6 +82,9 @@ class Sift:
         return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantized(root))
 
 
+SIFT = Sift()
+
+
 def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
     """Return the square roots of L1-normalised, non-negative descriptors; their Euclidean distance is the Hellinger one."""
     total = descriptors.sum(-1, keepdim=True).clamp(min=torch.finfo(descriptors.dtype).tiny)

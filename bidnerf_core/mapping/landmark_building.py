@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
-from bidnerf_core.mapping.features import Features, Sift
+from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.mapping.keypoint_depth import depth_noise, measured_depth, placed
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
@@ -34,7 +34,6 @@ from bidnerf_core.mapping.view_pairs import likely_pairs
 _Item = TypeVar("_Item")
 Result = TypeVar("Result")
 
-SIFT = Sift()
 TOLERANCES = (10.0, 4.0, 2.0)
 """Largest reprojection error (pixels) of an observation that stays in its track, round by round."""
 TWO_VIEWS = 1.5

@@ -24,12 +24,11 @@ from bidnerf_core.localization.search.guided import guided_matches
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
 from bidnerf_core.localization.search.unguided import unguided_matches
-from bidnerf_core.mapping.features import Features, Sift, paired_squared_distances
+from bidnerf_core.mapping.features import SIFT, Features, paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import ObservedPoints, ReprojectionFit, resect
 from bidnerf_core.se3 import SE3
 
-SIFT = Sift()
 THRESHOLD = 0.005
 """Largest reprojection error of an inlier, as a share of the image's diagonal; never less than 2 pixels."""
 RADII = (2.0, 1.0)

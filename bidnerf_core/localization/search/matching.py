@@ -13,9 +13,9 @@ from bidnerf_core.mapping.features import squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 
 EXACT = 4_000
-"""Up to this number of landmarks the search is exhaustive, and no cells are built."""
+"""The number of landmarks up to which the search is exhaustive, and no cells are built."""
 COMPARISONS = 30_000_000
-"""Up to this number of keypoint-landmark pairs, comparing all of them is faster than searching cells."""
+"""The number of keypoint-landmark pairs up to which comparing all of them is faster than searching cells."""
 QUERY_BLOCK = 64
 """Width of the blocks of columns whose minima are ranked first, because ranking all columns is slower."""
 PROBED = 12

@@ -16,7 +16,7 @@ from bidnerf_core.se3 import SE3
 Loss = Callable[[SE3], Tensor]
 
 
-def descend(loss: Loss, pivot: Pivot, config: AdamSettings, history: History) -> tuple[bool, str]:
+def follow_gradient(loss: Loss, pivot: Pivot, config: AdamSettings, history: History) -> tuple[bool, str]:
     """Take steps from ``history.T``, record them, and return whether they stayed finite and why they ended.
 
     Each step writes the pose as an update delta of the current one about ``pivot``, takes the gradient by delta at 0, and

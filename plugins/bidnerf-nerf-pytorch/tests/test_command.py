@@ -1,4 +1,4 @@
-"""From a checkpoint to a map, and training that goes on from one."""
+"""Checkpoints become maps, and training continues from one."""
 
 from __future__ import annotations
 

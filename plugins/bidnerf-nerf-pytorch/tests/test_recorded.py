@@ -44,7 +44,7 @@ def test_lego_is_seen_where_it_is(nerf_pytorch_data: Path) -> None:
 
 
 def squared_error(field: NerfPytorchField, view: View) -> torch.Tensor:
-    """Of colour, at a lattice of pixels, from the image averaged over 2 x 2 of its own."""
+    """Return squared errors of colour at a lattice of pixels, against the image averaged over 2 x 2 of its own."""
     rgb, intrinsics = view.frame.rgb, view.frame.intrinsics
     small = torch.nn.functional.avg_pool2d(rgb.movedim(-1, 0), 2).movedim(0, -1)[::SPACING, ::SPACING]
     camera, T_world_camera = intrinsics.scaled(0.5), view.T_ref_camera.to(torch.float32)
