@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import max_pool1d, pad
 
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples
 from bidnerf_core.rendering import query_samples, rendering_weights
@@ -113,6 +113,69 @@ class Importance:
             weights = rendering_weights(query_samples(self.field, rays, rough).density, rough)
             weights = torch.where(rough.valid, weights + 1e-5, 0)
             return _cut(rough, *inverse_transform(rough, weights, self.count, jitter))
+
+
+UNIFORM_SHARE = 0.1
+"""Weight that ``Concentrated`` spreads evenly over a ray, so that matter which the guide does not know of is found."""
+
+
+@dataclass(frozen=True)
+class Concentrated:
+    """At most ``count`` intervals of each ray, short where the field ``guide`` has its weight and long elsewhere.
+
+    Each stands for an equal part of the weight that the guide gives to the ray's own valid intervals, and is as long as what it
+    replaces of them. A ray with ``count`` intervals or fewer keeps them. No gradient flows through the choice.
+    """
+
+    guide: RadianceField
+    count: int
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        rough = _gathered(self.guide.sampler(rays, jitter))
+        if rough.starts.shape[-1] <= self.count:
+            return rough
+        weights = rendering_weights(query_samples(self.guide, rays, rough).density, rough)
+        few = rough.valid.sum(-1) <= self.count
+        kept = RaySamples(*(part[..., : self.count] for part in (rough.starts, rough.ends, rough.valid)))
+        return _either(few, kept, concentrated(rough, weights, self.count, jitter))
+
+
+def concentrated(
+    samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
+) -> RaySamples:
+    """Return ``count`` intervals in place of ``samples``, each with an equal share of their weight, see ``Concentrated``."""
+    length = torch.where(samples.valid, samples.ends - samples.starts, 0)
+    total = length.sum(-1, keepdim=True).clamp(min=torch.finfo(length.dtype).tiny)
+    blurred = max_pool1d(weights.flatten(0, -2)[:, None], 3, stride=1, padding=1)[:, 0].view_as(weights)
+    mass = torch.where(samples.valid, blurred, 0) + UNIFORM_SHARE * length / total
+    cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=torch.finfo(mass.dtype).tiny), (1, 0))
+    laid = pad(length.cumsum(-1), (1, 0))  # the intervals, laid end to end
+    level = torch.arange(count + 1, dtype=cdf.dtype, device=cdf.device).expand(*cdf.shape[:-1], count + 1) / count
+    if jitter is not None:
+        shift = torch.rand((*cdf.shape[:-1], count - 1), generator=jitter, device=jitter.device).to(cdf) - 0.5
+        level = torch.cat([level[..., :1], level[..., 1:-1] + shift / count, level[..., -1:]], dim=-1)
+    border = _interpolated(level, cdf, laid)
+    middle = (border[..., 1:] + border[..., :-1]) / 2
+    owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(max=length.shape[-1] - 1)
+    at = samples.starts.gather(-1, owner) + (middle - laid.gather(-1, owner))
+    half = border.diff(dim=-1) / 2
+    starts, ends = at - half, at + half
+    # Rounding, and intervals that reach over a gap, must not make two of them overlap.
+    between = (ends[..., :-1] + starts[..., 1:]) / 2
+    starts = torch.cat([starts[..., :1], torch.maximum(starts[..., 1:], between)], dim=-1)
+    ends = torch.cat([torch.minimum(ends[..., :-1], between), ends[..., -1:]], dim=-1)
+    return RaySamples(starts, torch.maximum(starts, ends), (half > 0) & samples.valid.any(-1, keepdim=True))
+
+
+def _interpolated(
+    at: Float[Tensor, "*r n"], x: Float[Tensor, "*r s"], y: Float[Tensor, "*r s"]
+) -> Float[Tensor, "*r n"]:
+    """Return the piecewise linear function through the points (x, y), x ascending, at ``at``."""
+    right = torch.searchsorted(x.contiguous(), at.contiguous(), right=True).clamp(1, x.shape[-1] - 1)
+    x0, x1, y0, y1 = (part.gather(-1, index) for part in (x, y) for index in (right - 1, right))
+    slope = (y1 - y0) / (x1 - x0).clamp(min=torch.finfo(x.dtype).tiny)
+    return torch.minimum(torch.maximum(y0 + (at - x0) * slope, y0), y1)
 
 
 def inverse_transform(

@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.sampling import Concentrated
 from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
-from bidnerf_hashgrid.occupancy import OccupancyGrid
+from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
 
 LARGEST_LOG_DENSITY = 12.0
 
@@ -31,21 +32,18 @@ class FieldConfig(Settings):
     geometry_features: Count = 15  # that the density network passes on to the colour network
     # cells of the occupancy grid along the longest side of the scene
     grid_resolution: Annotated[int, Range(2, 1024)] = 128
+    samples_per_ray: Annotated[int, Range(0)] = 32  # at most; 0: all intervals in occupied cells
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 
 
 class HashGridField(nn.Module):
     """Density and colour in a scene's box. Its ``levels`` are the field with its fine encoding levels masked, and itself."""
 
-    lower: Float[Tensor, "3"]
-
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
         super().__init__()
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        lower = [middle - self.side / 2 for middle in bounds.centre]
-        self.register_buffer("lower", torch.tensor(lower), persistent=False)
         self.encoding = HashEncoding(config.encoding)
         self.geometry = nn.Sequential(
             nn.Linear(self.encoding.width, config.width),
@@ -57,8 +55,13 @@ class HashGridField(nn.Module):
             nn.Linear(config.width, 3),
             nn.Sigmoid(),
         )
-        self.sampler = OccupancyGrid(bounds, config.grid_resolution)
+        self.occupancy = OccupancyGrid(bounds, config.grid_resolution)
         self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
+
+    @property
+    def sampler(self) -> RaySampler:
+        count = self.config.samples_per_ray
+        return Concentrated(GridDensity(self.occupancy), count) if count else self.occupancy
 
     @property
     def levels(self) -> tuple[CoarseField, HashGridField]:
@@ -79,7 +82,7 @@ class HashGridField(nn.Module):
         return FieldValues(density.reshape(shape), self.colour(seen).reshape(*shape, 3))
 
     def encode(self, positions: Float[Tensor, "p 3"], active: int | None) -> Float[Tensor, "p f"]:
-        encoded: Tensor = self.encoding((positions - self.lower) / self.side, active)
+        encoded: Tensor = self.encoding((self.bounds.normalized(positions) + 1) / 2, active)
         return encoded
 
 
@@ -95,6 +98,10 @@ class CoarseField:
 
     @property
     def sampler(self) -> OccupancyGrid:
+        return self.fine.coarse_sampler
+
+    @property
+    def occupancy(self) -> OccupancyGrid:
         return self.fine.coarse_sampler
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:

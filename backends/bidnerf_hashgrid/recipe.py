@@ -52,7 +52,7 @@ class HashGridConfig(FieldConfig):
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve and report.resume() is None:
-        for grid in (field.sampler, field.coarse_sampler):
+        for grid in (field.occupancy, field.coarse_sampler):
             grid.restrict(occupied_voxels(views, grid.grid))
     bank = RayBank(views, field.bounds)
     groups = [
@@ -66,7 +66,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
     def outcome(step: int, generator: Generator) -> StepOutcome:
         coarse = config.coarse_every > 0 and step % config.coarse_every == config.coarse_every - 1
         level: CoarseField | HashGridField = field.levels[0] if coarse else field
-        grid = level.sampler
+        grid = level.occupancy
         affordable = int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1)))
         count = max(1, min(config.rays_at_most, affordable))
         batch = bank.draw(count, generator)
@@ -84,7 +84,9 @@ def _update(
     """Update the occupancy grid by one step's rendering."""
     valid = rendering.samples.valid
     positions = batch.rays.at(rendering.samples.middles)[valid]
-    grid.observe(positions.detach(), rendering.weights.detach()[valid], config.prune_fade)
+    density = rendering.density
+    assert density is not None
+    grid.observe(positions.detach(), rendering.weights.detach()[valid], density.detach()[valid], config.prune_fade)
     grid.samples_per_ray.lerp_(valid.sum() / len(valid), 0.1 if step > 10 else 1.0)
     if step >= config.prune_from and step % config.prune_every in (0, config.coarse_every - 1):
         grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)
