@@ -13,20 +13,19 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
 from bidnerf_core.settings import Count, NotNegative, Range
-from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch, fit
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 
 
 @dataclass(frozen=True)
-class HashGridConfig(FieldConfig):
+class HashGridConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
     steps: Count = 1600  # of the optimizer
     samples_per_step: Count = 65536  # it decides the number of rays
     learning_rate: NotNegative = 1e-2  # of the tables; that of the networks is a quarter of it
     coarse_every: Annotated[int, Range(0)] = 4  # every so many steps, the coarse field is trained; 0: never
-    depth_weight: NotNegative = 0.1  # of the depth term beside the colour term; 0 leaves depth out
     seed: Annotated[int, Range(0)] = 0  # of the initial weights and of all random draws
     rays_at_most: Count = 16384  # a step, even if they take few samples
     prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
@@ -54,13 +53,14 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
     if config.carve and report.resume() is None:
         for grid in (field.occupancy, field.coarse_sampler):
             grid.restrict(occupied_voxels(views, grid.grid))
-    bank = RayBank(views, field.bounds)
+    supervision = Supervision(views, field.bounds, config)
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
         {
             "params": [*field.geometry.parameters(), *field.colour.parameters()],
             "lr": config.learning_rate / 4,
         },
+        *supervision.groups(),
     ]
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
@@ -69,13 +69,13 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         grid = level.occupancy
         affordable = int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1)))
         count = max(1, min(config.rays_at_most, affordable))
-        batch = bank.draw(count, generator)
+        batch = supervision.draw(count, generator)
         rendering = render(level, batch.rays, batch.background, generator)
         _update(grid, batch, rendering, step, config)
-        loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
+        loss, mse = supervision.loss(rendering, batch)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
-    fit(field, groups, outcome, config.steps, report, seed=config.seed)
+    fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
 
 
 def _update(
