@@ -9,19 +9,25 @@ from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 from torch.nn.functional import max_pool1d, pad
 
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.rendering import query_samples, rendering_weights
 from bidnerf_core.voxel_grid import OccupancyMask
 
 
 @dataclass(frozen=True)
 class Stratified:
-    """``count`` equal intervals of [near, far]; with jitter, their borders move at random within half an interval."""
+    """``count`` intervals of [near, far]; with jitter, their borders move at random within half an interval.
+
+    They are equal in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
+    """
 
     count: int
+    bounds: SceneBounds | None = None
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        near, far = rays.near.detach()[..., None], rays.far.detach()[..., None]
+        limits = torch.stack([rays.near.detach(), rays.far.detach()], dim=-1)
+        spacing = None if self.bounds is None else self.bounds.spacing(rays)
+        near, far = (limits if spacing is None else spacing.place(limits)).split(1, dim=-1)
         borders = torch.linspace(0, 1, self.count + 1, dtype=near.dtype, device=near.device)
         borders = borders.expand(*rays.near.shape, -1)
         if jitter is not None:
@@ -31,6 +37,8 @@ class Stratified:
             inner = borders[..., 1:-1] + shift.to(near) / self.count
             borders = torch.cat([borders[..., :1], inner, borders[..., -1:]], dim=-1)
         distances = near + (far - near) * borders
+        if spacing is not None:
+            distances = spacing.distance(distances)
         valid = (far > near).expand(*rays.near.shape, self.count)
         return RaySamples(distances[..., :-1], distances[..., 1:], valid)
 
@@ -151,13 +159,17 @@ def concentrated(
     mass = torch.where(samples.valid, blurred, 0) + UNIFORM_SHARE * length / total
     cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=torch.finfo(mass.dtype).tiny), (1, 0))
     laid = pad(length.cumsum(-1), (1, 0))  # the intervals, laid end to end
-    level = torch.arange(count + 1, dtype=cdf.dtype, device=cdf.device).expand(*cdf.shape[:-1], count + 1) / count
+    level = (
+        torch.arange(count + 1, dtype=cdf.dtype, device=cdf.device).expand(*cdf.shape[:-1], count + 1) / count
+    )
     if jitter is not None:
         shift = torch.rand((*cdf.shape[:-1], count - 1), generator=jitter, device=jitter.device).to(cdf) - 0.5
         level = torch.cat([level[..., :1], level[..., 1:-1] + shift / count, level[..., -1:]], dim=-1)
     border = _interpolated(level, cdf, laid)
     middle = (border[..., 1:] + border[..., :-1]) / 2
-    owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(max=length.shape[-1] - 1)
+    owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(
+        max=length.shape[-1] - 1
+    )
     at = samples.starts.gather(-1, owner) + (middle - laid.gather(-1, owner))
     half = border.diff(dim=-1) / 2
     starts, ends = at - half, at + half

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.settings import Count, NotNegative, Range, Settings
+from bidnerf_core.settings import Count, NotNegative, Range
+from bidnerf_core.training import SupervisionConfig
 
 
 @dataclass(frozen=True)
-class AdaNerfConfig(Settings):
+class AdaNerfConfig(SupervisionConfig):
     """Settings of an AdaNeRF. With the defaults, training takes about ten minutes on one core of a small CPU."""
 
     # The shading network.
@@ -35,7 +36,6 @@ class AdaNerfConfig(Settings):
     samples_per_step: Count = 8192  # it decides the number of rays
     rays_at_most: Count = 4096  # per step
     learning_rate: NotNegative = 3e-3
-    depth_weight: NotNegative = 0.1
     sparsity_weight: NotNegative = 0.01  # of the mean score, once the soft phase is half over
     # of the oracle's own loss, with measured depth and shaded bins as targets
     oracle_weight: NotNegative = 0.1

@@ -61,11 +61,21 @@ class HashGridField(nn.Module):
     @property
     def sampler(self) -> RaySampler:
         count = self.config.samples_per_ray
-        return Concentrated(GridDensity(self.occupancy), count) if count else self.occupancy
+        guided = count > 0 and self.occupancy.knows_density
+        return Concentrated(GridDensity(self.occupancy), count) if guided else self.occupancy
 
     @property
     def levels(self) -> tuple[CoarseField, HashGridField]:
         return CoarseField(self), self
+
+    def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return a stored state with today's names. The occupancy grid was the sampler, and it observed no densities."""
+        old = "sampler."
+        state = {f"occupancy.{k.removeprefix(old)}" if k.startswith(old) else k: v for k, v in state.items()}
+        for name in ("occupancy", "coarse_sampler"):
+            if (peak := state.get(f"{name}.peak")) is not None:
+                state.setdefault(f"{name}.density", torch.full_like(peak, torch.nan))
+        return state
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         return self.query_levels(positions, directions, None)

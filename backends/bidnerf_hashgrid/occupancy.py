@@ -54,7 +54,11 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def observe(
-        self, positions: Float[Tensor, "p 3"], weights: Float[Tensor, "p"], density: Float[Tensor, "p"], fade: float
+        self,
+        positions: Float[Tensor, "p 3"],
+        weights: Float[Tensor, "p"],
+        density: Float[Tensor, "p"],
+        fade: float,
     ) -> None:
         """Update peaks and densities by the rendering weights and densities at one batch's samples, ``positions`` (metres, world)."""
         cells = self.grid.numbers(positions)
@@ -89,16 +93,22 @@ class OccupancyGrid(nn.Module):
         kept = occupied & (place < far[ray][:, None])
         samples = self._padded(place[kept], ray[:, None].expand_as(kept)[kept], near, far)
         width = samples.valid.shape[-1]
-        starts, ends = (spacing.distance(part).reshape(*shape, width) for part in (samples.starts, samples.ends))
+        starts, ends = (
+            spacing.distance(part).reshape(*shape, width) for part in (samples.starts, samples.ends)
+        )
         return RaySamples(starts, ends, samples.valid.reshape(*shape, width))
 
-    def _busy_blocks(self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+    def _busy_blocks(
+        self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the ray and the start of each run of ``BLOCK`` steps that passes near an occupied cell, in order."""
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
         starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
         positions = rays.at(spacing.distance(starts + length / 2))
-        ray, block = ((starts < far[:, None]) & self.grid.at(self.near_occupied, positions)).nonzero(as_tuple=True)
+        ray, block = ((starts < far[:, None]) & self.grid.at(self.near_occupied, positions)).nonzero(
+            as_tuple=True
+        )
         return ray, starts[ray, block]
 
     def _padded(self, place: Tensor, ray: Tensor, near: Tensor, far: Tensor) -> RaySamples:
@@ -113,6 +123,11 @@ class OccupancyGrid(nn.Module):
         starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
         ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)
         return RaySamples(starts, ends, valid)
+
+    @property
+    def knows_density(self) -> bool:
+        """Whether densities were observed: maps that were trained before grids did so have none."""
+        return not bool(self.density.view(-1)[0].isnan())
 
     def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))

@@ -86,7 +86,9 @@ def _update(
     positions = batch.rays.at(rendering.samples.middles)[valid]
     density = rendering.density
     assert density is not None
-    grid.observe(positions.detach(), rendering.weights.detach()[valid], density.detach()[valid], config.prune_fade)
+    grid.observe(
+        positions.detach(), rendering.weights.detach()[valid], density.detach()[valid], config.prune_fade
+    )
     grid.samples_per_ray.lerp_(valid.sum() / len(valid), 0.1 if step > 10 else 1.0)
     if step >= config.prune_from and step % config.prune_every in (0, config.coarse_every - 1):
         grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)

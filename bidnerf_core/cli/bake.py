@@ -15,6 +15,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import build_landmarks
+from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.storage import Map, cameras_of, load_info, load_map, save_landmarks, save_surface
 
 
@@ -47,8 +48,10 @@ def _bake(
     bake_map(map, views, config)
 
 
-def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
-    """Bake the surface and the landmarks of the map in ``folder``.
+def bake_map(
+    folder: Path, views: Sequence[View], config: BakeConfig, landmarks: LandmarkMap | None = None
+) -> None:
+    """Bake the surface and the landmarks of the map in ``folder``; ``landmarks`` if they were built already.
 
     Of ``views``, those with measured depth take the place of rendered ones for the surface, and all of them give landmarks;
     without views, landmarks come from images that the field renders.
@@ -63,6 +66,9 @@ def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
     _bake_surface(folder, stored, views, cameras, config)
     # Photos alone show how well the field renders; against its own images it has no error.
     noise = colour_noise(stored.field, stored.bounds, views) if views else stored.colour_noise
+    if landmarks is not None:
+        save_landmarks(folder, stored.info, landmarks, noise)
+        return
     photos = views or rendered_views(stored.field, stored.bounds, cameras)
     _bake_landmarks(folder, stored, photos, noise)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,13 +25,15 @@ from bidnerf_core.cli.common import (
     value_of,
     wrong_usage,
 )
-from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
+from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining, counted
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.images import background_colour
 from bidnerf_core.mapping import BakeConfig
+from bidnerf_core.mapping.landmark_building import landmarks_and_views
+from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
@@ -131,12 +134,31 @@ def train_map(
     sparse_depth: int = 0,
 ) -> None:  # fmt: skip
     """Train a new map into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
+    landmarks, views = located(views)
     bounds = estimate_bounds(views, background)
     settings = to_plain(config, "config")
     info = MapInfo(
         name, settings, bounds, 0, False, data, cameras=stored_cameras(views), sparse_depth=sparse_depth
     )
-    _run(backend, info, out, views, checkpoint_seconds, baked)
+    _run(backend, info, out, views, landmarks, checkpoint_seconds, baked)
+
+
+def located(views: Sequence[View]) -> tuple[LandmarkMap | None, list[View]]:
+    """Build the landmarks that training takes distances from, where not all views have dense depth.
+
+    Return them, and the views with those that each shows. Where none are found, training goes on without.
+    """
+    if all(view.frame.has_dense_depth for view in views):
+        return None, list(views)
+    began = time.monotonic()
+    try:
+        with counted("landmarks", "steps") as report:
+            landmarks, shown = landmarks_and_views(views, progress=report, report=say)
+    except InputError as error:
+        say(f"no landmarks to train on: {error}")
+        return None, list(views)
+    say(f"{len(landmarks)} landmarks from {len(views)} views, {time.monotonic() - began:.1f} s")
+    return landmarks, shown
 
 
 def load_interrupted(out: Path, baking: bool) -> MapInfo:
@@ -212,11 +234,13 @@ def _resume(
         say(f"{out}: training is complete ({info.step} steps); baking its surface")
         bake_map(out, views, BakeConfig())
         return
-    _run(load_backend(info.backend, str(out)), info, out, views, checkpoint_seconds, baked)
+    landmarks, views = located(views)  # the same as when the training began
+    _run(load_backend(info.backend, str(out)), info, out, views, landmarks, checkpoint_seconds, baked)
 
 
 def _run(
-    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], checkpoint_seconds: float, baked: bool
+    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], landmarks: LandmarkMap | None,
+    checkpoint_seconds: float, baked: bool,
 ) -> None:  # fmt: skip
     field, config = build_field(backend, info, str(out))
     state = load_state(out, info, field) if info.step else None
@@ -227,7 +251,7 @@ def _run(
         report.finish(field)
     if baked:
         try:
-            bake_map(out, views, BakeConfig())
+            bake_map(out, views, BakeConfig(), landmarks)
         except InputError as error:  # the map itself is sound
             say(f"{out}: no surface baked: {error}")
     say(f"{out}: map of {info.data}, {sum(f.stat().st_size for f in out.iterdir()) / 2**20:.1f} MiB")

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
+from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.mapping.keypoint_depth import depth_noise, measured_depth, placed
-from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks, seen_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
 from bidnerf_core.mapping.pose_scatter import pose_scatter
 from bidnerf_core.mapping.tracks import PosedKeypoints, epipolar_matches, joined_tracks
@@ -71,6 +71,17 @@ def build_landmarks(
     ``progress`` is called with the number of images and image pairs done and their total, and ``report`` with a sentence if
     landmarks had to be dropped. Raises ``InputError`` if no landmark was found.
     """
+    return landmarks_and_views(views, features, config, progress, report)[0]
+
+
+def landmarks_and_views(
+    views: Sequence[View],
+    features: Features = SIFT,
+    config: LandmarkConfig = LandmarkConfig(),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    report: Callable[[str], None] = lambda sentence: None,
+) -> tuple[LandmarkMap, list[View]]:
+    """Build landmarks, see ``build_landmarks``, and return the views with the triangulated landmarks that each of them shows."""
     if not views:
         raise InputError("nothing to build landmarks from: expected at least one view")
     pairs = likely_pairs(views, config.neighbours).tolist() if len(views) > 1 else []
@@ -84,12 +95,13 @@ def build_landmarks(
     depth = torch.cat(
         [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
     )
-    found = _located(observations, depth, config)
+    found, seen = _located(observations, depth, config)
     if not len(found):
         raise InputError(
             f"no landmark found in {len(views)} images: expected texture that several images show from different places"
         )
-    return _bounded(found, config.most, report)
+    shown = [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
+    return _bounded(found, config.most, report), shown
 
 
 def _detected(view: View, features: Features) -> PosedKeypoints:
@@ -102,8 +114,10 @@ def _detected(view: View, features: Features) -> PosedKeypoints:
 
 def _located(
     observations: TrackedKeypoints, depth: Float[Tensor, "m"], config: LandmarkConfig
-) -> LandmarkMap:
-    """Return the triangulated landmarks, then those that measured depth places, made from the remaining keypoints."""
+) -> tuple[LandmarkMap, list[SeenLandmarks]]:
+    """Return the triangulated landmarks, then those that measured depth places, made from the remaining keypoints, and
+    which of the triangulated ones each image shows.
+    """
     tracked = torch.bincount(observations.point)[observations.point] > 1
     kept, positions, covariance = _triangulated(observations[tracked], radians(config.parallax))
     sightings = kept.sightings
@@ -115,8 +129,9 @@ def _located(
     relative = depth_noise(sightings, positions, depth[kept.number])
     left = torch.ones_like(tracked).index_fill_(0, kept.number, False)
     left &= tracked | config.singles
-    rest, positions, covariance = placed(observations[left], depth[left], relative, pixel_noise)
-    return concatenated([triangulated, fused_landmarks(rest, positions, covariance, pixel_noise)])
+    rest, placed_at, spread = placed(observations[left], depth[left], relative, pixel_noise)
+    landmarks = concatenated([triangulated, fused_landmarks(rest, placed_at, spread, pixel_noise)])
+    return landmarks, seen_landmarks(kept, positions, pixel_noise**2 * covariance)
 
 
 def _triangulated(

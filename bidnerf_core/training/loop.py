@@ -83,7 +83,11 @@ def _parameters(optimizer: torch.optim.Optimizer) -> Iterator[Tensor]:
 
 
 def _state(
-    step: int, field: nn.Module, optimizer: torch.optim.Optimizer, generator: Generator, beside: nn.Module | None
+    step: int,
+    field: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    generator: Generator,
+    beside: nn.Module | None,
 ) -> TrainingState:
     moments = {"generator": generator.get_state()}
     if beside is not None:

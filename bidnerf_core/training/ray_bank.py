@@ -122,7 +122,9 @@ class _LandmarkPixels:
 
 def _landmark_pixels(views: Sequence[View], offsets: Int[Tensor, "v"]) -> _LandmarkPixels:
     """Return the landmarks of the views without dense depth, whose own measurements are better."""
-    parts: list[tuple[Tensor, Tensor, Tensor]] = [(torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))]
+    parts: list[tuple[Tensor, Tensor, Tensor]] = [
+        (torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))
+    ]
     for view, first in zip(views, offsets.tolist(), strict=True):
         seen, camera = view.landmarks, view.frame.intrinsics
         if seen is None or view.frame.has_dense_depth:
