@@ -197,14 +197,19 @@ def test_peaks_rise_at_once_fade_when_visited_and_stay_when_not() -> None:
     grid = grid_of(torch.zeros((RESOLUTION,) * 3, dtype=torch.bool))
     grid.peak.fill_(0.5)
     here, there = cell_centres(grid.grid)[[3, 6], [4, 7], [5, 8]]
-    grid.observe(torch.stack([here, there, here, here]), torch.tensor([0.1, 0.9, 0.2, 0.0]), fade=0.8)
+    weights, densities = torch.tensor([0.1, 0.9, 0.2, 0.0]), torch.tensor([3.0, 8.0, 2.0, 1.0])
+    grid.observe(torch.stack([here, there, here, here]), weights, densities, fade=0.8)
+    assert float(grid.density[3, 4, 5]) == 3
+    assert float(grid.density[6, 7, 8]) == 8
+    assert int((grid.density != 0).sum()) == 2
     assert float(grid.peak[3, 4, 5]) == pytest.approx(0.4)
     assert float(grid.peak[6, 7, 8]) == pytest.approx(0.9)
     assert int((grid.peak != 0.5).sum()) == 2
-    grid.observe(here[None], torch.tensor([0.35]), fade=0.8)
+    grid.observe(here[None], torch.tensor([0.35]), torch.ones(1), fade=0.8)
+    assert float(grid.density[3, 4, 5]) == pytest.approx(2.4)
     assert float(grid.peak[3, 4, 5]) == pytest.approx(0.35)
     before = grid.peak.clone()
-    grid.observe(torch.zeros(0, 3), torch.zeros(0), fade=0.8)
+    grid.observe(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), fade=0.8)
     assert torch.equal(grid.peak, before)
 
 
@@ -273,7 +278,7 @@ def test_levels_are_coarse_and_fine(field: HashGridField) -> None:
     assert fine is field
     assert isinstance(coarse, RadianceField)
     assert coarse.sampler is field.coarse_sampler
-    assert coarse.sampler.grid.shape[0] * 2 == field.sampler.grid.shape[0]
+    assert coarse.sampler.grid.shape[0] * 2 == field.occupancy.grid.shape[0]
 
 
 @pytest.mark.parametrize("level", [0, 1])

@@ -82,13 +82,14 @@ def _update(
     grid: OccupancyGrid, batch: TrainingBatch, rendering: Rendering, step: int, config: HashGridConfig
 ) -> None:
     """Update the occupancy grid by one step's rendering."""
-    valid = rendering.samples.valid
-    positions = batch.rays.at(rendering.samples.middles)[valid]
-    density = rendering.density
-    assert density is not None
-    grid.observe(
-        positions.detach(), rendering.weights.detach()[valid], density.detach()[valid], config.prune_fade
-    )
+    samples, density = rendering.samples, rendering.density
+    assert density is not None  # it comes from ``render``
+    valid = samples.valid
+    # The weights that steps of the grid would have: samples are longer or shorter, as they are concentrated.
+    place = grid.bounds.spacing(batch.rays).place
+    weights = rendering.weights.detach() * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
+    positions = batch.rays.at(samples.middles).detach()
+    grid.observe(positions[valid], weights[valid].clamp(max=1), density.detach()[valid], config.prune_fade)
     grid.samples_per_ray.lerp_(valid.sum() / len(valid), 0.1 if step > 10 else 1.0)
     if step >= config.prune_from and step % config.prune_every in (0, config.coarse_every - 1):
         grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)
