@@ -123,16 +123,19 @@ class Importance:
             return _cut(rough, *inverse_transform(rough, weights, self.count, jitter))
 
 
-UNIFORM_SHARE = 0.1
-"""Weight that ``Concentrated`` spreads evenly over a ray, so that matter which the guide does not know of is found."""
+EVEN_SHARE = 0.25
+"""Fraction of the borders that ``Concentrated`` spreads evenly, so that matter which the guide does not know of is found."""
+TAIL = 0.005
+"""Fraction of a ray's weight, at either end, that ``Concentrated`` leaves to evenly spread intervals."""
 
 
 @dataclass(frozen=True)
 class Concentrated:
     """At most ``count`` intervals of each ray, short where the field ``guide`` has its weight and long elsewhere.
 
-    Each stands for an equal part of the weight that the guide gives to the ray's own valid intervals, and is as long as what it
-    replaces of them. A ray with ``count`` intervals or fewer keeps them. No gradient flows through the choice.
+    Three quarters of the borders divide the weight that the guide gives to the ray's own valid intervals into equal parts, the
+    others their length. Each interval is as long as what it replaces. A ray with ``count`` intervals or fewer keeps them. No
+    gradient flows through the choice.
     """
 
     guide: RadianceField
@@ -152,32 +155,45 @@ class Concentrated:
 def concentrated(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> RaySamples:
-    """Return ``count`` intervals in place of ``samples``, each with an equal share of their weight, see ``Concentrated``."""
+    """Return ``count`` intervals in place of ``samples``, short where these have ``weights``, see ``Concentrated``."""
     length = torch.where(samples.valid, samples.ends - samples.starts, 0)
-    total = length.sum(-1, keepdim=True).clamp(min=torch.finfo(length.dtype).tiny)
-    blurred = max_pool1d(weights.flatten(0, -2)[:, None], 3, stride=1, padding=1)[:, 0].view_as(weights)
-    mass = torch.where(samples.valid, blurred, 0) + UNIFORM_SHARE * length / total
-    cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=torch.finfo(mass.dtype).tiny), (1, 0))
-    laid = pad(length.cumsum(-1), (1, 0))  # the intervals, laid end to end
-    level = (
-        torch.arange(count + 1, dtype=cdf.dtype, device=cdf.device).expand(*cdf.shape[:-1], count + 1) / count
-    )
-    if jitter is not None:
-        shift = torch.rand((*cdf.shape[:-1], count - 1), generator=jitter, device=jitter.device).to(cdf) - 0.5
-        level = torch.cat([level[..., :1], level[..., 1:-1] + shift / count, level[..., -1:]], dim=-1)
-    border = _interpolated(level, cdf, laid)
-    middle = (border[..., 1:] + border[..., :-1]) / 2
+    laid = pad(length.cumsum(-1), (1, 0))  # borders of the intervals, laid end to end
+    border = _borders(weights, length, laid, count, jitter)
+    middle, half = (border[..., 1:] + border[..., :-1]) / 2, border.diff(dim=-1) / 2
     owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(
         max=length.shape[-1] - 1
     )
     at = samples.starts.gather(-1, owner) + (middle - laid.gather(-1, owner))
-    half = border.diff(dim=-1) / 2
     starts, ends = at - half, at + half
     # Rounding, and intervals that reach over a gap, must not make two of them overlap.
     between = (ends[..., :-1] + starts[..., 1:]) / 2
     starts = torch.cat([starts[..., :1], torch.maximum(starts[..., 1:], between)], dim=-1)
     ends = torch.cat([torch.minimum(ends[..., :-1], between), ends[..., -1:]], dim=-1)
     return RaySamples(starts, torch.maximum(starts, ends), (half > 0) & samples.valid.any(-1, keepdim=True))
+
+
+def _borders(
+    weights: Float[Tensor, "*r s"], length: Float[Tensor, "*r s"], laid: Float[Tensor, "*r b"], count: int,
+    jitter: Generator | None,
+) -> Float[Tensor, "*r n"]:  # fmt: skip
+    """Return the ``count + 1`` borders in the coordinate of the intervals laid end to end: equal weight, and equal length."""
+    blurred = max_pool1d(weights.reshape(-1, 1, weights.shape[-1]), 3, stride=1, padding=1).view_as(weights)
+    mass = torch.where(length > 0, blurred, 0) + 1e-5 * length / laid[..., -1:].clamp(min=1e-30)
+    cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=1e-30), (1, 0))
+    even = max(2, round(EVEN_SHARE * (count + 1)))
+    dense = TAIL + (1 - 2 * TAIL) * _levels(count + 1 - even, laid, jitter)
+    by_weight = _interpolated(dense, cdf, laid)
+    by_length = _levels(even, laid, jitter) * laid[..., -1:]
+    return torch.cat([by_weight, by_length], dim=-1).sort(dim=-1).values
+
+
+def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -> Float[Tensor, "*r n"]:
+    """Return ``count`` numbers from 0 to 1 at equal steps; with jitter, those between move at random within half a step."""
+    levels = torch.linspace(0, 1, count, dtype=like.dtype, device=like.device).repeat(*like.shape[:-1], 1)
+    if jitter is not None and count > 2:
+        shift = torch.rand((*like.shape[:-1], count - 2), generator=jitter, device=jitter.device) - 0.5
+        levels[..., 1:-1] += shift.to(levels) / (count - 1)
+    return levels
 
 
 def _interpolated(

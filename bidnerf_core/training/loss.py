@@ -39,9 +39,7 @@ def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor,
     return torch.where(measured, away + missing, 0).sum() / measured.sum().clamp(min=1)
 
 
-def expected_distance(
-    offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p"]
-) -> Float[Tensor, "*p"]:
+def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p"]) -> Float[Tensor, "*p"]:
     """Return the mean of ``|offset + e|`` over normal errors ``e`` of a standard deviation: the mean of a folded normal."""
     sigma = deviation.clamp(min=torch.finfo(offset.dtype).tiny)
     ratio = (offset / sigma).clamp(-30, 30)
