@@ -10,7 +10,8 @@ These keys are read from a frame or, where it lacks them, from the file: ``camer
 0.001; as in nerfstudio it holds for ``.npy`` depth as well). These are read from a frame only: ``file_path`` (its extension
 may be missing), ``transform_matrix``, ``depth_file_path`` (planar z; see ``depth_images`` for values that count as not
 measured). ``applied_transform`` and ``applied_scale`` record what was already done to the poses. They are not undone, so
-the world is that of the file. Other keys are ignored.
+the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or by the number
+that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
 
 Images are used as they are stored: poses and intrinsics describe that raster, so an EXIF orientation is not applied.
 """
@@ -21,6 +22,7 @@ from functools import cached_property
 from pathlib import Path
 
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
 from bidnerf_core.depth_images import read_depth
@@ -41,6 +43,9 @@ class TransformsReader:
 
     def open(self, path: Path, background: Background | None) -> Dataset:
         return TransformsDataset(path, read_splits(path), background)
+
+    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+        return TransformsDataset(path, read_splits(path), background).sequence()
 
 
 class TransformsDataset(SplitDataset[FrameRecord]):
