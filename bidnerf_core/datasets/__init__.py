@@ -17,7 +17,9 @@ from bidnerf_core.datasets.sequence import (
     TimedFrame,
     sequence_of,
 )
+from bidnerf_core.datasets.seven_scenes import SevenScenesReader
 from bidnerf_core.datasets.transforms import TransformsReader
+from bidnerf_core.datasets.tum import TumReader
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError
 from bidnerf_core.images import Background
@@ -65,7 +67,7 @@ class SequenceReader(Protocol):
     def open_sequence(self, path: Path, background: Background | None) -> FrameSequence: ...
 
 
-READERS: list[Reader] = [TransformsReader(), ScannerAppReader()]
+READERS: list[Reader] = [TransformsReader(), ScannerAppReader(), TumReader(), SevenScenesReader()]
 """The formats that ``open_dataset`` tries, in this order; append a reader to add one."""
 
 

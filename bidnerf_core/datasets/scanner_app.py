@@ -53,8 +53,6 @@ HIGH_CONFIDENCE = 2
 POSE, INTRINSICS, PROJECTION = "cameraPoseARFrame", "intrinsics", "projectionMatrix"
 PHOTO = re.compile(r"frame_(\d+)\.jpe?g", re.IGNORECASE)
 DEPTH = re.compile(r"depth_(\d+)\.png")
-BETWEEN = "between"
-"""The frames between photos. Only the sequence has them, since every split of a dataset has images."""
 OTHER_SIZE = 0.01
 """Relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that shows another image size."""
 
@@ -109,8 +107,8 @@ class ScannerAppReader:
     def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
         """Read all descriptions, those of frames that have depth alone included."""
         colour = background_colour("black" if background is None else background)
-        splits = hold_out(scanner_frames(path)) | {BETWEEN: depth_frames(path)}
-        return ScannerAppDataset(Splits(path, splits), colour, self.largest).sequence()
+        splits = Splits(path, hold_out(scanner_frames(path)))
+        return ScannerAppDataset(splits, colour, self.largest).sequence(depth_frames(path))
 
 
 class ScannerAppDataset(SplitDataset[ScannerFrame]):

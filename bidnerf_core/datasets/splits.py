@@ -118,10 +118,14 @@ class SplitDataset(ABC, Generic[F]):
                 progress(done, len(frames))
         return views
 
-    def sequence(self) -> FrameSequence:
-        """Return the frames of all splits in the order of time, or of their files' names where times are not recorded."""
-        listed = sorted(self._frames.distinct(), key=lambda item: natural_order("/".join(item[1].parts)))
-        names = unique_names([(split, *frame.parts) for split, frame in listed])
+    def sequence(self, others: Sequence[F] = ()) -> FrameSequence:
+        """Return the frames of all splits in the order of time, or of their files' names where times are not recorded.
+
+        ``others`` are frames that no split has, since they lack what a dataset needs.
+        """
+        listed: list[tuple[str | None, F]] = [*self._frames.distinct(), *((None, frame) for frame in others)]
+        listed.sort(key=lambda item: natural_order("/".join(item[1].parts)))
+        names = unique_names([(split or "", *frame.parts) for split, frame in listed])
         return FileSequence.ordered(
             self.path,
             [
@@ -130,7 +134,8 @@ class SplitDataset(ABC, Generic[F]):
             ],
         )
 
-    def _posed(self, frame: F, name: str) -> tuple[Frame, SE3]:
+    def _posed(self, frame: F, name: str) -> tuple[Frame, SE3 | None]:
+        """Read a frame of a sequence, and its pose where there is one."""
         view = self._view(frame, name)
         return view.frame, view.T_ref_camera
 

@@ -25,7 +25,7 @@ from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
-from bidnerf_core.depth_images import read_depth
+from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, background_colour, over, read_header, read_image
@@ -55,6 +55,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         self, path: Path, frames: dict[str, list[FrameRecord]], background: Background | None = None
     ) -> None:
         super().__init__(Splits(path, frames))
+        self._read_depth = DepthReader()
         self._background = None if background is None else background_colour(background)
         self._first: tuple[str, int, int] | None = (
             None  # file, width, height of the first image of unknown size
@@ -80,7 +81,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         colour, alpha = read_image(path)
         depth = None
         if frame.depth_path is not None:
-            depth = read_depth(self._depth_file(frame), frame.depth_unit)
+            depth = self._read_depth(self._depth_file(frame), frame.depth_unit).metres
             if depth.shape != colour.shape[:2]:
                 found = f"{depth.shape[1]}x{depth.shape[0]}"
                 raise frame.record.error(
