@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +143,7 @@ def test_datasets_of_other_readers_have_sequences(tmp_path: Path) -> None:
     sequence = open_sequence(tmp_path, readers=[Reader()])
     assert names(sequence) == list(Others.seen)
     assert [timed.split for timed in sequence] == ["train", "train", "test"]
-    with pytest.raises(InputError, match="has cameras of its own"):
+    with pytest.raises(InputError, match="with cameras of its own"):
         open_sequence(tmp_path, readers=[Reader()], focal=100.0)
 
 
@@ -187,12 +188,8 @@ def test_a_recorded_sequence_is_one_video(data_dir: Path) -> None:
     assert isinstance(sequence, FileSequence)
     times = torch.tensor([time for time in sequence.times if time is not None], dtype=torch.float64)
     assert len(times) == len(sequence) == 199
-    assert 0.1 < float(times.diff().min()) < float(times.diff().max()) < 0.2
+    assert 0.1 < float(times.diff().min()) < float(times.diff().max()) < 0.3  # one frame is missing
     truths = [timed.truth for timed in sequence[:40]]
-    steps = [
-        float((b.translation - a.translation).norm())
-        for a, b in zip(truths, truths[1:], strict=False)
-        if a and b
-    ]
+    steps = [float((b.translation - a.translation).norm()) for a, b in pairwise(truths) if a and b]
     assert len(steps) == 39
     assert max(steps) < 0.1
