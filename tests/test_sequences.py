@@ -182,6 +182,37 @@ def test_places_without_a_sequence(tmp_path: Path) -> None:
 
 
 @pytest.mark.data
+def test_a_nerfstudio_export_is_the_dataset_it_was_made_of(data_dir: Path, tmp_path: Path) -> None:
+    """One file, cameras in the frames, lists of names, and the keys that its converters add; the world is the file's."""
+    original = open_dataset(data_dir / "phone_doll")
+    frames: list[dict[str, Any]] = []
+    camera = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2")
+    for split in ("train", "test"):
+        content = json.loads((data_dir / "phone_doll" / f"transforms_{split}.json").read_text())
+        for number, frame in enumerate(content["frames"]):
+            frames.append(frame | {key: content[key] for key in camera} | {"colmap_im_id": number})
+    lists = {
+        f"{split}_filenames": [f"images/{name}.jpg" for name in original.frame_names(source)]
+        for split, source in (("train", "train"), ("val", "test"), ("test", "test"))
+    }
+    export = {
+        "camera_model": "OPENCV", "orientation_override": "none", "frames": frames, "ply_file_path": "sparse_pc.ply",
+        "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], **lists,
+    }  # fmt: skip
+    (tmp_path / "transforms.json").write_text(json.dumps(export))
+    (tmp_path / "images").symlink_to(data_dir / "phone_doll" / "images")
+    found = open_dataset(tmp_path)
+    assert found.splits == ("train", "val", "test")
+    for split in ("train", "test"):
+        names = original.frame_names(split)[:6]
+        for view, expected in zip(found.views(split, names), original.views(split, names), strict=True):
+            assert view.frame.intrinsics == expected.frame.intrinsics
+            assert torch.equal(view.frame.rgb, expected.frame.rgb)
+            torch.testing.assert_close(view.T_ref_camera.matrix(), expected.T_ref_camera.matrix())
+    assert len(open_sequence(tmp_path)) == 97
+
+
+@pytest.mark.data
 def test_a_recorded_sequence_is_one_video(data_dir: Path) -> None:
     """Train and test together are every fourth frame of a video at 30 Hz, in which the camera does not jump."""
     sequence = open_sequence(data_dir / "tum_fr1_xyz")

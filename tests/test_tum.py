@@ -251,7 +251,7 @@ def test_images_and_depth_that_are_no_pair_are_refused(folder: Path) -> None:
     with pytest.raises(InputError, match=r"depth is 8x6, expected 16x12 as its colour image"):
         next(iter(open_sequence(folder)))
     depth.unlink()
-    with pytest.raises(InputError, match=rf"rgb\.txt: line 4: no image .*{re.escape(depth.name)}"):
+    with pytest.raises(InputError, match=rf"depth\.txt: line 4: no image .*{re.escape(depth.name)}"):
         next(iter(open_sequence(folder)))
 
 
