@@ -29,13 +29,13 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows, require_distinct_times
 from bidnerf_core.datasets.trajectories import LARGEST_GAP, read_trajectory
 from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.se3 import SE3
 
 COLOURS, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
@@ -116,19 +116,13 @@ class TumReader:
         return FolderCamera(path, self.camera, published_camera(path), unknown)
 
 
-class TumDataset(SplitDataset[TumFrame]):
+class TumDataset(OpaqueDataset[TumFrame]):
     """Views of a folder of the TUM RGB-D benchmark; see ``Dataset``."""
 
     def __init__(self, frames: Splits[TumFrame], camera: FolderCamera, background: Background | None) -> None:
-        super().__init__(frames)
+        super().__init__(frames, background)
         self._camera = camera
-        self._background = background_colour("black" if background is None else background)
         self._read_depth = DepthReader(documented=("65535",))
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """The requested colour, or black: the images have no alpha channel."""
-        return self._background
 
     def _view(self, frame: TumFrame, name: str) -> View:
         found, truth = self._posed(frame, name)
