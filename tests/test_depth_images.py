@@ -131,6 +131,10 @@ def test_a_far_plane_in_floats_counts_as_not_measured() -> None:
         (filled(3500), "nearer than any sensor's limit"),
         (filled(10000, share=0.04), "few pixels"),
         (np.full((40, 50), 10000, np.uint16), "a wall and nothing else"),
+        (
+            np.repeat([1000, 4000], [1200, 800]).reshape(40, 50).astype(np.uint16),
+            "two walls that face the camera",
+        ),
         (np.arange(2000).reshape(40, 50).astype(np.uint16) * 5, "a largest value that occurs once"),
     ],
 )
