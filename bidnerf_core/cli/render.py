@@ -46,8 +46,8 @@ def _render(
     map: MapFolder,
     data: DataFolder,
     out: Annotated[Path, option("DIR", "folder for the images")],
-    split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
-    frame: Annotated[Names, option("NAME...", "names of frames", "all of the split")] = (),
+    split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+    frame: Annotated[Names, option("NAME...", "render only these frames", "all of the split")] = (),
     level: Annotated[
         int | None, option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,
