@@ -65,7 +65,7 @@ class RadianceField(Protocol):
     def sampler(self) -> RaySampler: ...
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Return density and colour at ``positions`` (metres, world) seen along unit ``directions``; there may be no points."""
+        """Return density and colour at ``positions`` (metres, world; possibly none) seen along unit ``directions``."""
         ...
 
 
@@ -115,6 +115,6 @@ class SceneBounds:
 
 
 def widened(rays: Rays, factor: float) -> Rays:
-    """Return the rays with an interval ``factor`` times as long about its middle, but not behind the camera (the paper's "wide")."""
+    """Return rays whose interval is ``factor`` times as long (the paper's "wide"), but does not begin behind the camera."""
     middle, half = (rays.near + rays.far) / 2, (rays.far - rays.near) / 2 * factor
     return replace(rays, near=(middle - half).clamp(min=0), far=middle + half)

@@ -193,7 +193,7 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
 
 
 def load_info(folder: Path) -> MapInfo:
-    """Return the checked content of ``map.json``. Raises ``InputError`` where it describes no map, or one of another version."""
+    """Return the checked content of ``map.json``. Raises ``InputError`` where it describes no map of this version."""
     path = folder / DESCRIPTION
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
@@ -218,10 +218,10 @@ def load_info(folder: Path) -> MapInfo:
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
-    """Return the map in ``folder``, its field built by its backend and frozen, on ``device``; what was baked stays on the CPU.
+    """Return the map in ``folder``, its field built by its backend, frozen, and on ``device``.
 
-    ``baked``: whether to read the surface and the landmarks as well. Raises ``InputError`` where the folder is no map, or a
-    damaged one.
+    The surface and the landmarks stay on the CPU; ``baked`` says whether to read them. Raises ``InputError`` where the
+    folder is no map, or a damaged one.
     """
     folder = Path(folder)
     info, tensors, surface, landmarks = _read(folder, baked)

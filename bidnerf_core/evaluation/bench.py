@@ -210,7 +210,7 @@ def _follow_parent() -> None:
 
 
 def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
-    """Raise ``InputError`` where a result of ``file`` was made with other weights, settings or input than its trial has now."""
+    """Raise ``InputError`` where a result of ``file`` had other weights, settings or input than its trial has now."""
     digests: dict[Any, dict[str, Any]] = {}
     for trial in trials:
         known = file.results[key_of(trial)]
