@@ -74,6 +74,10 @@ def levels(field: RadianceField) -> tuple[RadianceField, ...]:
     return tuple(getattr(field, "levels", None) or (field,))
 
 
+LARGEST_LENGTH = 1e15
+"""Metres. Squares of larger lengths come close to the largest number of single precision."""
+
+
 @dataclass(frozen=True)
 class SceneBounds:
     """What may be assumed of a scene before anything is trained. Plain numbers: it is stored as JSON."""
@@ -91,6 +95,11 @@ class SceneBounds:
             )
         if not 0 <= self.near < self.far:
             raise InputError(f"scene bounds: expected 0 <= near < far, got near {self.near}, far {self.far}")
+        largest = max(map(abs, (*self.lower, *self.upper, self.far)))
+        if not largest <= LARGEST_LENGTH:
+            raise InputError(
+                f"scene bounds: {largest:g} m is too large, expected at most {LARGEST_LENGTH:g} m"
+            )
 
     @property
     def size(self) -> tuple[float, float, float]:

@@ -214,6 +214,12 @@ def load_info(folder: Path) -> MapInfo:
     for name in (info.weights, info.training, info.surface, info.landmarks):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
+    for camera in info.cameras:
+        rows = camera.T_world_camera
+        if len(rows) != 4 or not bool(SE3.from_matrix(torch.tensor(rows).double()).is_rigid()):
+            raise InputError(
+                f"{path}: pose of camera {camera.name!r} is not a rigid transform, expected 4x4 rows"
+            )
     return info
 
 
