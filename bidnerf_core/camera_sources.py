@@ -28,7 +28,7 @@ COLMAP_MODELS: dict[str, tuple[int, ...]] = {
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
-"""Parameters of COLMAP's perspective models (https://colmap.github.io/cameras.html), with pixel centres at +0.5 as here."""
+"""Parameters of COLMAP's perspective models (https://colmap.github.io/cameras.html), which also has pixel centres at +0.5."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,7 @@ def _fitted(where: str, raster: Raster, given: Intrinsics, origin: str) -> Camer
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
         raise InputError(
-            f"{where}: image is {size}, its camera is for {given.width}x{given.height}; expected one of the same aspect"
-            " ratio"
+            f"{where}: image is {size}, its camera is for {given.width}x{given.height}; expected one of the same aspect ratio"
         )
     return CameraSource(fitted, f"{origin}: {_focal(fitted)}")
 
