@@ -12,10 +12,10 @@ from bidnerf_core.se3 import SE3, skew
 
 RESECTION_STEPS = 20
 """Largest number of steps; from a good start, four or five suffice."""
-STEP_TOLERANCE = 1e-6
+FIRM = 1e-6
 """Squared length of a step, in standard deviations of the pose, below which the iteration has converged."""
-NOISE_TOLERANCE = 0.01
-"""Relative change of the estimated noise below which the estimate has converged."""
+SETTLED = 0.01
+"""Relative change of the estimated noise below which it has converged."""
 LEAST_NOISE = 0.05
 """Lower limit of the estimated noise, pixels: no detector is more accurate."""
 SCALE = 2.0
@@ -85,32 +85,32 @@ def resect(
     settles. ``focal_factor`` multiplies the focal lengths; with ``free_focal`` it is estimated too, from that start.
     """
     T, log_factor, damping = start, torch.tensor(focal_factor, dtype=torch.float64).log(), 1e-4
-    equations = _linearized(data, T, log_factor, noise, free_focal)
+    system = _linearized(data, T, log_factor, noise, free_focal)
     for _ in range(RESECTION_STEPS):
-        step = -_solved(equations.hessian, damping, equations.gradient)
+        step = -_solved(system.hessian, damping, system.gradient)
         T_new = T.retract(step[:6]).normalized()
         factor_new = log_factor + step[6] if free_focal else log_factor
         tried = _linearized(data, T_new, factor_new, noise, free_focal)
-        if tried.cost <= equations.cost:
-            size = float(step @ equations.hessian @ step)
-            T, log_factor, damping, equations = T_new, factor_new, max(1e-10, damping / 10), tried
-            estimated = max(LEAST_NOISE, noise * equations.spread)
-            converged = abs(estimated / noise - 1) < NOISE_TOLERANCE
-            if not converged:
-                noise = estimated
-                equations = _linearized(data, T, log_factor, noise, free_focal)
-            elif size < STEP_TOLERANCE:
+        if tried.cost <= system.cost:
+            size = float(step @ system.hessian @ step)
+            T, log_factor, damping, system = T_new, factor_new, max(1e-10, damping / 10), tried
+            better = max(LEAST_NOISE, noise * system.spread)
+            settled = abs(better / noise - 1) < SETTLED
+            if not settled:
+                noise = better
+                system = _linearized(data, T, log_factor, noise, free_focal)
+            elif size < FIRM:
                 break
         else:
             damping *= 10
             if damping > 1e8:
                 break
-    covariance = _sandwich(equations)
+    covariance = _sandwich(system)
     return ReprojectionFit(T, float(log_factor.exp()), noise, covariance)
 
 
 @dataclass(frozen=True, eq=False)
-class _Linearization:
+class _System:
     cost: float
     gradient: Float[Tensor, "p"]
     hessian: Float[Tensor, "p p"]
@@ -121,9 +121,7 @@ class _Linearization:
     spread: float  # residuals in standard deviations, robustly: 1 where the noise is right
 
 
-def _linearized(
-    data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, free_focal: bool
-) -> _Linearization:
+def _linearized(data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, free_focal: bool) -> _System:
     """Linearize the residuals, in standard deviations, about ``T`` and the focal factor."""
     local = data.in_camera(T)
     front = local[:, 2] > 1e-9
@@ -142,7 +140,7 @@ def _linearized(
     hessian = (weighted.mT @ jacobian).sum(0)
     # d(w r)/dr = w I - 2 w^2 r r^T / c^2 for w = 1 / (1 + r^2 / c^2).
     curvature = hessian - 2 / SCALE**2 * (single.mT @ single)
-    return _Linearization(
+    return _System(
         float(cost),
         single.sum(0),
         hessian,
@@ -204,10 +202,10 @@ def _solved(hessian: Tensor, damping: float, gradient: Tensor) -> Tensor:
     return torch.linalg.solve(hessian + torch.diag(damping * diagonal), gradient)
 
 
-def _sandwich(equations: _Linearization) -> Float[Tensor, "p p"]:
+def _sandwich(system: _System) -> Float[Tensor, "p p"]:
     """Return the covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, section 6.3)."""
     # With few residuals or many outliers the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
-    values, vectors = torch.linalg.eigh(equations.curvature)
-    least = 0.2 * torch.linalg.eigvalsh(equations.hessian)
+    values, vectors = torch.linalg.eigh(system.curvature)
+    least = 0.2 * torch.linalg.eigvalsh(system.hessian)
     inverse = vectors @ torch.diag(1 / values.maximum(least).clamp(min=1e-12)) @ vectors.mT
-    return inverse @ equations.scatter @ inverse
+    return inverse @ system.scatter @ inverse
