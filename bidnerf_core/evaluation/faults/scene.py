@@ -65,7 +65,7 @@ def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     """Put a textured thing onto ``share`` of the measured surface, from which it rises a little."""
     mask = _surface_piece(frame, share, generator)
     rise = uniform(generator, *ADDED_HEIGHT) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
-    colours = texture(*frame.rgb.shape[:2], generator)
+    colours = texture(frame.intrinsics.height, frame.intrinsics.width, generator)
     return _pasted(frame, mask, colours, measured_depth(frame) * (1 - rise))
 
 
@@ -107,7 +107,8 @@ def _surface_piece(frame: Frame, share: float, generator: Generator) -> Bool[Ten
 
 
 def _bounded_noise(frame: Frame, cells: int, generator: Generator) -> Float[Tensor, "h w"]:
-    return smooth_noise(*frame.rgb.shape[:2], cells, cells, generator).clamp(-2, 2)
+    camera = frame.intrinsics
+    return smooth_noise(camera.height, camera.width, cells, cells, generator).clamp(-2, 2)
 
 
 def _pasted(
