@@ -204,7 +204,9 @@ def test_a_share_of_the_rays_ends_at_landmarks_where_they_are() -> None:
     points = batch.observed[known].points
     surface = exact.draw(20_000, torch.Generator().manual_seed(2)).observed
     off = torch.cdist(points, surface[surface.measured].points).amin(1)
-    assert float((off < 1e-3).float().mean()) > 0.95  # each is a pixel's point, and nearly all pixels were drawn
+    assert (
+        float((off < 1e-3).float().mean()) > 0.95
+    )  # each is a pixel's point, and nearly all pixels were drawn
 
 
 @pytest.mark.parametrize("name", BACKENDS)

@@ -15,7 +15,7 @@ from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
 from bidnerf_core.sampling import Concentrated
 from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
-from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
+from bidnerf_hashgrid.occupancy import UNKNOWN, GridDensity, OccupancyGrid
 
 LARGEST_LOG_DENSITY = 12.0
 
@@ -27,9 +27,10 @@ class FieldConfig(Settings):
     encoding: HashEncodingConfig = field(
         default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=19, finest_resolution=768)
     )
-    width: Count = 64  # of the hidden layers
+    width: Count = 64  # units of a hidden layer
     colour_layers: Count = 2  # hidden layers of the colour network
-    geometry_features: Count = 15  # that the density network passes on to the colour network
+    # number of features that the density network passes on to the colour network
+    geometry_features: Count = 15
     # cells of the occupancy grid along the longest side of the scene
     grid_resolution: Annotated[int, Range(2, 1024)] = 128
     samples_per_ray: Annotated[int, Range(0)] = 32  # at most; 0: all intervals in occupied cells
@@ -74,7 +75,7 @@ class HashGridField(nn.Module):
         state = {f"occupancy.{k.removeprefix(old)}" if k.startswith(old) else k: v for k, v in state.items()}
         for name in ("occupancy", "coarse_sampler"):
             if (peak := state.get(f"{name}.peak")) is not None:
-                state.setdefault(f"{name}.density", torch.full_like(peak, torch.nan))
+                state.setdefault(f"{name}.density", torch.full_like(peak, UNKNOWN))
         return state
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:

@@ -15,6 +15,9 @@ from bidnerf_core.voxel_grid import VoxelGrid
 BLOCK = 8
 """Steps along a ray that are skipped together where no occupied cell is near."""
 
+UNKNOWN = -1.0
+"""Density of all cells of a grid that was stored before grids observed densities."""
+
 
 class OccupancyGrid(nn.Module):
     """A cube of cells around the scene, and a ``RaySampler`` of equal steps within its occupied cells.
@@ -127,7 +130,7 @@ class OccupancyGrid(nn.Module):
     @property
     def knows_density(self) -> bool:
         """Whether densities were observed: maps that were trained before grids did so have none."""
-        return not bool(self.density.view(-1)[0].isnan())
+        return float(self.density.view(-1)[0]) != UNKNOWN
 
     def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))
