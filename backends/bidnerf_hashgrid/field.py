@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated
 
@@ -45,7 +45,7 @@ class HashGridField(nn.Module):
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        self.encoding = HashEncoding(config.encoding)
+        self.encoding = HashEncoding(_scaled(config.encoding, 2 if bounds.contracted else 1))
         self.geometry = nn.Sequential(
             nn.Linear(self.encoding.width, config.width),
             nn.ReLU(),
@@ -95,6 +95,11 @@ class HashGridField(nn.Module):
     def encode(self, positions: Float[Tensor, "p 3"], active: int | None) -> Float[Tensor, "p f"]:
         encoded: Tensor = self.encoding((self.bounds.normalized(positions) + 1) / 2, active)
         return encoded
+
+
+def _scaled(encoding: HashEncodingConfig, factor: int) -> HashEncodingConfig:
+    """Return an encoding with a finest level ``factor`` times as fine: the box is a part of a contracted cube."""
+    return replace(encoding, finest_resolution=factor * encoding.finest_resolution)
 
 
 def _hidden(widths: Sequence[int]) -> list[nn.Module]:

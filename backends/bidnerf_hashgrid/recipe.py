@@ -31,10 +31,10 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
     rays_at_most: Count = 16384  # largest number of rays a step
     prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
     prune_every: Count = 16  # steps from one update of the occupied cells to the next
-    prune_fade: Annotated[float, Range(0, 1)] = 0.95  # factor on a cell's weight when rays visit it
-    prune_threshold: NotNegative = 0.01  # rendering weight up to which a cell is empty
+    prune_fade: Annotated[float, Range(0, 1)] = 0.98  # factor on a cell's weight when rays visit it
+    prune_threshold: NotNegative = 0.002  # rendering weight up to which a cell is empty
     # fraction of the steps in which neighbours of occupied cells are sampled too
-    grow_until: NotNegative = 0.6
+    grow_until: NotNegative = 0.9
     carve: bool = True  # begin with the cells that the views' depth and silhouettes leave
 
     def __post_init__(self) -> None:
