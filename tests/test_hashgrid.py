@@ -378,3 +378,22 @@ def test_building_leaves_the_global_chance_alone() -> None:
     state = torch.get_rng_state()
     backend.build(HashGridConfig(encoding=tiny.ENCODING, grid_resolution=8), BOUNDS)
     assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_a_state_without_densities_is_taken_and_samples_as_it_did(field: HashGridField) -> None:
+    """Maps were stored when the occupancy grid was the sampler itself and observed no densities."""
+    stored = {
+        name.replace("occupancy.", "sampler."): value
+        for name, value in field.state_dict().items()
+        if not name.endswith("density")
+    }
+    field.load_state_dict(field.upgraded_state(stored))
+    assert field.sampler is field.occupancy
+    assert float(field.occupancy.density.max()) < 0
+
+
+def test_todays_state_is_taken_as_it_is(field: HashGridField) -> None:
+    state = field.state_dict()
+    upgraded = field.upgraded_state(state)
+    assert upgraded.keys() == state.keys()
+    assert all(torch.equal(upgraded[name], value) for name, value in state.items())

@@ -395,7 +395,7 @@ def _with_weights(folder: Path, name: str, value: Tensor) -> Path:
     ],
     ids=["int", "nan"],
 )
-@pytest.mark.parametrize("name", ["sampler.peak", "colour.0.bias"])
+@pytest.mark.parametrize("name", ["occupancy.peak", "colour.0.bias"])
 def test_weights_and_buffers_of_another_kind_are_refused(
     name: str, change: Callable[[Tensor], Tensor], said: str, tmp_path: Path
 ) -> None:
