@@ -108,11 +108,11 @@ def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None
 
 def test_what_follows_from_the_occupancy_is_brought_up_to_date_on_loading(tmp_path: Path) -> None:
     sparse = field(0)
-    sparse.sampler.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
+    sparse.occupancy.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
     save_map(tmp_path, info(), TrainingState(5, sparse.state_dict(), {}))
     loaded = load_map(tmp_path).field
     assert isinstance(loaded, HashGridField)
-    assert not loaded.sampler.near_occupied.any()
+    assert not loaded.occupancy.near_occupied.any()
     assert loaded.coarse_sampler.occupied.any()
 
 
