@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -25,6 +25,13 @@ class LandmarkMap:
     # Covariance of the right updates (translation in metres first) from the given poses of the map's images to those that
     # the landmarks imply: the error that the source of the poses adds to a pose found by landmarks.
     pose_covariance: Float[Tensor, "6 6"]  # float64
+    # The number of keypoints of an image that count as one measurement, because their errors are correlated.
+    correlation: float = 10.0
+    # Standard deviations of the corrections of intrinsics that images of the map seem to need, although their intrinsics are
+    # right: logarithm of the focal length, principal point (u, v) as a share of it, radial distortion. Float64.
+    calibration_scatter: Float[Tensor, "4"] = field(
+        default_factory=lambda: torch.tensor([0.02, 0.02, 0.02, 0.02], dtype=torch.float64)
+    )
 
     def __len__(self) -> int:
         return len(self.positions)
