@@ -33,7 +33,7 @@ def _bake(
             "rendered images only",
         ),
     ] = None,
-    split: Annotated[str, option("NAME", "which of the dataset's splits")] = "train",
+    split: Annotated[str, option("NAME", "split of the dataset")] = "train",
     config: BakeConfig = BakeConfig(),
 ) -> None:
     """Find the surface and the landmarks of a map, and store them in the map.

@@ -67,7 +67,7 @@ def run(arguments: list[str]) -> None:
             tuple[str, ...],
             option("SIZE...", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's"),
         ] = (),
-        method: Annotated[str, option("NAME", ", ".join(METHODS))] = "auto",
+        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = "auto",
         trials: Annotated[
             int | None, option("N", "number of trials of each size", "the protocol's, 24 or 25")
         ] = None,

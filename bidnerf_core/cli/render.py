@@ -30,9 +30,10 @@ from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.files import write_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.rendering import RenderedImage, render_image
-from bidnerf_core.storage import Map, load_map, write_file
+from bidnerf_core.storage import Map, load_map
 
 DEEPEST = 65.535  # metres in a 16-bit image of millimetres
 
@@ -45,8 +46,8 @@ def _render(
     map: MapFolder,
     data: DataFolder,
     out: Annotated[Path, option("DIR", "folder for the images")],
-    split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
-    frame: Annotated[Names, option("NAME...", "names of frames", "all of the split")] = (),
+    split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+    frame: Annotated[Names, option("NAME...", "render only these frames", "all of the split")] = (),
     level: Annotated[
         int | None, option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,

@@ -25,7 +25,7 @@ def run(arguments: list[str]) -> None:
 
 def report(
     results: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, option("RESULTS...", "files that 'bidnerf evaluate' wrote")
+        tuple[Path, ...], tyro.conf.Positional, option("RESULTS...", "files that 'bidnerf evaluate' wrote", "")
     ],
     out: Annotated[Path, option("DIR", "folder for index.html and the figures as PNG and SVG")] = Path("report"),
     criterion: Annotated[

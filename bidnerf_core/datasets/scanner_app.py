@@ -18,7 +18,6 @@ pixel is added.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,9 +29,9 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.camera_sources import Raster
-from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.poses import pose_of_rows
-from bidnerf_core.datasets.splits import Splits, hold_out
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.depth_images import DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
@@ -98,42 +97,20 @@ class ScannerAppReader:
         return ScannerAppDataset(Splits(path, hold_out(scanner_frames(path))), colour, self.largest)
 
 
-class ScannerAppDataset:
+class ScannerAppDataset(SplitDataset[ScannerFrame]):
     """Views of a folder of "3D Scanner App"; see ``Dataset``."""
 
     def __init__(
         self, frames: Splits[ScannerFrame], background: tuple[float, float, float], largest: int
     ) -> None:
-        self._frames = frames
+        super().__init__(frames)
         self._background = background
         self._largest = largest
-
-    @property
-    def path(self) -> Path:
-        return self._frames.path
-
-    @property
-    def splits(self) -> tuple[str, ...]:
-        return self._frames.splits
 
     @property
     def background(self) -> tuple[float, float, float]:
         """The requested colour, or black: photos have no alpha channel."""
         return self._background
-
-    def frame_names(self, split: str) -> list[str]:
-        return self._frames.names(split)
-
-    def views(
-        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
-    ) -> list[View]:
-        frames = self._frames.select(split, names)
-        views = []
-        for done, (name, frame) in enumerate(frames, start=1):
-            views.append(self._view(frame, name))
-            if progress is not None:
-                progress(done, len(frames))
-        return views
 
     def _view(self, frame: ScannerFrame, name: str) -> View:
         header = read_header(frame.photo)

@@ -1,13 +1,15 @@
-"""The frames of a dataset in named splits, before any image is read."""
+"""The frames of a dataset in named splits, before any image is read, and the dataset that reads them."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
-from bidnerf_core.datasets.dataset import positions, unique_names
+from bidnerf_core.datasets.dataset import ReadingProgress, positions, unique_names
 from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
 
 HOLD_OUT_EVERY = 8
 
@@ -66,6 +68,43 @@ class Splits(Generic[F]):
     def _known(self, split: str) -> None:
         if split not in self._frames:
             raise InputError(f"{self.path}: no split {split!r}, expected one of {', '.join(self.splits)}")
+
+
+class SplitDataset(ABC, Generic[F]):
+    """A ``Dataset`` whose frames are described in ``Splits``; a subclass reads one frame and has the background."""
+
+    def __init__(self, frames: Splits[F]) -> None:
+        self._frames = frames
+
+    @property
+    def path(self) -> Path:
+        return self._frames.path
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return self._frames.splits
+
+    @property
+    @abstractmethod
+    def background(self) -> tuple[float, float, float]: ...
+
+    def frame_names(self, split: str) -> list[str]:
+        return self._frames.names(split)
+
+    def views(
+        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+    ) -> list[View]:
+        frames = self._frames.select(split, names)
+        views = []
+        for done, (name, frame) in enumerate(frames, start=1):
+            views.append(self._view(frame, name))
+            if progress is not None:
+                progress(done, len(frames))
+        return views
+
+    @abstractmethod
+    def _view(self, frame: F, name: str) -> View:
+        """Read the frame's image and depth. Raises ``InputError`` where a file is missing or not usable."""
 
 
 def hold_out(frames: list[F]) -> dict[str, list[F]]:

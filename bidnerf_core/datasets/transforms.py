@@ -17,12 +17,11 @@ Images are used as they are stored: poses and intrinsics describe that raster, s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
-from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
-from bidnerf_core.datasets.splits import Splits
+from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
 from bidnerf_core.depth_images import read_depth
 from bidnerf_core.errors import InputError
@@ -44,25 +43,17 @@ class TransformsReader:
         return TransformsDataset(path, read_splits(path), background)
 
 
-class TransformsDataset:
+class TransformsDataset(SplitDataset[FrameRecord]):
     """Views of a folder with ``transforms.json``; see ``Dataset``."""
 
     def __init__(
         self, path: Path, frames: dict[str, list[FrameRecord]], background: Background | None = None
     ) -> None:
-        self._frames = Splits(path, frames)
+        super().__init__(Splits(path, frames))
         self._background = None if background is None else background_colour(background)
         self._first: tuple[str, int, int] | None = (
             None  # file, width, height of the first image of unknown size
         )
-
-    @property
-    def path(self) -> Path:
-        return self._frames.path
-
-    @property
-    def splits(self) -> tuple[str, ...]:
-        return self._frames.splits
 
     @cached_property
     def background(self) -> tuple[float, float, float]:
@@ -70,20 +61,6 @@ class TransformsDataset:
         if self._background is not None:
             return self._background
         return background_colour("white" if any(map(self._has_alpha, self._frames.first())) else "black")
-
-    def frame_names(self, split: str) -> list[str]:
-        return self._frames.names(split)
-
-    def views(
-        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
-    ) -> list[View]:
-        frames = self._frames.select(split, names)
-        views = []
-        for done, (name, frame) in enumerate(frames, start=1):
-            views.append(self._view(frame, name))
-            if progress is not None:
-                progress(done, len(frames))
-        return views
 
     def image_file(self, split: str, name: str) -> Path:
         """Return the image file of a frame. Raises ``InputError`` where there is none."""
