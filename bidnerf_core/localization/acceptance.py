@@ -16,7 +16,7 @@ from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.localization.search.landmarks import LandmarkPose
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.mapping.casting import trace
 from bidnerf_core.se3 import SE3
 

@@ -18,7 +18,6 @@ from torch import Generator
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.acceptance import (
     SurfaceDiagnostics,
-    landmark_verdict,
     surface_diagnostics,
 )
 from bidnerf_core.localization.bid import BidConfig, bid
@@ -67,7 +66,7 @@ class AutoConfig(Settings):
     hypotheses: Annotated[int, Range(8, 10**5)] = 256  # with which each round of the search begins
     rounds: Annotated[int, Range(1, 100)] = 3  # of search with fresh hypotheses, until an answer is accepted
     refine_steps: Annotated[int, Range(0, 1000)] = 2  # on rendered rays, of an answer by depth; 0: none
-    refine_rays: Annotated[int, Range(64, 10**6)] = 512
+    refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for these steps
     landmarks: bool = True  # match image features with the map's landmarks first, where it has some
     fused_rays: Annotated[int, Range(0, 10**6)] = 1024  # rendered, and fused with landmarks; 0: none
     by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
@@ -81,7 +80,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     began, answer = time.perf_counter(), None
     if problem.matcher is not None and config.landmarks:
         answer = answer_by_landmarks(problem, problem.matcher, config.fused_rays, seed)
-    if answer is not None and landmark_verdict(answer.found).accepted:
+    if answer is not None and answer.verdict.accepted:
         return localization_by_landmarks(problem, answer, began)
     if answer is not None and problem.start is None:
         problem = replace(problem, start=answer.T)  # one more place to look
@@ -171,7 +170,8 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
     search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
     # Images with a plain background were rendered and are as bright as the map; photos may have another exposure.
-    refinement = replace(config.by_colour.refinement, exposure=not search.has_background)
+    exposure = config.by_colour.refinement.exposure or not search.has_background
+    refinement = replace(config.by_colour.refinement, exposure=exposure)
     by_colour = replace(config.by_colour, refinement=refinement)
     known = Surroundings(SE3.from_matrix(surface.keyframes), surface.extent, torch.zeros(3), search.middle)
     while True:

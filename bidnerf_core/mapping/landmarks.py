@@ -10,6 +10,16 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 
+@dataclass(frozen=True)
+class HeldOutTrial:
+    """How images of the map were localized by landmarks that were built without them."""
+
+    images: int = 0
+    found: int = 0  # of these images
+    translation: float = 0.0  # metres: median error
+    rotation_deg: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class LandmarkMap:
     """Points in the world frame (metres) with descriptors; all tensors are on the CPU."""
@@ -30,8 +40,9 @@ class LandmarkMap:
     # Standard deviations of the corrections of intrinsics that images of the map seem to need, although their intrinsics are
     # right: logarithm of the focal length, principal point (u, v) as a share of it, radial distortion. Float64.
     calibration_scatter: Float[Tensor, "4"] = field(
-        default_factory=lambda: torch.tensor([0.02, 0.02, 0.02, 0.02], dtype=torch.float64)
+        default_factory=lambda: torch.full((4,), 0.02, dtype=torch.float64)
     )
+    trial: HeldOutTrial = HeldOutTrial()
 
     def __len__(self) -> int:
         return len(self.positions)

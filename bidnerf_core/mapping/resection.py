@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.se3 import SE3
 
 Array = np.ndarray
@@ -90,6 +91,15 @@ class Calibration:
         """True over given focal length."""
         return math.exp(self.log_focal)
 
+    def applied(self, given: Intrinsics) -> Intrinsics:
+        """Return the corrected intrinsics."""
+        k1, *others = given.distortion or (0.0, 0.0, 0.0, 0.0)
+        factor = self.focal_factor
+        return replace(
+            given, fx=given.fx * factor, fy=given.fy * factor, cx=given.cx + self.shift_u * given.fx,
+            cy=given.cy + self.shift_v * given.fy, distortion=(k1 + self.radial, *others),
+        )  # fmt: skip
+
     def pixels(self, flat: Float[Tensor, "m 2"], focal: float) -> Float[Tensor, "m 2"]:
         """Return where points on the plane z = 1 appear, in pixels from the given principal point, by the given focal length."""
         bent = flat * (1 + self.radial * flat.square().sum(-1, keepdim=True))
@@ -125,7 +135,7 @@ class CalibrationPrior:
 
 FIXED = CalibrationPrior()
 """Intrinsics that are not estimated."""
-NOMINAL = CalibrationPrior(log_focal=0.1, shift=0.01, radial=0.03)
+NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
 """Intrinsics from EXIF or a field of view, without distortion."""
 
 

@@ -15,8 +15,8 @@ from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided import guided_matches, projected_landmarks
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.ransac import Hypothesis
+from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import (
-    GIVEN,
     NOMINAL,
     Calibration,
     CalibrationPrior,
@@ -36,7 +36,7 @@ LOOSE = 1.3
 """Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
 """Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
-MISCALIBRATED = 5.0
+MISCALIBRATED = 4.0
 """Standard deviations between the given intrinsics and those that fit best, beyond which the latter are taken."""
 LEAST_MATCHES = 6
 """Least number of guided matches for another round."""
@@ -50,7 +50,7 @@ class GuidedPose:
     prior: CalibrationPrior  # of the intrinsics, as they were taken in the end
     correspondences: LandmarkMatches
     chance: float  # matches that the last round would find at a wrong pose
-    miscalibration: float  # how far the intrinsics that fit best are from the given ones, in standard deviations
+    free: ReprojectionFit  # to the matches of the given intrinsics, which are estimated along
 
 
 def refined(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -> GuidedPose:
@@ -63,13 +63,12 @@ def refined(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -
     data, correlation = query.observed(inliers), query.landmarks.correlation
     fit = resect(data, first.T_world_rig, query.threshold / 2, query.prior, start, correlation)
     fit, found = _guided(query, query.prior, fit, inliers, most, RADII)
-    miscalibration = _miscalibration(query, fit, found)
+    free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
     prior = query.prior
-    if miscalibration > MISCALIBRATED and not prior.log_focal:
+    if miscalibration(free, query.landmarks) > MISCALIBRATED and not prior.log_focal:
         prior = NOMINAL
-        fit = resect(query.observed(found), fit.T_world_rig, fit.noise, prior, GIVEN, correlation)
-        fit, found = _guided(query, prior, fit, found, most, RADII[1:])
-    return GuidedPose(fit, prior, found, _chance(query, fit, most), miscalibration)
+        fit, found = _guided(query, prior, free, found, most, RADII[1:])
+    return GuidedPose(fit, prior, found, _chance(query, fit, most), free)
 
 
 def _guided(
@@ -91,24 +90,19 @@ def _guided(
         if len(guided) < LEAST_MATCHES:
             break
         changed, found = _changed(guided, found), guided
-        fit = resect(
-            data, fit.T_world_rig, fit.noise, prior, fit.calibration, query.landmarks.correlation
-        )
+        fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, query.landmarks.correlation)
         if changed <= UNCHANGED:
             break
     return fit, found
 
 
-def _miscalibration(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches) -> float:
-    """Return how far the calibration that fits best is from the given one, in standard deviations.
+def miscalibration(free: ReprojectionFit, landmarks: LandmarkMap) -> float:
+    """Return how far a calibration estimated with a pose is from the given one, in standard deviations.
 
     The scatter of this estimate over images of the map, whose intrinsics are right, is part of the standard deviation.
     """
-    free = resect(
-        query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, query.landmarks.correlation
-    )
     value = torch.tensor(dataclasses.astuple(free.calibration), dtype=torch.float64)
-    variance = free.calibration_deviations.square() + query.landmarks.calibration_scatter.square()
+    variance = free.calibration_deviations.square() + landmarks.calibration_scatter.square()
     return float((value.square() / variance).max().sqrt())
 
 

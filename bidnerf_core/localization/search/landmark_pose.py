@@ -36,7 +36,9 @@ class LandmarkPose:
     calibration: Calibration  # what was estimated of the camera
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
     slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each of them
-    miscalibration: float  # how far the intrinsics that fit best are from the given ones, in standard deviations
+    apparent: Calibration  # what fits best if hardly anything is assumed of the intrinsics
+    apparent_deviations: Float[Tensor, "4"]  # standard deviations of these estimates
+    miscalibration: float  # how far that is from the given intrinsics, in standard deviations
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 

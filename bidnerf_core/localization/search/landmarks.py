@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
-
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_images
