@@ -87,9 +87,9 @@ def answer_by_landmarks(
         return None
     verdict, covariance = landmark_verdict(found), _pose_covariance(found)
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, covariance)
-    if not verdict.accepted:
-        return answer
-    problem = _corrected(problem, found)
+    if not verdict.accepted or found.calibration != GIVEN:
+        return answer  # the other terms would need intrinsics as exact as the landmarks'
+    problem = _from(problem, found)
     about, generator = pivot("scene", problem), Generator().manual_seed(seed)
     terms = dict[str, FusedTerm]()
     if problem.surface is not None and problem.has_depth:
@@ -107,17 +107,12 @@ def _pose_covariance(found: LandmarkPose) -> Float[Tensor, "6 6"]:
     return found.covariance + by_calibration @ by_calibration.mT
 
 
-def _corrected(problem: Problem, found: LandmarkPose) -> Problem:
-    """Return the problem from the pose found, with the camera and the depth scale as they were estimated."""
-    scale = _depth_scale(found)
-    views = []
+def _from(problem: Problem, found: LandmarkPose) -> Problem:
+    """Return the problem from the pose found, with measured depth on the map's scale."""
+    scale, views = _depth_scale(found), []
     for view in problem.views:
-        frame = view.frame
-        depth = None if frame.depth is None else frame.depth * scale
-        camera = (
-            found.calibration.applied(frame.intrinsics) if found.calibration != GIVEN else frame.intrinsics
-        )
-        views.append(replace(view, frame=replace(frame, depth=depth, intrinsics=camera)))
+        depth = None if view.frame.depth is None else view.frame.depth * scale
+        views.append(replace(view, frame=replace(view.frame, depth=depth)))
     return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 
