@@ -15,6 +15,10 @@ if TYPE_CHECKING:  # the rest is imported when a report is made: help pages do w
     from bidnerf_core.evaluation.groups import Group
     from bidnerf_core.evaluation.page import Figure
 
+FAULT_CAPTION = (
+    "Trials by fault of the images and its size, with Wilson's 95 % intervals: right (within 5 degrees and 0.05 units), "
+    "converged by the method's own judgement, and converged but wrong."
+)
 CriterionName = Literal["10%", "5deg 0.05", "1deg 0.02"]
 
 
@@ -93,16 +97,19 @@ def _check_ours(out: Path) -> None:
 
 def draw_figures(groups: Sequence[Group], folder: Path, criterion: str) -> list[Figure]:
     """Write all figures of a report to ``folder`` and return them with their captions."""
+    from bidnerf_core.evaluation.fault_figure import draw_faults
     from bidnerf_core.evaluation.page import Figure
     from bidnerf_core.evaluation.plot_style import CRITERION_NAMES
     from bidnerf_core.evaluation.plots import Figures
     from bidnerf_core.evaluation.summary import applies
 
     figures, success = Figures(groups, folder, criterion), CRITERION_NAMES[criterion]
+    by_fault = draw_faults(groups, folder)
     some = not all(applies(criterion, group.results) for group in groups)
     omitted = " Trials without a start are not shown." if some else ""
     return [
         Figure(figures.rates(), "Success rates with Wilson's 95 % intervals."),
+        *([] if by_fault is None else [Figure(by_fault, FAULT_CAPTION)]),
         Figure(
             figures.steps(),
             f"Steps to success ({success}): the first step from which on the criterion holds. Boxes show the median and the "

@@ -23,6 +23,7 @@ from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.evaluation.errors import PoseError, pose_error
+from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.evaluation.fingerprint import InputDigests, folder_digest, views_digest
 from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.protocols import find_protocol
@@ -59,8 +60,11 @@ def _localized(
 
 
 def trial_views(trial: Trial, dataset: Dataset) -> list[View]:
-    """Return the views that the method gets, with T_world_camera, and without depth where the trial withholds it."""
-    views = dataset.views(trial.split, trial.frames)
+    """Return the views that the method gets, with T_world_camera.
+
+    They have the trial's faults, and no depth where the trial withholds it.
+    """
+    views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.split, trial.frames)]
     if trial.depth:
         return views
     return [View(replace(view.frame, depth=None), view.T_ref_camera) for view in views]
