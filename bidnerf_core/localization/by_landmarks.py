@@ -29,7 +29,7 @@ from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.resection import GIVEN
+from bidnerf_core.mapping.resection import CALIBRATED, GIVEN
 from bidnerf_core.se3 import SE3
 
 POINTS = 2000
@@ -40,8 +40,6 @@ FUSION_STEPS = 4
 """Number of second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
-CALIBRATION_PRIOR = (0.002, 0.002, 0.002, 0.002)
-"""Standard deviations of a camera's intrinsics, in the order of ``Calibration``, where nothing contradicts them."""
 DEPTH_SCALE_PRIOR, DEPTH_SCALE_NOISE = 0.02, 0.01
 """Relative standard deviations of a depth sensor's scale, and of the scale that a few landmarks give."""
 DEPTH_CELLS, RENDERED_DEPTH_SHARE = 6.0, 0.01
@@ -102,7 +100,7 @@ def answer_by_landmarks(
 def _pose_covariance(found: LandmarkPose) -> Float[Tensor, "6 6"]:
     """Return the covariance of a pose by landmarks, including that of intrinsics that were taken as given."""
     estimated = found.calibration_deviations > 0
-    deviations = torch.tensor(CALIBRATION_PRIOR, dtype=torch.float64).masked_fill(estimated, 0)
+    deviations = CALIBRATED.deviations.masked_fill(estimated, 0)
     by_calibration = found.slope * deviations
     return found.covariance + by_calibration @ by_calibration.mT
 

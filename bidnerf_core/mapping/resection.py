@@ -128,13 +128,15 @@ class CalibrationPrior:
     radial: float = 0.0
 
     @property
-    def deviations(self) -> Array:
+    def deviations(self) -> Float[Tensor, "4"]:
         """The standard deviations in the order of the fields of ``Calibration``."""
-        return np.array([self.log_focal, self.shift, self.shift, self.radial])
+        return torch.tensor([self.log_focal, self.shift, self.shift, self.radial], dtype=torch.float64)
 
 
 FIXED = CalibrationPrior()
 """Intrinsics that are not estimated."""
+CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002)
+"""Intrinsics from a good calibration."""
 NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
 """Intrinsics from EXIF or a field of view, without distortion."""
 
@@ -168,7 +170,7 @@ def resect(
     ``correlation`` is the number of observations that count as one, because their errors are correlated: it weighs them
     against the prior and scales the covariance.
     """
-    residuals, free = _Residuals(data, start), prior.deviations.nonzero()[0]
+    residuals, free = _Residuals(data, start), prior.deviations.numpy().nonzero()[0]
 
     def equations(state: _State, noise: float) -> _System:
         return residuals(state, noise, free).weighted(1 / correlation).with_prior(state, prior)
@@ -247,7 +249,7 @@ class _System:
 
     def with_prior(self, state: _State, prior: CalibrationPrior) -> _System:
         """Add the prior of the free parameters, which is Gaussian."""
-        deviations = prior.deviations
+        deviations = prior.deviations.numpy()
         free = deviations.nonzero()[0]
         if not len(free):
             return self

@@ -17,6 +17,7 @@ from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.ransac import Hypothesis
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import (
+    CALIBRATED,
     NOMINAL,
     Calibration,
     CalibrationPrior,
@@ -102,7 +103,11 @@ def miscalibration(free: ReprojectionFit, landmarks: LandmarkMap) -> float:
     The scatter of this estimate over images of the map, whose intrinsics are right, is part of the standard deviation.
     """
     value = torch.tensor(dataclasses.astuple(free.calibration), dtype=torch.float64)
-    variance = free.calibration_deviations.square() + landmarks.calibration_scatter.square()
+    variance = (
+        free.calibration_deviations.square()
+        + landmarks.calibration_scatter.square()
+        + CALIBRATED.deviations.square()
+    )
     return float((value.square() / variance).max().sqrt())
 
 
