@@ -812,6 +812,23 @@ def test_info_describes_a_map(bidnerf: Run, shared: Path) -> None:
     assert all(f"{key}:" in shown for key in facts)
 
 
+def test_render_refuses_names_whose_files_would_collide(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    data = Path(shutil.copytree(shared / "data", tmp_path / "data"))
+    path = data / "transforms.json"
+    described = json.loads(path.read_text())
+    first, second = described["test_filenames"][:2]
+    other = str(Path(first).with_name(f"{Path(first).stem}.depth.png"))
+    (data / second).rename(data / other)
+    path.write_text(path.read_text().replace(second, other))
+    refused = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
+    assert_refused(refused, 1, "would have the file of the depth of", "--frame")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_argument_with_a_nul_is_wrong_usage(bidnerf: Run) -> None:
+    assert_refused(bidnerf("info", "a\0b"), 2, "NUL")
+
+
 def test_render_writes_the_images_that_were_agreed_on(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     render = ["render", shared / "map", shared / "data"]
     outcome = bidnerf(*render, "--out", tmp_path / "all")

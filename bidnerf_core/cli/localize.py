@@ -34,6 +34,7 @@ from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trials import places_of
 from bidnerf_core.localization import METHODS, Localizer
+from bidnerf_core.localization.methods import require_use_of_depth
 from bidnerf_core.storage import Map, load_map
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
@@ -138,6 +139,8 @@ def run(arguments: list[str]) -> None:
             raise UsageError("no QUERY, expected image files, folders of photos, or a folder of a dataset")
         if METHODS[method].needs_start and not begin.given:
             raise InputError(f"method {method!r} needs a start; give one, or take method 'auto'")
+        if depth_points is not None:
+            require_use_of_depth(method)
         output.prepare()
         stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)

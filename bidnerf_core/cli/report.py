@@ -76,7 +76,8 @@ def _criterion(asked: str | None, groups: Sequence[Group]) -> str:
         return usual_criterion([result for group in groups for result in group.results])
     if not any(applies(asked, group.results) for group in groups):
         raise UsageError(
-            f"--criterion is {asked}, a share of the start's error, and no trial had a start; expected 5deg 0.05 or 1deg 0.02"
+            f"--criterion is {asked}, a share of the start's error, and no trial had a start; expected 5deg 0.05 or"
+            " 1deg 0.02"
         )
     return asked
 

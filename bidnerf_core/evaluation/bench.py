@@ -31,7 +31,7 @@ from bidnerf_core.evaluation.trials import (
     trial_views,
 )
 from bidnerf_core.localization import find_method
-from bidnerf_core.localization.methods import RENAMED
+from bidnerf_core.localization.methods import RENAMED, require_use_of_depth
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.settings import to_flat
 
@@ -215,7 +215,7 @@ def _follow_parent() -> None:
 
 
 def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
-    """Raise ``InputError`` where a result of ``file`` was made with other weights, settings or input than its trial has now."""
+    """Raise ``InputError`` where a result of ``file`` had other weights, settings or input than its trial has now."""
     digests: dict[Any, dict[str, Any]] = {}
     for trial in trials:
         known = file.results[key_of(trial)]
@@ -273,10 +273,11 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
 
 
 def _check_points(plan: Plan, rigs: list[tuple[str, ...]]) -> None:
-    """Raise ``InputError`` where the views of some frame observe no depth points."""
+    """Raise ``InputError`` where the method uses no depth points, or the views of some frame observe none."""
     points = opened_points(plan.depth_points, plan.map)
     if points is None:
         return
+    require_use_of_depth(plan.method)
     blind = [rig[-1] for rig in rigs if not any(len(points.seen(name, plan.split)) for name in rig)]
     if blind:
         listed = ", ".join(blind[:4]) + (", ..." if len(blind) > 4 else "")

@@ -42,7 +42,7 @@ Render = Callable[[SE3, str], Frame]
 
 @dataclass(frozen=True, eq=False)
 class ClosedFormData:
-    """A ``Dataset`` with the one split "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the scene's middle."""
+    """A ``Dataset`` with the one split "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the middle."""
 
     name: str
     poses: tuple[SE3, ...]  # T_world_camera

@@ -37,7 +37,7 @@ from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
 
 
 def run_trial(trial: Trial) -> TrialResult:
-    """Localize once. Raises ``InputError`` where the trial is impossible: an unknown name, or a method that lacks what it needs."""
+    """Localize once. Raises ``InputError`` for an unknown name, and for a method that lacks what it needs."""
     with one_thread():
         stored, dataset = opened(trial.map, trial.data, trial.device)
         views = trial_views(trial, dataset)

@@ -62,13 +62,17 @@ LOSS_POINTS = 200
 class AutoConfig(Settings):
     """Settings of method ``auto``."""
 
-    points: Annotated[int, Range(LEAST_POINTS, 10**6)] = 2000  # of the measured pixels, at most
-    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # with which each round of the search begins
-    rounds: Annotated[int, Range(1, 100)] = 3  # of search with fresh hypotheses, until an answer is accepted
-    refine_steps: Annotated[int, Range(0, 1000)] = 2  # on rendered rays, of an answer by depth; 0: none
-    refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for these steps
+    # largest number of measured points that are aligned
+    points: Annotated[int, Range(LEAST_POINTS, 10**6)] = 2000
+    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # number of poses with which a round of search begins
+    # largest number of rounds of search, each with fresh hypotheses, until an answer is accepted
+    rounds: Annotated[int, Range(1, 100)] = 3
+    # steps on rendered rays that refine an answer by depth; 0: none
+    refine_steps: Annotated[int, Range(0, 1000)] = 2
+    refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for each of these steps
     landmarks: bool = True  # match image features with the map's landmarks first, where it has some
-    fused_rays: Annotated[int, Range(0, 10**6)] = 1024  # rendered, and fused with landmarks; 0: none
+    # number of rendered rays that are fused with landmarks; 0: none
+    fused_rays: Annotated[int, Range(0, 10**6)] = 1024
     by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
 
 

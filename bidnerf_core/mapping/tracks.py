@@ -66,7 +66,7 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
 
 
 def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
-    """Return whether each keypoint of ``b`` lies within ``EPIPOLAR_BAND`` of the epipolar half-line of each keypoint of ``a``.
+    """Return whether each keypoint of ``b`` lies near the epipolar half-line of each keypoint of ``a``.
 
     The half-line begins at the image of the ray's point at infinity. If the cameras are at the same place, it reduces to
     that point.
