@@ -29,7 +29,7 @@ from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.resection import CALIBRATED, GIVEN
+from bidnerf_core.mapping.resection import GIVEN
 from bidnerf_core.se3 import SE3
 
 POINTS = 2000
@@ -100,7 +100,7 @@ def answer_by_landmarks(
 def _pose_covariance(found: LandmarkPose) -> Float[Tensor, "6 6"]:
     """Return the covariance of a pose by landmarks, including that of intrinsics that were taken as given."""
     estimated = found.calibration_deviations > 0
-    deviations = CALIBRATED.deviations.masked_fill(estimated, 0)
+    deviations = found.miscalibration.deviations.masked_fill(estimated, 0)
     by_calibration = found.slope * deviations
     return found.covariance + by_calibration @ by_calibration.mT
 

@@ -6,7 +6,6 @@ points, lenses, rolling shutters and the given poses all have errors that the ke
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -125,10 +124,8 @@ def _calibration_scatter(answers: Sequence[_Answer], correlation: float) -> Floa
 
     What the fits' own uncertainty explains is left out.
     """
-    apparent = torch.tensor(
-        [dataclasses.astuple(answer.found.apparent) for answer in answers], dtype=torch.float64
-    )
-    explained = correlation * torch.stack([a.found.apparent_deviations for a in answers]).square()
+    apparent = torch.stack([answer.found.miscalibration.apparent for answer in answers])
+    explained = correlation * torch.stack([a.found.miscalibration.noise for a in answers]).square()
     low, high = torch.full((4,), 1e-5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
     for _ in range(30):
         middle = (low * high).sqrt()

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
@@ -37,10 +37,29 @@ LOOSE = 1.3
 """Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
 """Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
-MISCALIBRATED = 4.0
-"""Standard deviations between the given intrinsics and those that fit best, beyond which the latter are taken."""
+MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
+"""Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
+CERTAIN = 0.999
+"""Probability that the given intrinsics are wrong above which the estimated ones are taken."""
 LEAST_MATCHES = 6
 """Least number of guided matches for another round."""
+
+
+@dataclass(frozen=True, eq=False)
+class Miscalibration:
+    """How far the intrinsics that fit an image best are from the given ones, and whether these are wrong.
+
+    Images of the map, whose intrinsics are right, seem to need corrections, too; their scatter is part of the noise.
+    """
+
+    apparent: Float[Tensor, "4"]  # the correction that fits best, in the order of ``Calibration``
+    noise: Float[Tensor, "4"]  # standard deviations of that estimate by the noise of the keypoints
+    probability: Float[Tensor, "4"]  # that the given parameter is wrong
+
+    @property
+    def deviations(self) -> Float[Tensor, "4"]:
+        """The standard deviation of the true correction about zero."""
+        return (CALIBRATED.deviations.square() + self.probability * self.apparent.square()).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +70,7 @@ class GuidedPose:
     prior: CalibrationPrior  # of the intrinsics, as they were taken in the end
     correspondences: LandmarkMatches
     chance: float  # matches that the last round would find at a wrong pose
-    free: ReprojectionFit  # to the matches of the given intrinsics, which are estimated along
+    miscalibration: Miscalibration
 
 
 def refined(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -> GuidedPose:
@@ -66,10 +85,11 @@ def refined(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -
     fit, found = _guided(query, query.prior, fit, inliers, most, RADII)
     free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
     prior = query.prior
-    if miscalibration(free, query.landmarks) > MISCALIBRATED and not prior.log_focal:
+    wrong = miscalibration(free, query.landmarks)
+    if float(wrong.probability.max()) > CERTAIN and not prior.log_focal:
         prior = NOMINAL
         fit, found = _guided(query, prior, free, found, most, RADII[1:])
-    return GuidedPose(fit, prior, found, _chance(query, fit, most), free)
+    return GuidedPose(fit, prior, found, _chance(query, fit, most), wrong)
 
 
 def _guided(
@@ -97,18 +117,14 @@ def _guided(
     return fit, found
 
 
-def miscalibration(free: ReprojectionFit, landmarks: LandmarkMap) -> float:
-    """Return how far a calibration estimated with a pose is from the given one, in standard deviations.
-
-    The scatter of this estimate over images of the map, whose intrinsics are right, is part of the standard deviation.
-    """
+def miscalibration(free: ReprojectionFit, landmarks: LandmarkMap) -> Miscalibration:
+    """Judge whether the given intrinsics are wrong, by those that were estimated along with the pose."""
     value = torch.tensor(dataclasses.astuple(free.calibration), dtype=torch.float64)
-    variance = (
-        free.calibration_deviations.square()
-        + landmarks.calibration_scatter.square()
-        + CALIBRATED.deviations.square()
-    )
-    return float((value.square() / variance).max().sqrt())
+    noise = free.calibration_deviations.square() + landmarks.calibration_scatter.square()
+    right, wrong = (noise + prior.deviations.square() for prior in (CALIBRATED, MISTAKEN))
+    log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
+    log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES))
+    return Miscalibration(value, free.calibration_deviations, log_odds.sigmoid())
 
 
 def _changed(a: LandmarkMatches, b: LandmarkMatches) -> float:

@@ -8,7 +8,7 @@ import torch
 
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.guided_refinement import GuidedPose, miscalibration
+from bidnerf_core.localization.search.guided_refinement import GuidedPose
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 
@@ -45,9 +45,7 @@ def described(
         calibration=fit.calibration,
         calibration_deviations=fit.calibration_deviations,
         slope=fit.slope,
-        apparent=answer.free.calibration,
-        apparent_deviations=answer.free.calibration_deviations,
-        miscalibration=miscalibration(answer.free, query.landmarks),
+        miscalibration=answer.miscalibration,
         depth_scale=float(ratio.median()) if len(ratio) >= LEAST_DEPTHS else None,
         seconds=seconds,
     )

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.search.guided_refinement import Miscalibration
 from bidnerf_core.mapping.resection import Calibration
 from bidnerf_core.se3 import SE3
 
@@ -36,9 +37,7 @@ class LandmarkPose:
     calibration: Calibration  # what was estimated of the camera
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
     slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each of them
-    apparent: Calibration  # what fits best if hardly anything is assumed of the intrinsics
-    apparent_deviations: Float[Tensor, "4"]  # standard deviations of these estimates
-    miscalibration: float  # how far that is from the given intrinsics, in standard deviations
+    miscalibration: Miscalibration
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
