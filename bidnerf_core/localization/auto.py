@@ -17,7 +17,9 @@ from torch import Generator
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.acceptance import (
+    LandmarkThresholds,
     SurfaceDiagnostics,
+    landmark_verdict,
     surface_diagnostics,
 )
 from bidnerf_core.localization.bid import BidConfig, bid
@@ -27,7 +29,11 @@ from bidnerf_core.localization.by_colour import (
     localization_of,
     refine_by_colour,
 )
-from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
+from bidnerf_core.localization.by_landmarks import (
+    answer_by_landmarks,
+    fused_answer,
+    localization_by_landmarks,
+)
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import surface_covariance
@@ -44,6 +50,8 @@ from bidnerf_core.localization.search.by_images import ImageSearch
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
+from bidnerf_core.localization.search.landmarks import confirm
+from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import EXPERT, Range, Settings
@@ -53,7 +61,9 @@ LEAST_POINTS = 50
 WORSE = 0.05
 """Largest increase of the cost on the surface by refinement; with more, field and surface contradict each other."""
 MANY_LANDMARKS = 500
-"""The number of landmarks from which on a scene is textured: an image that matches none of them shows something else."""
+"""The number of landmarks from which on a scene is textured."""
+WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
+"""Thresholds for landmarks that match near a pose that was not found by them."""
 LOSS_POINTS = 200
 """Number of points on which the losses along the path are computed."""
 
@@ -81,18 +91,43 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
 
     Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
     """
-    began, answer = time.perf_counter(), None
-    if problem.matcher is not None and config.landmarks:
-        answer = answer_by_landmarks(problem, problem.matcher, config.fused_rays, seed)
-    if answer is not None and answer.verdict.accepted:
+    began, answer, matcher = time.perf_counter(), None, problem.matcher if config.landmarks else None
+    if matcher is not None:
+        answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
+    if answer is not None and answer.verdict.outcome in (Outcome.CONVERGED, Outcome.MISCALIBRATED):
+        # With wrong intrinsics, the surface is not found at the right place either.
         return localization_by_landmarks(problem, answer, began)
     if answer is not None and problem.start is None:
         problem = replace(problem, start=answer.T)  # one more place to look
     if problem.surface is None:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
     if _measured_points(problem) >= LEAST_POINTS:
-        return _by_points(problem, problem.surface, config, seed)
-    return _by_images(problem.without_depth(), problem.surface, config, seed)
+        found = _by_points(problem, problem.surface, config, seed)
+    else:
+        found = _by_images(problem.without_depth(), problem.surface, config, seed)
+    return (
+        found if matcher is None else _compared_with_landmarks(found, problem, matcher, config, seed, began)
+    )
+
+
+def _compared_with_landmarks(
+    found: Localization,
+    problem: Problem,
+    matcher: LandmarkMatcher,
+    config: AutoConfig,
+    seed: int,
+    began: float,
+) -> Localization:
+    """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not."""
+    near = confirm(matcher, problem.views, found.T_world_camera)
+    if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
+        answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
+        refined = localization_by_landmarks(problem, answer, began)
+        return replace(refined, reason=f"found on the surface; {refined.reason}")
+    if found.converged and near.contradicts:
+        why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
+        return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
+    return replace(found, seconds=time.perf_counter() - began)
 
 
 def _measured_points(problem: Problem) -> int:
@@ -129,6 +164,7 @@ def _by_points(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
         poses=path,
         losses=losses[:-1],
         covariance=covariance,
+        diagnostics=diagnostics,
     )
 
 
@@ -173,6 +209,10 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer."""
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
     search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
+    textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
+    rounds = (
+        1 if textured else config.rounds
+    )  # images of such a scene in which no landmark is recognised rarely succeed
     # Images with a plain background were rendered and are as bright as the map; photos may have another exposure.
     exposure = config.by_colour.refinement.exposure or not search.has_background
     refinement = replace(config.by_colour.refinement, exposure=exposure)
@@ -183,21 +223,8 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
             found = search(hypotheses_for_images(known, problem.start, config.hypotheses, generator))
         answers.append(refine_by_colour(problem, found, by_colour, generator))
         best = min(answers, key=lambda answer: answer.refined.loss)
-        if best.verdict.accepted or len(answers) == config.rounds:
-            answer = localization_of(problem, best, by_colour, began, "auto")
-            return _doubted(answer) if config.landmarks and _has_texture(problem) else answer
-
-
-def _has_texture(problem: Problem) -> bool:
-    return problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
-
-
-def _doubted(found: Localization) -> Localization:
-    """Return the answer as rejected: in a map with this many landmarks, some should have matched the image."""
-    if not found.converged:
-        return found
-    why = f"no landmarks were recognised; {found.reason}"
-    return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=why)
+        if best.verdict.accepted or len(answers) == rounds:
+            return localization_of(problem, best, by_colour, began, "auto")
 
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:

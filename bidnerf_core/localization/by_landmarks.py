@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_diagnostics, landmark_verdict
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
@@ -29,7 +29,6 @@ from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.resection import GIVEN
 from bidnerf_core.se3 import SE3
 
 POINTS = 2000
@@ -69,6 +68,7 @@ class LandmarkAnswer:
     verdict: Verdict
     T: SE3
     covariance: Float[Tensor, "6 6"]
+    diagnostics: LandmarkDiagnostics
     terms: tuple[str, ...] = ()  # what was fused with the landmarks
 
 
@@ -81,28 +81,30 @@ def answer_by_landmarks(
     out.
     """
     found = propose(matcher, problem.views, seed=seed)
-    if found is None:
-        return None
-    verdict, covariance = landmark_verdict(found), _pose_covariance(found)
-    answer = LandmarkAnswer(found, verdict, found.T_world_camera, covariance)
-    if not verdict.accepted or found.calibration != GIVEN:
+    return None if found is None else fused_answer(problem, found, landmark_verdict(found), rays, seed)
+
+
+def fused_answer(
+    problem: Problem, found: LandmarkPose, verdict: Verdict, rays: int, seed: int, searched: bool = True
+) -> LandmarkAnswer:
+    """Return a pose by landmarks, refined on all terms at once if it is accepted.
+
+    ``searched`` is false if landmarks only confirm a pose that was found by other means.
+    """
+    diagnostics = landmark_diagnostics(found, searched)
+    answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.full_covariance, diagnostics)
+    if not verdict.accepted or found.estimates_calibration:
         return answer  # the other terms would need intrinsics as exact as the landmarks'
     problem = _from(problem, found)
     about, generator = pivot("scene", problem), Generator().manual_seed(seed)
     terms = dict[str, FusedTerm]()
     if problem.surface is not None and problem.has_depth:
-        terms["depth"] = _surface_term(problem, problem.surface, generator)
+        terms["depth"], judge = _surface_term(problem, problem.surface, generator)
+        diagnostics = landmark_diagnostics(found, searched, judge, found.T_world_camera)
+        answer = replace(answer, diagnostics=diagnostics)
     if rays and _is_sharp(problem):
         terms["rendering"] = _rendered_term(problem, rays, about, generator)
     return _fused(answer, terms, about) if terms else answer
-
-
-def _pose_covariance(found: LandmarkPose) -> Float[Tensor, "6 6"]:
-    """Return the covariance of a pose by landmarks, including that of intrinsics that were taken as given."""
-    estimated = found.calibration_deviations > 0
-    deviations = found.miscalibration.deviations.masked_fill(estimated, 0)
-    by_calibration = found.slope * deviations
-    return found.covariance + by_calibration @ by_calibration.mT
 
 
 def _from(problem: Problem, found: LandmarkPose) -> Problem:
@@ -126,13 +128,15 @@ def _is_sharp(problem: Problem) -> bool:
     return problem.colour_noise is None or problem.colour_noise <= SHARPEST
 
 
-def _surface_term(problem: Problem, surface: SurfaceMap, generator: Generator) -> FusedTerm:
-    """Return the term of measured points on the surface."""
+def _surface_term(
+    problem: Problem, surface: SurfaceMap, generator: Generator
+) -> tuple[FusedTerm, SurfaceCost]:
+    """Return the term of measured points on the surface, and the cost itself."""
     cloud = PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator)
     cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
     assert problem.start is not None
     variance = max(float(cost.residual_variance(problem.start[None])[0]), LEAST_VARIANCE)
-    return FusedTerm(cost, variance, SURFACE_MEASUREMENTS * len(problem.views))
+    return FusedTerm(cost, variance, SURFACE_MEASUREMENTS * len(problem.views)), cost
 
 
 def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator) -> FusedTerm:
@@ -188,4 +192,5 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
         losses=torch.full((len(poses) - 1,), found.noise, dtype=torch.float64),
         covariance=answer.covariance,
         focal_factor=found.focal_factor,
+        diagnostics=answer.diagnostics,
     )

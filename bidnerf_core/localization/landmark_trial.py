@@ -25,6 +25,7 @@ from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews,
 from bidnerf_core.mapping.landmarks import HeldOutTrial, LandmarkMap
 from bidnerf_core.se3 import SE3
 
+DEFAULTS = LandmarkConfig()
 HELD_OUT, MOST_HELD_OUT = 8, 24
 """One image in so many is held out, and at most so many images."""
 ENOUGH = 6
@@ -44,7 +45,7 @@ class _Answer:
 def build_tried_landmarks(
     views: Sequence[View],
     features: Features = SIFT,
-    config: LandmarkConfig = LandmarkConfig(),
+    config: LandmarkConfig = DEFAULTS,
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:

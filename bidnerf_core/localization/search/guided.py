@@ -79,6 +79,9 @@ class ProjectedLandmarks:
         self._tree = cKDTree(self._pixels.numpy()) if len(self._pixels) else None
         self._sizes = landmarks.sizes[self._index] * focal / local[:, 2]
 
+    def __len__(self) -> int:
+        return len(self._index)
+
     def matches(
         self, radius: float, most_distance: float, shift: tuple[float, float] = (0.0, 0.0)
     ) -> LandmarkMatches:

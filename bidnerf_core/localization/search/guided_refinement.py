@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.guided import guided_matches, projected_landmarks
+from bidnerf_core.localization.search.guided import (
+    ProjectedLandmarks,
+    guided_matches,
+    projected_landmarks,
+)
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
+from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.search.ransac import Hypothesis
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.features import NORM
 from bidnerf_core.mapping.resection import (
-    CALIBRATED,
+    GIVEN,
     NOMINAL,
     Calibration,
     CalibrationPrior,
@@ -37,29 +41,12 @@ LOOSE = 1.3
 """Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
 """Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
-MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
-"""Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
 CERTAIN = 0.999
 """Probability that the given intrinsics are wrong above which the estimated ones are taken."""
+MOST_DISTANCE = (0.5 * NORM) ** 2
+"""Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
 LEAST_MATCHES = 6
 """Least number of guided matches for another round."""
-
-
-@dataclass(frozen=True, eq=False)
-class Miscalibration:
-    """How far the intrinsics that fit an image best are from the given ones, and whether these are wrong.
-
-    Images of the map, whose intrinsics are right, seem to need corrections, too; their scatter is part of the noise.
-    """
-
-    apparent: Float[Tensor, "4"]  # the correction that fits best, in the order of ``Calibration``
-    noise: Float[Tensor, "4"]  # standard deviations of that estimate by the noise of the keypoints
-    probability: Float[Tensor, "4"]  # that the given parameter is wrong
-
-    @property
-    def deviations(self) -> Float[Tensor, "4"]:
-        """The standard deviation of the true correction about zero."""
-        return (CALIBRATED.deviations.square() + self.probability * self.apparent.square()).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,27 +56,48 @@ class GuidedPose:
     fit: ReprojectionFit
     prior: CalibrationPrior  # of the intrinsics, as they were taken in the end
     correspondences: LandmarkMatches
+    visible: int  # landmarks that should be visible from there
     chance: float  # matches that the last round would find at a wrong pose
     miscalibration: Miscalibration
 
 
 def refined(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -> GuidedPose:
-    """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change.
-
-    The intrinsics are taken as given, unless the matches contradict them; they are estimated then.
-    """
+    """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change."""
     most = LOOSE**2 * float(query.squared_distances(inliers).quantile(0.9))
     start = Calibration(log_focal=math.log(first.focal_factor))
-    data, correlation = query.observed(inliers), query.landmarks.correlation
-    fit = resect(data, first.T_world_rig, query.threshold / 2, query.prior, start, correlation)
-    fit, found = _guided(query, query.prior, fit, inliers, most, RADII)
+    correlation = query.landmarks.correlation
+    fit = resect(
+        query.observed(inliers), first.T_world_rig, query.threshold / 2, query.prior, start, correlation
+    )
+    return _settled(query, fit, inliers, most)
+
+
+def confirmed(query: LandmarkQuery, T_world_rig: SE3) -> GuidedPose | None:
+    """Refine a pose that was found by other means on guided matches; None if there are too few."""
+    radius = RADII[0] * query.threshold
+    found = guided_matches(query.images, query.landmarks, T_world_rig, radius, MOST_DISTANCE)
+    if len(found) < LEAST_MATCHES:
+        return None
+    fit = resect(
+        query.observed(found), T_world_rig, radius / 2, query.prior, correlation=query.landmarks.correlation
+    )
+    return _settled(query, fit, found, MOST_DISTANCE)
+
+
+def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches, most: float) -> GuidedPose:
+    """Refine a pose on guided matches, with the given intrinsics unless the matches contradict them for certain."""
+    correlation = query.landmarks.correlation
+    fit, found = _guided(query, query.prior, fit, found, most, RADII)
     free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
     prior = query.prior
-    wrong = miscalibration(free, query.landmarks)
-    if float(wrong.probability.max()) > CERTAIN and not prior.log_focal:
+    wrong = Miscalibration.of(free, query.landmarks)
+    if wrong.worst[1] > CERTAIN and not prior.log_focal:
         prior = NOMINAL
         fit, found = _guided(query, prior, free, found, most, RADII[1:])
-    return GuidedPose(fit, prior, found, _chance(query, fit, most), wrong)
+    radius = RADII[-1] * query.threshold
+    projections = projected_landmarks(query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius)
+    visible, chance = sum(map(len, projections)), _by_chance(projections, radius, most)
+    return GuidedPose(fit, prior, found, visible, chance, wrong)
 
 
 def _guided(
@@ -117,16 +125,6 @@ def _guided(
     return fit, found
 
 
-def miscalibration(free: ReprojectionFit, landmarks: LandmarkMap) -> Miscalibration:
-    """Judge whether the given intrinsics are wrong, by those that were estimated along with the pose."""
-    value = torch.tensor(dataclasses.astuple(free.calibration), dtype=torch.float64)
-    noise = free.calibration_deviations.square() + landmarks.calibration_scatter.square()
-    right, wrong = (noise + prior.deviations.square() for prior in (CALIBRATED, MISTAKEN))
-    log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
-    log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES))
-    return Miscalibration(value, free.calibration_deviations, log_odds.sigmoid())
-
-
 def _changed(a: LandmarkMatches, b: LandmarkMatches) -> float:
     """Return the share of the matches ``a`` that are not among ``b``."""
     keypoints = 1 << 32
@@ -143,11 +141,17 @@ def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
     return (ratio / scale - 1).abs() <= DEPTH_OFF
 
 
-def _chance(query: LandmarkQuery, fit: ReprojectionFit, most: float) -> float:
+def agreement(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
+    """Return how many landmarks should be visible from a pose, how many match near there, and how many would by chance."""
+    radius = RADII[0] * query.threshold
+    projections = projected_landmarks(query.images, query.landmarks, T_world_rig, GIVEN, radius)
+    matches = sum(len(found.matches(radius, MOST_DISTANCE)) for found in projections)
+    return sum(map(len, projections)), matches, _by_chance(projections, radius, MOST_DISTANCE)
+
+
+def _by_chance(projections: Sequence[ProjectedLandmarks], radius: float, most: float) -> float:
     """Return the number of guided matches expected by chance: the mean over shifts of all keypoints."""
-    radius = RADII[-1] * query.threshold
     away = 4 * radius
     shifts = ((away, away), (-away, -away))
-    projections = projected_landmarks(query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius)
     counts = [len(found.matches(radius, most, shift)) for shift in shifts for found in projections]
     return sum(counts) / len(shifts)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.guided_refinement import Miscalibration
+from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.mapping.resection import Calibration
 from bidnerf_core.se3 import SE3
 
@@ -32,7 +32,10 @@ class LandmarkPose:
     # Logarithm of the number of as good agreements expected by chance (Moisan and Stival 2004).
     log10_nfa: float
     chance: float  # correspondences that guided matching would find at a wrong pose
+    visible: int  # landmarks that should be visible from the pose
+    keypoints: int  # in the images
     spread: float  # 0 to 1: share of the image that the correspondences lie in
+    noise_ratio: float  # ``noise`` over that of the map's own images
     distance: float  # metres: median distance of the correspondences' landmarks
     calibration: Calibration  # what was estimated of the camera
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
@@ -45,6 +48,24 @@ class LandmarkPose:
     def focal_factor(self) -> float:
         """True over given focal length."""
         return self.calibration.focal_factor
+
+    @property
+    def estimates_calibration(self) -> bool:
+        """Whether the calibration was estimated with the pose."""
+        return bool((self.calibration_deviations > 0).any())
+
+    @property
+    def full_covariance(self) -> Float[Tensor, "6 6"]:
+        """The covariance with that of intrinsics that were taken as given."""
+        if self.estimates_calibration:
+            return self.covariance
+        by_calibration = self.slope * self.miscalibration.deviations
+        return self.covariance + by_calibration @ by_calibration.mT
+
+    @property
+    def position_deviation(self) -> float:
+        """The standard deviation of the position along its least certain direction, metres."""
+        return float(torch.linalg.eigvalsh(self.full_covariance[:3, :3])[-1].clamp(min=0).sqrt())
 
     @property
     def inliers(self) -> int:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_images
-from bidnerf_core.localization.search.guided_refinement import refined
+from bidnerf_core.localization.search.guided_refinement import agreement, confirmed, refined
 from bidnerf_core.localization.search.landmark_evidence import described, log10_agreement
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
@@ -17,6 +18,7 @@ from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.mapping.resection import FIXED, NOMINAL, CalibrationPrior
+from bidnerf_core.se3 import SE3
 
 STRONGEST = 700
 """Number of keypoints, the strongest of an image, that are matched first; all are matched only if these do not suffice."""
@@ -26,6 +28,10 @@ APPROXIMATE = 0.05
 """Relative standard deviation of the focal length above which it is sought together with the first pose."""
 LEAST_INLIERS = 6
 """Least number of inliers for a pose to be refined at all."""
+MANY_VISIBLE, CONTRADICTED = 200, 1.5
+"""The number of visible landmarks from which on they can contradict a pose, and how many times as many as by chance have to
+match for them not to.
+"""
 
 
 def propose(
@@ -55,6 +61,35 @@ def propose(
     found = described(query, matches, answer, clock.seconds)
     clock.lap("assessment")
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class Confirmation:
+    """What landmarks say about a pose that was found by other means."""
+
+    pose: LandmarkPose | None  # refined on the landmarks that match near it; None if too few do
+    visible: int  # landmarks that should be visible there
+    matches: int
+    chance: float  # matches expected at a wrong pose
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether no more landmarks match than by chance, although many should."""
+        return self.visible >= MANY_VISIBLE and self.matches < CONTRADICTED * self.chance + LEAST_INLIERS
+
+
+def confirm(
+    matcher: LandmarkMatcher, views: Sequence[View], T_world_camera: SE3, features: Features = SIFT
+) -> Confirmation:
+    """Match the landmarks near their projections at a pose of the last of ``views``, and refine it."""
+    clock = Stopwatch()
+    query = LandmarkQuery(query_images(views, features), matcher.landmarks, _calibration_prior(views))
+    clock.lap("descriptors")
+    visible, matches, chance = agreement(query, T_world_camera)
+    answer = confirmed(query, T_world_camera)
+    clock.lap("refinement")
+    pose = None if answer is None else described(query, answer.correspondences, answer, clock.seconds)
+    return Confirmation(pose, visible, matches, chance)
 
 
 def _calibration_prior(views: Sequence[View]) -> CalibrationPrior:
