@@ -161,7 +161,9 @@ def main() -> None:
         )
         for name, weight in zip(model.features, model.weights, strict=True):
             print(f"  {name:22} {weight:+.2f}")
-    record = write_record(RESULTS / f"{given.name}.json", {"examples": len(everything), "held_out": results}, seed=0)
+    record = write_record(
+        RESULTS / f"{given.name}.json", {"examples": len(everything), "held_out": results}, seed=0
+    )
     print(record)
     if given.write:
         text = json.dumps({"source": record.name, "models": stored}, indent=1)

@@ -32,6 +32,7 @@ from bidnerf_core.localization.by_colour import (
 from bidnerf_core.localization.by_landmarks import (
     answer_by_landmarks,
     fused_answer,
+    is_sharp,
     localization_by_landmarks,
 )
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
@@ -209,10 +210,6 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer."""
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
     search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
-    textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
-    rounds = (
-        1 if textured else config.rounds
-    )  # images of such a scene in which no landmark is recognised rarely succeed
     # Images with a plain background were rendered and are as bright as the map; photos may have another exposure.
     exposure = config.by_colour.refinement.exposure or not search.has_background
     refinement = replace(config.by_colour.refinement, exposure=exposure)
@@ -221,10 +218,33 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     while True:
         with torch.no_grad():
             found = search(hypotheses_for_images(known, problem.start, config.hypotheses, generator))
+        if config.landmarks and _is_hopeless(problem):
+            return _unrecognised(found, began)
         answers.append(refine_by_colour(problem, found, by_colour, generator))
         best = min(answers, key=lambda answer: answer.refined.loss)
-        if best.verdict.accepted or len(answers) == rounds:
+        if best.verdict.accepted or len(answers) == config.rounds:
             return localization_of(problem, best, by_colour, began, "auto")
+
+
+def _is_hopeless(problem: Problem) -> bool:
+    """Whether an image without recognised landmarks cannot be found: the scene is textured, and its field blurred."""
+    textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
+    return textured and not is_sharp(problem)
+
+
+def _unrecognised(found: SearchResult, began: float) -> Localization:
+    """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
+    return Localization(
+        T_world_camera=found.T[0].normalized(),
+        outcome=Outcome.TOO_FEW_MATCHES,
+        reason="no landmarks were recognised, and the field is too blurred to compare images with its renderings",
+        steps=len(found.losses),
+        seconds=time.perf_counter() - began,
+        loss=float(found.scores[0]),
+        method="auto",
+        poses=found.path,
+        losses=found.losses,
+    )
 
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:

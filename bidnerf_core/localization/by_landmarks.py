@@ -102,7 +102,7 @@ def fused_answer(
         terms["depth"], judge = _surface_term(problem, problem.surface, generator)
         diagnostics = landmark_diagnostics(found, searched, judge, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
-    if rays and _is_sharp(problem):
+    if rays and is_sharp(problem):
         terms["rendering"] = _rendered_term(problem, rays, about, generator)
     return _fused(answer, terms, about) if terms else answer
 
@@ -124,7 +124,8 @@ def _depth_scale(found: LandmarkPose) -> float:
     return 1 + weight * (found.depth_scale - 1)
 
 
-def _is_sharp(problem: Problem) -> bool:
+def is_sharp(problem: Problem) -> bool:
+    """Whether the field is sharp enough for rendered rays to add to what landmarks tell."""
     return problem.colour_noise is None or problem.colour_noise <= SHARPEST
 
 

@@ -34,9 +34,9 @@ class LogisticModel:
 
 def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float:
     """Return the probability that a pose with these diagnostics is right."""
-    by_landmarks = isinstance(diagnostics, LandmarkDiagnostics)
-    values = landmark_features(diagnostics) if by_landmarks else surface_features(diagnostics)
-    return models()["landmarks" if by_landmarks else "surface"].probability(values)
+    if isinstance(diagnostics, LandmarkDiagnostics):
+        return models()["landmarks"].probability(landmark_features(diagnostics))
+    return models()["surface"].probability(surface_features(diagnostics))
 
 
 @lru_cache(maxsize=1)

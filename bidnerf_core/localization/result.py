@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -33,6 +33,7 @@ class Outcome(StrEnum):
     TOO_FEW_MATCHES = "too few matches"  # of image features with the map's landmarks
 
 
+@runtime_checkable
 class Diagnostics(Protocol):
     """The measures by which a pose is judged: a dataclass of numbers, whose fields depend on how the pose was found."""
 
