@@ -35,6 +35,7 @@ from bidnerf_core.localization.by_landmarks import (
     is_sharp,
     localization_by_landmarks,
 )
+from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import surface_covariance
@@ -150,14 +151,14 @@ def _by_points(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
         found, inliers = _refined(problem, search, found, config, generator)
     with torch.no_grad():
         diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers)
-        verdict = diagnostics.verdict()
+        judgement = judged(diagnostics.verdict(), diagnostics)
         path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
         losses = search.judge(LOSS_POINTS).cost(path)
         covariance = surface_covariance(search.judge(), found.T[0], len(problem.views))
     return Localization(
         T_world_camera=found.T[0].normalized(),
-        outcome=verdict.outcome,
-        reason=verdict.reason,
+        outcome=judgement.verdict.outcome,
+        reason=judgement.verdict.reason,
         steps=len(losses) - 1,
         seconds=time.perf_counter() - began,
         loss=float(found.scores[0]),
@@ -165,6 +166,7 @@ def _by_points(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
         poses=path,
         losses=losses[:-1],
         covariance=covariance,
+        confidence=judgement.confidence,
         diagnostics=diagnostics,
     )
 

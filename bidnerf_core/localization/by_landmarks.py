@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_diagnostics, landmark_verdict
+from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
@@ -176,15 +177,15 @@ def _fused(answer: LandmarkAnswer, terms: dict[str, FusedTerm], about: Pivot) ->
 
 def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
     """Return an answer as a localization of method ``auto``."""
-    found, verdict = answer.found, answer.verdict
+    found, judgement = answer.found, judged(answer.verdict, answer.diagnostics)
     poses = [found.T_world_camera, answer.T]
     if problem.start is not None:
         poses = [problem.start, *poses]
     fused = f", fused with {' and '.join(answer.terms)}" if answer.terms else ""
     return Localization(
         T_world_camera=answer.T,
-        outcome=verdict.outcome,
-        reason=verdict.reason + fused,
+        outcome=judgement.verdict.outcome,
+        reason=judgement.verdict.reason + fused,
         steps=len(poses) - 1,
         seconds=time.perf_counter() - began,
         loss=found.noise,
@@ -193,5 +194,6 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
         losses=torch.full((len(poses) - 1,), found.noise, dtype=torch.float64),
         covariance=answer.covariance,
         focal_factor=found.focal_factor,
+        confidence=judgement.confidence,
         diagnostics=answer.diagnostics,
     )

@@ -13,9 +13,18 @@ from functools import lru_cache
 from importlib.resources import files
 
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.result import Outcome, Verdict
 
 ACCEPTED = 0.8
 """Least confidence with which a pose is accepted."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict with the probability that the pose is right; None where it is not known."""
+
+    verdict: Verdict
+    confidence: float | None
 
 
 @dataclass(frozen=True)
@@ -32,11 +41,24 @@ class LogisticModel:
         return 1 / (1 + math.exp(-max(-500.0, min(500.0, odds))))
 
 
-def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float:
-    """Return the probability that a pose with these diagnostics is right."""
+def judged(verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> Judgement:
+    """Return the confidence in a pose, and the verdict, which it can turn into a rejection."""
+    value = confidence(diagnostics)
+    if value is not None and verdict.accepted and value < ACCEPTED:
+        verdict = Verdict(
+            Outcome.UNCERTAIN, f"right with a probability of {value:.0%} only; {verdict.reason}"
+        )
+    return Judgement(verdict, value)
+
+
+def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float | None:
+    """Return the probability that a pose with these diagnostics is right; None where no model was learned."""
     if isinstance(diagnostics, LandmarkDiagnostics):
-        return models()["landmarks"].probability(landmark_features(diagnostics))
-    return models()["surface"].probability(surface_features(diagnostics))
+        name, features = "landmarks", landmark_features(diagnostics)
+    else:
+        name, features = "surface", surface_features(diagnostics)
+    model = models().get(name)
+    return None if model is None else model.probability(features)
 
 
 @lru_cache(maxsize=1)
