@@ -36,7 +36,7 @@ POINTS = 2000
 """Largest number of measured points that are fused."""
 SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
 """Numbers of independent measurements that a view's points on the surface and its rendered rays count as."""
-FUSION_STEPS = 4
+FUSION_STEPS = 2
 """Number of second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""

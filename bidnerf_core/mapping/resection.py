@@ -181,12 +181,12 @@ def resect(
         step = -_solved(system.hessian, damping, system.gradient)
         moved = state.retracted(step, free)
         tried = equations(moved, noise)
+        size = float(step @ system.hessian @ step)
         if not tried.cost <= system.cost:
             damping = max(10 * damping, 1e-4)
-            if damping > 1e8:
+            if size < SMALL_STEP or damping > 1e8:
                 break
             continue
-        size = float(step @ system.hessian @ step)
         state, system, damping = moved, tried, damping / 10
         better = max(LEAST_NOISE, noise * tried.spread)
         settled = abs(better / noise - 1) < SETTLED
