@@ -17,7 +17,7 @@ from bidnerf_core.localization.result import Outcome, Verdict
 
 GOOD = LandmarkDiagnostics(
     inliers=300, matches=400, agreeing=350, log10_nfa=-300.0, chance=4.0, visible=900, keypoints=1500, spread=0.7,
-    noise_ratio=1.0, miscalibration=0.02, precision=0.003, searched=True,
+    noise_ratio=1.0, miscalibration=0.02, precision=0.003, estimated_calibration=False, searched=True,
 )  # fmt: skip
 FINE = Verdict(Outcome.CONVERGED, "fine")
 
@@ -63,7 +63,7 @@ def test_every_stored_weight_belongs_to_a_feature() -> None:
 
 
 def test_features_are_finite_at_the_extremes() -> None:
-    nothing = LandmarkDiagnostics(0, 0, 0, 0.0, 0.0, 0, 0, 0.0, 0.0, 1.0, float("inf"), False)
+    nothing = LandmarkDiagnostics(0, 0, 0, 0.0, 0.0, 0, 0, 0.0, 0.0, 1.0, float("inf"), False, False)
     assert np.isfinite(list(confidence.landmark_features(nothing).values())).all()
     surface = SurfaceDiagnostics(0.0, 0.0, 1.0, float("inf"), 0.0)
     assert np.isfinite(list(confidence.surface_features(surface).values())).all()

@@ -123,7 +123,7 @@ def landmark_diagnostics(
     return LandmarkDiagnostics(
         found.inliers, found.matches, found.agreeing, found.log10_nfa, found.chance, found.visible,
         found.keypoints, found.spread, found.noise_ratio, wrong, found.position_deviation / found.distance,
-        searched, near, both,
+        found.estimates_calibration, searched, near, both,
     )  # fmt: skip
 
 

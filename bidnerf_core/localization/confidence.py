@@ -15,7 +15,7 @@ from importlib.resources import files
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
 from bidnerf_core.localization.result import Outcome, Verdict
 
-ACCEPTED = 0.8
+ACCEPTED = 0.7
 """Least confidence with which a pose is accepted."""
 
 
@@ -83,6 +83,7 @@ def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
         "spread": found.spread,
         "precision": math.log10(min(max(found.precision, 1e-4), 1.0)),
         "miscalibration": found.miscalibration,
+        "estimated_calibration": float(found.estimated_calibration),
         "confirmed_only": 0.0 if found.searched else 1.0,
         # Without measured points the surface neither supports nor contradicts a pose.
         "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,

@@ -49,6 +49,7 @@ def described(
         calibration_deviations=fit.calibration_deviations,
         slope=fit.slope,
         miscalibration=answer.miscalibration,
+        calibration_scatter=query.landmarks.calibration_scatter,
         depth_scale=float(ratio.median()) if len(ratio) >= LEAST_DEPTHS else None,
         seconds=seconds,
     )

@@ -41,6 +41,7 @@ class LandmarkPose:
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
     slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each of them
     miscalibration: Miscalibration
+    calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
@@ -56,10 +57,11 @@ class LandmarkPose:
 
     @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:
-        """The covariance with that of intrinsics that were taken as given."""
-        if self.estimates_calibration:
-            return self.covariance
-        by_calibration = self.slope * self.miscalibration.deviations
+        """The covariance with that of the intrinsics, as they were given or as this image and this map show them."""
+        deviations = (
+            self.calibration_scatter if self.estimates_calibration else self.miscalibration.deviations
+        )
+        by_calibration = self.slope * deviations
         return self.covariance + by_calibration @ by_calibration.mT
 
     @property
