@@ -12,10 +12,10 @@ from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.localization.landmark_trial import tried_landmarks
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
-from bidnerf_core.mapping.landmark_building import build_landmarks
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
 from bidnerf_core.storage import (
     LandmarkSource,
     Map,
@@ -66,9 +66,9 @@ def _bake(
 
 def bake_map(
     folder: Path, views: Sequence[View], config: BakeConfig, rendered_landmarks: bool = False,
-    landmarks: LandmarkMap | None = None,
+    tracked: TrackedViews | None = None,
 ) -> None:  # fmt: skip
-    """Bake the surface and the landmarks of the map in ``folder``; ``landmarks`` of the views if they were built already.
+    """Bake the surface and the landmarks of the map in ``folder``; ``tracked`` if the views' keypoints were tracked already.
 
     Views with measured depth take the place of rendered ones for the surface, and all ``views`` give landmarks. Without
     views, landmarks come from images that the field renders, unless the map has landmarks of photos, which are kept where
@@ -88,11 +88,8 @@ def bake_map(
     # Photos alone show how well the field renders; against its own images it has no error.
     noise = colour_noise(stored.field, stored.bounds, views) if views else stored.colour_noise
     source: LandmarkSource = "photos" if views else "rendered images"
-    if landmarks is not None:
-        save_landmarks(folder, stored.info, landmarks, noise, source)
-        return
     images = views or rendered_views(stored.field, stored.bounds, cameras)
-    _bake_landmarks(folder, stored, images, noise, source)
+    _bake_landmarks(folder, stored, images, noise, source, tracked)
 
 
 def _has_photo_landmarks(folder: Path, info: MapInfo) -> bool:
@@ -131,7 +128,8 @@ def _bake_landmarks(
     began = time.monotonic()
     try:
         with counted("landmarks", "steps") as report:
-            landmarks = build_landmarks(views, progress=report, report=say)
+            found = tracked_views(views, progress=report) if tracked is None else tracked
+        landmarks = tried_landmarks(found, views, report=say)
     except InputError as error:
         say(f"{folder}: no landmarks: {error}")
         return

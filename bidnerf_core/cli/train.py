@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,8 +32,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.images import background_colour
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.mapping.landmark_building import landmarks_and_views
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
@@ -140,31 +139,29 @@ def train_map(
     sparse_depth: int = 0,
 ) -> None:  # fmt: skip
     """Train a new map into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
-    landmarks, views = located(views)
+    tracked, views = located(views)
     bounds = estimate_bounds(views, background)
     settings = to_plain(config, "config")
     info = MapInfo(
         name, settings, bounds, 0, False, data, cameras=stored_cameras(views), sparse_depth=sparse_depth
     )
-    _run(backend, info, out, views, landmarks, checkpoint_seconds, baked)
+    _run(backend, info, out, views, tracked, checkpoint_seconds, baked)
 
 
-def located(views: Sequence[View]) -> tuple[LandmarkMap | None, list[View]]:
-    """Build the landmarks that training takes distances from, where not all views have dense depth.
+def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:
+    """Track the keypoints of the views, where not all of them have dense depth: training takes distances from landmarks.
 
-    Return them, and the views with those that each shows. Where none are found, training goes on without.
+    Return the tracks, of which ``bake_map`` makes the map's landmarks, and the views with the landmarks that each shows.
     """
     if all(view.frame.has_dense_depth for view in views):
         return None, list(views)
     began = time.monotonic()
-    try:
-        with counted("landmarks", "steps") as report:
-            landmarks, shown = landmarks_and_views(views, progress=report, report=say)
-    except InputError as error:
-        say(f"no landmarks to train on: {error}")
-        return None, list(views)
-    say(f"{len(landmarks)} landmarks from {len(views)} views, {time.monotonic() - began:.1f} s")
-    return landmarks, shown
+    with counted("landmarks", "steps") as report:
+        tracked = tracked_views(views, progress=report)
+    seen = tracked.seen(LandmarkConfig())
+    count = sum(len(part.distance) for part in seen)
+    say(f"{count} sightings of landmarks in {len(views)} views, {time.monotonic() - began:.1f} s")
+    return tracked, [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
 
 
 def load_interrupted(out: Path, baking: bool) -> MapInfo:
@@ -240,12 +237,12 @@ def _resume(
         say(f"{out}: training is complete ({info.step} steps); baking its surface")
         bake_map(out, views, BakeConfig())
         return
-    landmarks, views = located(views)  # the same as when the training began
-    _run(load_backend(info.backend, str(out)), info, out, views, landmarks, checkpoint_seconds, baked)
+    tracked, views = located(views)  # the same as when the training began
+    _run(load_backend(info.backend, str(out)), info, out, views, tracked, checkpoint_seconds, baked)
 
 
 def _run(
-    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], landmarks: LandmarkMap | None,
+    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], tracked: TrackedViews | None,
     checkpoint_seconds: float, baked: bool,
 ) -> None:  # fmt: skip
     field, config = build_field(backend, info, str(out))
@@ -257,7 +254,7 @@ def _run(
         report.finish(field)
     if baked:
         try:
-            bake_map(out, views, BakeConfig(), landmarks=landmarks)
+            bake_map(out, views, BakeConfig(), tracked=tracked)
         except InputError as error:  # the map itself is sound
             say(f"{out}: no surface baked: {error}")
     say(f"{out}: map of {info.data}, {sum(f.stat().st_size for f in out.iterdir()) / 2**20:.1f} MiB")
