@@ -104,9 +104,8 @@ class LandmarkDiagnostics:
     noise_ratio: float  # reprojection noise over that of the map's own images
     miscalibration: float  # probability that the given intrinsics are wrong
     precision: float  # standard deviation of the position over the landmarks' distance
-    searched: (
-        bool  # whether landmarks found the pose; otherwise they confirm one that was found on the surface
-    )
+    estimated_calibration: bool  # whether the intrinsics were estimated along with the pose
+    searched: bool  # whether landmarks found the pose, or only confirm one that was found on the surface
     on_surface: float | None = None  # share of the measured points that lie on the surface
     colour_inliers: float | None = None  # share that lies there and has its colour
 
