@@ -67,8 +67,8 @@ def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
     spacing = bins.bounds.spacing(whole)
     near, far = spacing.place(torch.stack([whole.near, whole.far], dim=-1)).split(1, dim=-1)
     along = spacing.distance(torch.lerp(near, far, oracle.places.to(near)))
-    points = bins.bounds.normalized(whole.at(along)).flatten(0, -3).to(oracle.places)
-    logits: Tensor = oracle(points)
+    points = bins.bounds.normalized(whole.at(along)).reshape(shape.numel(), len(oracle.places), 3)
+    logits: Tensor = oracle(points.to(oracle.places))
     return logits.reshape(*shape, logits.shape[-1])
 
 

@@ -122,8 +122,9 @@ def _bake_surface(
 
 
 def _bake_landmarks(
-    folder: Path, stored: Map, views: Sequence[View], noise: float | None, source: LandmarkSource
-) -> None:
+    folder: Path, stored: Map, views: Sequence[View], noise: float | None, source: LandmarkSource,
+    tracked: TrackedViews | None,
+) -> None:  # fmt: skip
     """Build landmarks of the views; a scene without texture has none, and the surface alone then serves."""
     began = time.monotonic()
     try:
