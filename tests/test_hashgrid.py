@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -390,7 +390,16 @@ def test_a_state_without_densities_is_taken_and_samples_as_it_did(field: HashGri
     loaded = copy.deepcopy(field)
     loaded.load_state_dict(field.upgraded_state(stored))
     assert loaded.sampler is loaded.occupancy
-    assert float(loaded.occupancy.density.max()) < 0
+    samples, before = loaded.sampler(random_rays()), field.occupancy(random_rays())
+    assert torch.equal(samples.starts, before.starts)
+
+
+def test_samples_are_concentrated_in_contracted_scenes_only(field: HashGridField) -> None:
+    assert field.sampler is field.occupancy
+    opened = backend.build(field.config, replace(BOUNDS, far=90.0, contracted=True))
+    rays = opened.bounds.rays(*(getattr(random_rays(), part).float() for part in ("origins", "directions")))
+    assert int(opened.occupancy(rays).valid.sum(-1).max()) > 32
+    assert int(opened.sampler(rays).valid.sum(-1).max()) <= 32
 
 
 def test_todays_state_is_taken_as_it_is(field: HashGridField) -> None:

@@ -15,7 +15,7 @@ from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
 from bidnerf_core.sampling import Concentrated
 from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
-from bidnerf_hashgrid.occupancy import UNKNOWN, GridDensity, OccupancyGrid
+from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
 
 LARGEST_LOG_DENSITY = 12.0
 
@@ -33,7 +33,8 @@ class FieldConfig(Settings):
     geometry_features: Count = 15
     # cells of the occupancy grid along the longest side of the scene
     grid_resolution: Annotated[int, Range(2, 1024)] = 128
-    samples_per_ray: Annotated[int, Range(0)] = 32  # at most; 0: all intervals in occupied cells
+    # at most, where the scene is contracted; elsewhere, or with 0, all intervals in occupied cells: few in a box
+    samples_per_ray: Annotated[int, Range(0)] = 32
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 
 
@@ -62,7 +63,7 @@ class HashGridField(nn.Module):
     @property
     def sampler(self) -> RaySampler:
         count = self.config.samples_per_ray
-        guided = count > 0 and self.occupancy.knows_density
+        guided = self.bounds.contracted and count > 0
         return Concentrated(GridDensity(self.occupancy), count) if guided else self.occupancy
 
     @property
@@ -70,12 +71,14 @@ class HashGridField(nn.Module):
         return CoarseField(self), self
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a stored state with today's names. The occupancy grid was the sampler, and it observed no densities."""
+        """Return a stored state with today's names. The occupancy grid was the sampler, and it observed no densities,
+        which only contracted scenes need: there were none.
+        """
         old = "sampler."
         state = {f"occupancy.{k.removeprefix(old)}" if k.startswith(old) else k: v for k, v in state.items()}
         for name in ("occupancy", "coarse_sampler"):
             if (peak := state.get(f"{name}.peak")) is not None:
-                state.setdefault(f"{name}.density", torch.full_like(peak, UNKNOWN))
+                state.setdefault(f"{name}.density", torch.zeros_like(peak))
         return state
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:

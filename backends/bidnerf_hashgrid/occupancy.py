@@ -15,9 +15,6 @@ from bidnerf_core.voxel_grid import VoxelGrid
 BLOCK = 8
 """Steps along a ray that are skipped together where no occupied cell is near."""
 
-UNKNOWN = -1.0
-"""Density of all cells of a grid that was stored before grids observed densities."""
-
 
 class OccupancyGrid(nn.Module):
     """A cube of cells around the scene, and a ``RaySampler`` of equal steps within its occupied cells.
@@ -126,11 +123,6 @@ class OccupancyGrid(nn.Module):
         starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
         ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)
         return RaySamples(starts, ends, valid)
-
-    @property
-    def knows_density(self) -> bool:
-        """Whether densities were observed: maps that were trained before grids did so have none."""
-        return float(self.density.view(-1)[0]) != UNKNOWN
 
     def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from torch import Generator
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
+from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
 from bidnerf_core.settings import Count, NotNegative, Range
@@ -31,10 +32,10 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
     rays_at_most: Count = 16384  # largest number of rays a step
     prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
     prune_every: Count = 16  # steps from one update of the occupied cells to the next
-    prune_fade: Annotated[float, Range(0, 1)] = 0.98  # factor on a cell's weight when rays visit it
-    prune_threshold: NotNegative = 0.002  # rendering weight up to which a cell is empty
+    prune_fade: Annotated[float, Range(0, 1)] = 0.95  # factor on a cell's weight when rays visit it
+    prune_threshold: NotNegative = 0.01  # rendering weight up to which a cell is empty
     # fraction of the steps in which neighbours of occupied cells are sampled too
-    grow_until: NotNegative = 0.9
+    grow_until: NotNegative = 0.6
     carve: bool = True  # begin with the cells that the views' depth and silhouettes leave
 
     def __post_init__(self) -> None:
@@ -49,12 +50,26 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
             )
 
 
+def pruning(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
+    """Return the config with slower pruning where the scene is contracted.
+
+    There a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a cell that is left out
+    too early is rarely found again.
+    """
+    if not bounds.contracted:
+        return config
+    return replace(
+        config, prune_fade=config.prune_fade**0.4, prune_threshold=config.prune_threshold / 5,
+        grow_until=max(config.grow_until, 0.9),
+    )  # fmt: skip
+
+
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve and report.resume() is None:
         for grid in (field.occupancy, field.coarse_sampler):
             grid.restrict(occupied_voxels(views, grid.grid))
-    supervision = Supervision(views, field.bounds, config)
+    supervision, pruned = Supervision(views, field.bounds, config), pruning(config, field.bounds)
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
         {
@@ -72,7 +87,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         count = max(1, min(config.rays_at_most, affordable))
         batch = supervision.draw(count, generator)
         rendering = render(level, batch.rays, batch.background, generator)
-        _update(grid, batch, rendering, step, config)
+        _update(grid, batch, rendering, step, pruned)
         loss, mse = supervision.loss(rendering, batch)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
