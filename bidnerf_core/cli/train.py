@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf_core.backend import Backend
-from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.carving import estimate_bounds, has_outline
 from bidnerf_core.cli.bake import bake_map
 from bidnerf_core.cli.common import (
     DEFAULT_BACKEND,
@@ -149,11 +149,11 @@ def train_map(
 
 
 def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:
-    """Track the keypoints of the views, where not all of them have dense depth: training takes distances from landmarks.
+    """Track the keypoints of the views, unless all have dense depth or a silhouette: training takes distances from landmarks.
 
     Return the tracks, of which ``bake_map`` makes the map's landmarks, and the views with the landmarks that each shows.
     """
-    if all(view.frame.has_dense_depth for view in views):
+    if all(view.frame.has_dense_depth or has_outline(view) for view in views):
         return None, list(views)
     began = time.monotonic()
     with counted("landmarks", "steps") as report:
