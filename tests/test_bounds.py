@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import tiny
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
@@ -13,11 +14,11 @@ from landmark_scene import Points, ring
 CAMERA = Intrinsics(60.0, 60.0, 32.0, 24.0, 64, 48)
 
 
-def wall(measured_rows: int, alpha: torch.Tensor | None = None) -> View:
+def wall(measured_rows: int) -> View:
     """A wall three metres away, whose depth was measured in the upper rows of 48."""
     depth = torch.zeros(48, 64)
     depth[:measured_rows] = 3.0
-    return View(Frame("wall", torch.zeros(48, 64, 3), CAMERA, depth, alpha), SE3.identity())
+    return View(Frame("wall", torch.zeros(48, 64, 3), CAMERA, depth), SE3.identity())
 
 
 def captured() -> list[View]:
@@ -28,19 +29,25 @@ def captured() -> list[View]:
     return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
 
 
-@pytest.mark.parametrize(("rows", "contracted"), [(48, False), (47, False), (40, True)])
-def test_a_scene_is_contracted_where_depth_leaves_much_unknown(rows: int, contracted: bool) -> None:
+@pytest.mark.parametrize(("rows", "contracted"), [(48, False), (30, False), (1, True)])
+def test_a_scene_is_contracted_unless_a_sensor_measured_its_depth(rows: int, contracted: bool) -> None:
     assert estimate_bounds([wall(rows)]).contracted == contracted
 
 
-def test_pixels_that_show_the_background_are_known() -> None:
-    alpha = torch.ones(48, 64)
-    alpha[40:] = 0
-    assert not estimate_bounds([wall(40, alpha)]).contracted
+def test_half_of_the_views_may_lack_depth() -> None:
+    assert not estimate_bounds([wall(48), wall(0)]).contracted
+    assert estimate_bounds([wall(48), wall(0), wall(0)]).contracted
+
+
+def test_silhouettes_leave_nothing_beyond_the_box() -> None:
+    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views()]
+    assert not estimate_bounds(bare).contracted
+    opaque = [replace(view, frame=replace(view.frame, alpha=None)) for view in bare]
+    assert estimate_bounds(opaque).contracted
 
 
 def test_matter_beyond_the_box_is_within_reach() -> None:
-    closed, opened = estimate_bounds([wall(48)]), estimate_bounds([wall(40)])
+    closed, opened = estimate_bounds([wall(48)]), estimate_bounds([wall(1)])
     assert opened.far > 1.5 * closed.far
 
 

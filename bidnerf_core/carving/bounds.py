@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.carving.boxes import MARGIN, AxisBox, corner, grown, rays_of
 from bidnerf_core.carving.hull import carved_box, has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames import View
 
 OUTLIERS = 1e-3  # fraction of the measured points, at either end of each axis, that may be wrong
 POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements that are used: in all, and at least of each view
@@ -21,9 +21,6 @@ FAR_MARGIN = 1.1  # a camera may be a little farther away than any of the views
 LEAST_NEAR = 0.01  # of far, where cameras are inside the box and nothing was measured
 LEAST_SPREAD = 0.01  # mean squared sine of the angles between optical axes and their mean: about 6 degrees
 INWARD = 0.8  # fraction of the cameras that must see the point that all of them look at
-COMPLETE = (
-    0.95  # share of the pixels known to show the box or the background, from which on there is nothing beyond
-)
 FAR_BEYOND = 2.0  # times the farthest that is known of, where there is matter beyond the box
 LEAST_LANDMARKS = 50  # sightings of landmarks in all views, for a box around them
 LANDMARKS_BEYOND = 0.05  # fraction of the landmarks, at either end of each axis, that may lie beyond the box
@@ -40,8 +37,8 @@ def estimate_bounds(
     measured points along each axis. With silhouettes (alpha) it is that of the visual hull. With colour only, it holds the
     middle 90 % of the landmarks that the views see. Without landmarks it is a guess: for cameras that look inward, a cube
     around the point they look at, as large as what an image shows there; for others (a room), the box of the cameras and of
-    what they see within ``ROOM`` times the extent of their positions. Unless depth or silhouettes say for nearly every pixel
-    what it shows, there is matter beyond the box, and the scene is contracted. Raises ``InputError`` where there is only
+    what they see within ``ROOM`` times the extent of their positions. Unless half of the views have dense depth or
+    silhouettes, there may be matter beyond the box, and the scene is contracted. Raises ``InputError`` where there is only
     colour and all cameras are in one place.
     """
     if not views:
@@ -51,7 +48,7 @@ def estimate_bounds(
     outlined = [view for view in views if has_outline(view)]
     if measured and (2 * len(dense) >= len(views) or not outlined):
         box, near = _measured_box(measured, MARGIN if dense else SPARSE_MARGIN)
-        return _with_far(views, box, near, background, _share_known(views) < COMPLETE)
+        return _with_far(views, box, near, background, 2 * len(dense) < len(views))
     if 2 * len(outlined) < len(views) and sum(_landmarks_of(view) for view in views) >= LEAST_LANDMARKS:
         return _around_landmarks([view for view in views if _landmarks_of(view)], background)
     box = _guessed_box(views)
@@ -95,19 +92,6 @@ def _landmark_points(view: View) -> Float[Tensor, "n 3"]:
     ray = view.frame.intrinsics.unproject(seen.pixels.double())
     points = ray * (seen.distance.double() / torch.linalg.vector_norm(ray, dim=-1))[:, None]
     return view.T_ref_camera.to(torch.float64).apply(points)
-
-
-def _share_known(views: Sequence[View]) -> float:
-    """Return the share of the views' pixels whose depth was measured or that show the background."""
-    shares = [_known(view.frame).float().mean().item() for view in views]
-    return sum(shares) / len(shares)
-
-
-def _known(frame: Frame) -> Bool[Tensor, "h w"]:
-    known = torch.zeros(frame.rgb.shape[:2], dtype=torch.bool)
-    if frame.depth is not None:
-        known |= frame.depth > 0
-    return known if frame.alpha is None else known | (frame.alpha < 1)
 
 
 def _measured_box(views: Sequence[View], margin: float) -> tuple[AxisBox, float]:
