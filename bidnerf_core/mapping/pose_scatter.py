@@ -8,7 +8,8 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.resection import ObservedPoints, resect
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.resection import resect
 from bidnerf_core.mapping.triangulation import Sightings
 
 LEAST_VISIBLE_POINTS = 20
