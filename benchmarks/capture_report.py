@@ -72,7 +72,9 @@ class Case:
     arrangement: str | None = None
 
 
-def drawn(views: Sequence[View], count: int, generator: Generator, among: Sequence[int] | None = None) -> list[int]:
+def drawn(
+    views: Sequence[View], count: int, generator: Generator, among: Sequence[int] | None = None
+) -> list[int]:
     """Return the numbers of ``count`` photos, drawn without replacement."""
     left = torch.tensor(range(len(views)) if among is None else among)
     return left[torch.randperm(len(left), generator=generator)[:count]].tolist()
@@ -108,7 +110,9 @@ def misplaced(view: View, middle: Tensor, generator: Generator) -> View:
     )
     T = view.T_ref_camera.to("cpu", torch.float64)
     size = SHIFT * torch.linalg.vector_norm(T.translation - middle)
-    return replace(view, T_ref_camera=T @ SE3.exp(torch.cat([size * directions[0], math.radians(TURN) * directions[1]])))
+    return replace(
+        view, T_ref_camera=T @ SE3.exp(torch.cat([size * directions[0], math.radians(TURN) * directions[1]]))
+    )
 
 
 def names(views: Sequence[View], numbers: Sequence[int]) -> set[str]:
@@ -176,7 +180,12 @@ def one_place(views: list[View], generator: Generator) -> Case:
         x, y = where[:, 0].reshape(height, width), where[:, 1].reshape(height, width)
         image = cv2.remap(source.frame.rgb.numpy(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         frame = replace(
-            source.frame, name=f"turn {number}", rgb=torch.from_numpy(image), intrinsics=camera, depth=None, alpha=None
+            source.frame,
+            name=f"turn {number}",
+            rgb=torch.from_numpy(image),
+            intrinsics=camera,
+            depth=None,
+            alpha=None,
         )
         made.append(View(frame, source.T_ref_camera.to("cpu", torch.float64) @ T))
     return Case(made, arrangement="one place")
@@ -221,7 +230,11 @@ def judged(case: Case, report: CaptureReport, usual: dict[str, set[str]]) -> dic
     if case.gap is not None:
         ends = {case.gap.after, case.gap.before}
         gaps = [(gap.degrees, gap.after, gap.before) for gap in report.coverage.gaps]
-        found |= {"gap_made": sorted(ends), "gaps_named": gaps, "gap_found": any(ends == set(g[1:]) for g in gaps)}
+        found |= {
+            "gap_made": sorted(ends),
+            "gaps_named": gaps,
+            "gap_found": any(ends == set(g[1:]) for g in gaps),
+        }
     if case.arrangement is not None:
         found["arrangement_found"] = report.coverage.arrangement == case.arrangement
     return found
@@ -232,14 +245,19 @@ def survey(views: list[View], features: RememberedKeypoints) -> tuple[CaptureRep
     tracked = tracked_views(views, features)
     middle = time.process_time()
     report = surveyed(tracked, views, features)
-    return report, {"matching_cpu_seconds": middle - began, "survey_cpu_seconds": time.process_time() - middle}
+    return report, {
+        "matching_cpu_seconds": middle - began,
+        "survey_cpu_seconds": time.process_time() - middle,
+    }
 
 
 def scene(views: list[View], others: list[View] | None, seed: int, only: Sequence[str]) -> dict[str, Any]:
     """Make each kind of damage to one dataset, and judge its record."""
     features = RememberedKeypoints()
     plain, cost = survey(views, features)
-    usual = {p: {photo.name for photo in plain.with_problem(p)} for photo in plain.photos for p in photo.problems}
+    usual = {
+        p: {photo.name for photo in plain.with_problem(p)} for photo in plain.photos for p in photo.problems
+    }
     found = {"as it is": judged(Case(views), plain, usual) | cost}
     print("as it is", *found["as it is"]["summary"], sep="\n  ", flush=True)
     generator = torch.Generator().manual_seed(seed)

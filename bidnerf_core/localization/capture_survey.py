@@ -89,8 +89,9 @@ def surveyed(
     mirrored: that tells a wrong pose from a photo that shows something else. ``trial`` is how held-out photos were found.
     """
     seen, positions = tracked.triangulated(config)
-    links, near, measures = linked(seen), nearby(views), photo_measures(views)
+    links, measures = linked(seen), photo_measures(views)
     group = groups(links)
+    near = _comparable(nearby(views), group)
     count = torch.bincount(seen.image, minlength=len(views))
     suspects = _suspects(seen, count, group)
     posed = _by_others(tracked, views, suspects, features, config)
@@ -103,15 +104,30 @@ def surveyed(
         found = posed.get(i)
         photos.append(
             PhotoRecord(
-                view.frame.name, _three(view.T_ref_camera.translation), _three(view.T_ref_camera.rotation[:, 2]),
-                float(sharpness[i]), float(exposure[i]), float(measures.overexposed[i]),
-                float(measures.underexposed[i]), len(seen.images[i].keypoints), int(count[i]), int(links[i].sum()),
-                int(group[i]), *(_difference(found) if found else (None, None, None)), problems[i],
+                view.frame.name,
+                _three(view.T_ref_camera.translation),
+                _three(view.T_ref_camera.rotation[:, 2]),
+                float(sharpness[i]),
+                float(exposure[i]),
+                float(measures.overexposed[i]),
+                float(measures.underexposed[i]),
+                len(seen.images[i].keypoints),
+                int(count[i]),
+                int(links[i].sum()),
+                int(group[i]),
+                *(_difference(found) if found else (None, None, None)),
+                problems[i],
             )  # fmt: skip
         )
     spread = exposure.quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
     covered = coverage(_sound(views, problems), _matched(tracked), seen, config.parallax)
     return CaptureReport(tuple(photos), covered, trial, float(spread[1] - spread[0]))
+
+
+def _comparable(near: Bool[Tensor, "v v"], group: Int[Tensor, "v"]) -> Bool[Tensor, "v v"]:
+    """Return which nearby photos also belong to the same group; all that are nearby where none does."""
+    same = near & (group[:, None] == group)
+    return torch.where(same.any(dim=1, keepdim=True), same, near)
 
 
 def _matched(tracked: TrackedViews) -> TrackedKeypoints:
@@ -121,8 +137,8 @@ def _matched(tracked: TrackedViews) -> TrackedKeypoints:
 
 
 def _sound(views: Sequence[View], problems: Sequence[tuple[Problem, ...]]) -> Sequence[View]:
-    """Return the views whose poses are right, as far as is known."""
-    wrong = {"mirrored", "turned", "badly posed"}
+    """Return the views of the main group whose poses are right, as far as is known."""
+    wrong = {"mirrored", "turned", "badly posed", "apart"}
     return [v for v, p in zip(views, problems, strict=True) if not wrong & set(p)] or views
 
 
@@ -167,7 +183,9 @@ def _mirrored(view: View) -> View:
     """Return the view with its image mirrored left to right."""
     frame, camera = view.frame, view.frame.intrinsics
     intrinsics = replace(camera, cx=camera.width - camera.cx)
-    return replace(view, frame=replace(frame, rgb=frame.rgb.flip(1), intrinsics=intrinsics, depth=None, alpha=None))
+    return replace(
+        view, frame=replace(frame, rgb=frame.rgb.flip(1), intrinsics=intrinsics, depth=None, alpha=None)
+    )
 
 
 def _compared(found: LandmarkPose, view: View, mirrored: bool) -> _Posed:

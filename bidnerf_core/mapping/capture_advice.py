@@ -58,14 +58,18 @@ def summary(report: CaptureReport) -> list[str]:
     if len(lines) <= SUMMARY_LINES:
         return lines
     left = len(lines) - SUMMARY_LINES + 1
-    return [*lines[: SUMMARY_LINES - 1], f"{left} more remarks: 'bidnerf info' prints them, with --draw a picture"]
+    return [
+        *lines[: SUMMARY_LINES - 1],
+        f"{left} more remarks: 'bidnerf info' prints them, with --draw a picture",
+    ]
 
 
 def _overview(report: CaptureReport) -> str:
     covered = report.coverage
     count = len(report.photos)
     low, high = covered.heights_deg
-    heights = f", {_degrees(low)} to {_degrees(high)} above the horizon" if covered.arrangement != "unknown" else ""
+    around = covered.arrangement in ("around", "one side")
+    heights = f", {low:.0f}° to {high:.0f}° above the horizon" if around else ""
     first = f"{_photos(count)}, {ARRANGEMENTS[covered.arrangement]}{heights}"
     if not covered.landmarks:
         return f"{first}; no landmark that several of them show could be triangulated"
@@ -82,7 +86,7 @@ def _trial(report: CaptureReport) -> Iterator[str]:
     errors = f", median error {trial.translation:.3g} m and {trial.rotation_deg:.2g}°" if trial.found else ""
     yield (
         f"of {_photos(trial.images)} held out of the landmarks, {trial.found} {_were(trial.found)} localized by them"
-        f"{errors}: expect as much of photos like these"
+        f"{errors}; expect the same of new photos that are taken likewise"
     )
 
 
@@ -110,7 +114,7 @@ def _advice(report: CaptureReport) -> Iterator[str]:
     low, high = covered.heights_deg
     if covered.arrangement in ("around", "one side") and high - low < SAME_HEIGHT:
         yield "all photos are from the same height: add some from higher and lower places"
-    if covered.landmarks and covered.seen_by_two > THIN:
+    if len(report.photos) >= LEAST_PHOTOS and covered.seen_by_two > THIN:
         yield (
             f"{covered.seen_by_two:.0%} of the landmarks are in two photos only: photos in between the present ones would"
             " make them firmer"
@@ -131,10 +135,6 @@ def _listed(photos: Sequence[PhotoRecord]) -> str:
 
 def _photos(count: int) -> str:
     return "one photo" if count == 1 else f"{count} photos"
-
-
-def _degrees(angle: float) -> str:
-    return f"{angle:.0f}°"
 
 
 def _is(count: int) -> str:

@@ -46,7 +46,7 @@ def coverage(
     directions = centres - centre if converge else rotations[:, :, 2]
     arrangement, open_side, gaps, heights = _around(views, directions, up, converge)
     if angle is not None and angle < least_parallax:
-        arrangement, gaps = "one place", ()
+        arrangement, open_side, gaps = "one place", None, ()
     views_of = torch.bincount(seen.point).double()
     cones = _cones_deg(seen.sightings, seen.count)
     return CoverageRecord(

@@ -25,7 +25,9 @@ class PhotoRecord:
     name: str
     position: tuple[float, float, float]  # of the camera, metres, world
     direction: tuple[float, float, float]  # of the optical axis, unit, world
-    sharpness: float  # log2 of the energy of fine over that of coarse detail, relative to photos from nearby places
+    sharpness: (
+        float  # log2 of the energy of fine over that of coarse detail, relative to photos from nearby places
+    )
     exposure: float  # stops: brightness of the same landmarks, relative to the other photos
     overexposed: float  # share of the pixels
     underexposed: float
@@ -54,7 +56,11 @@ class CoverageRecord:
     """How well a capture covers its scene."""
 
     arrangement: Arrangement = "unknown"
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres: where the optical axes meet, as far as they do
+    centre: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # metres: where the optical axes meet, as far as they do
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit: mean upward direction of the cameras
     parallax_deg: float = 0.0  # median angle between the rays to a point
     landmarks: int = 0  # triangulated
@@ -64,7 +70,10 @@ class CoverageRecord:
     # Range of directions without a camera that all cameras leave open, where they do not go around; then gaps between them.
     open_side: Gap | None = None
     gaps: tuple[Gap, ...] = ()  # much wider than the capture's other steps, the widest first
-    heights_deg: tuple[float, float] = (0.0, 0.0)  # of the cameras above the horizon of the centre: lowest, highest twentieth
+    heights_deg: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # of the cameras above the horizon of the centre: lowest, highest twentieth
 
 
 @dataclass(frozen=True)
