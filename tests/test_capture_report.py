@@ -26,16 +26,19 @@ from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.serialization import from_plain, to_plain
 from landmark_scene import Points, looking_in, ring
-from textured_field import BOUNDS, ground
+from textured_field import BOUNDS, TexturedGround
 
-CAMERA = Intrinsics(260.0, 260.0, 128.0, 96.0, 256, 192)
+CAMERA = Intrinsics(162.0, 162.0, 80.0, 60.0, 160, 120)
 
 
 @functools.cache
 def photos() -> tuple[View, ...]:
     """Photos of the textured ground from all sides."""
     poses = orbit(1.8, 16, elevation=(45.0, 75.0), seed=0)
-    images = [render_image(ground(), CAMERA, T, BOUNDS).rgb for T in poses]
+    field = TexturedGround()
+    fine = torch.tensor([1.0, 3.0]).repeat(12)  # half of the waves are short, so that there is detail to lose
+    object.__setattr__(field, "waves", field.waves * fine)
+    images = [render_image(field, CAMERA, T, BOUNDS).rgb for T in poses]
     return tuple(
         View(Frame(f"{i:02d}", rgb, CAMERA), T) for i, (rgb, T) in enumerate(zip(images, poses, strict=True))
     )
@@ -157,7 +160,7 @@ def test_few_photos_are_recorded_and_more_are_asked_for(count: int) -> None:
 
 def test_photos_without_texture_are_recorded() -> None:
     plain = [
-        replace(view, frame=replace(view.frame, rgb=torch.full((192, 256, 3), 0.5))) for view in photos()[:9]
+        replace(view, frame=replace(view.frame, rgb=torch.full((120, 160, 3), 0.5))) for view in photos()[:9]
     ]
     report = survey(plain)
     assert report.coverage.landmarks == 0

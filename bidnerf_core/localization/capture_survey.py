@@ -34,6 +34,7 @@ from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, pose_updates, robus
 from bidnerf_core.mapping.triangulation import noise
 from bidnerf_core.se3 import SE3
 
+DEFAULTS, NOT_TRIED = LandmarkConfig(), HeldOutTrial()
 OUTLIER = 4.0
 """Deviations (robust) from the other photos of the capture from which on a photo stands out."""
 LEAST_BLUR = 0.5
@@ -75,13 +76,23 @@ class _Posed:
         about_axis = abs(float(self.update[5])) >= ALONG_AXIS * angle
         return "turned" if about_axis and math.degrees(angle) >= TURNED else "badly posed"
 
+    def onto(self, record: PhotoRecord) -> PhotoRecord:
+        """Return the record with how far the given pose is off; a mirrored photo has no pose to compare."""
+        if self.mirrored:
+            return record
+        translation, rotation = (float(torch.linalg.vector_norm(part)) for part in self.update.split(3))
+        return replace(
+            record, pose_translation=translation, pose_rotation_deg=math.degrees(rotation),
+            pose_deviations=self.deviations,
+        )  # fmt: skip
+
 
 def surveyed(
     tracked: TrackedViews,
     views: Sequence[View],
     features: Features = SIFT,
-    config: LandmarkConfig = LandmarkConfig(),
-    trial: HeldOutTrial = HeldOutTrial(),
+    config: LandmarkConfig = DEFAULTS,
+    trial: HeldOutTrial = NOT_TRIED,
 ) -> CaptureReport:
     """Return the record of the capture whose keypoints are matched in ``tracked``, in the order of ``views``.
 
@@ -100,25 +111,14 @@ def surveyed(
     problems = _problems(measures, exposure, near, group, posed)
     sharpness = above_neighbours(measures.sharpness, near)
     photos = []
-    for i, view in enumerate(views):
+    for i, (view, image) in enumerate(zip(views, seen.images, strict=True)):
         found = posed.get(i)
-        photos.append(
-            PhotoRecord(
-                view.frame.name,
-                _three(view.T_ref_camera.translation),
-                _three(view.T_ref_camera.rotation[:, 2]),
-                float(sharpness[i]),
-                float(exposure[i]),
-                float(measures.overexposed[i]),
-                float(measures.underexposed[i]),
-                len(seen.images[i].keypoints),
-                int(count[i]),
-                int(links[i].sum()),
-                int(group[i]),
-                *(_difference(found) if found else (None, None, None)),
-                problems[i],
-            )  # fmt: skip
-        )
+        record = PhotoRecord(
+            view.frame.name, _three(view.T_ref_camera.translation), _three(view.T_ref_camera.rotation[:, 2]),
+            float(sharpness[i]), float(exposure[i]), float(measures.overexposed[i]), float(measures.underexposed[i]),
+            len(image.keypoints), int(count[i]), int(links[i].sum()), int(group[i]), problems=problems[i],
+        )  # fmt: skip
+        photos.append(found.onto(record) if found else record)
     spread = exposure.quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
     covered = coverage(_sound(views, problems), _matched(tracked), seen, config.parallax)
     return CaptureReport(tuple(photos), covered, trial, float(spread[1] - spread[0]))
@@ -250,11 +250,6 @@ def _place(group: int) -> Problem | None:
 def _standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
     """Return which values exceed both ``least`` and ``OUTLIER`` robust standard deviations of all about zero."""
     return values > max(least, OUTLIER * 1.4826 * float(values.abs().median()))
-
-
-def _difference(found: _Posed) -> tuple[float, float, float]:
-    translation, rotation = (float(torch.linalg.vector_norm(part)) for part in found.update.split(3))
-    return translation, math.degrees(rotation), found.deviations
 
 
 def _three(vector: Float[Tensor, "3"]) -> tuple[float, float, float]:

@@ -27,22 +27,22 @@ ARRANGEMENTS: dict[Arrangement, str] = {
     "unknown": "too few to tell how they lie",
 }
 PROBLEMS: dict[Problem, tuple[str, str]] = {
-    "mirrored": ("mirrored", "turn off the mirroring of selfies, or flip them back"),
+    "mirrored": ("mirrored", "flip the image back, and turn off the mirroring of selfies"),
     "turned": (
-        "turned against their poses",
-        "rotate the images, or their poses, so that both agree on what is up",
+        "turned against the pose",
+        "rotate the image, or the pose, so that both agree on what is up",
     ),
-    "badly posed": ("posed differently from what their landmarks say", "leave them out, or estimate their poses anew"),
+    "badly posed": ("not where the given pose says, by the landmarks of other photos", "estimate the pose anew, or leave the photo out"),
     "apart": (
-        "linked to each other but to none of the rest",
-        "if they show another place, make a map of its own; otherwise take photos in between",
+        "linked to the rest by no landmarks",
+        "photos of another place need a map of their own; otherwise take some in between",
     ),
     "isolated": (
-        "without enough landmarks in common with others",
-        "leave them out, or take photos between them and the rest",
+        "short of landmarks in common with others",
+        "leave it out, or take photos between it and the rest",
     ),
-    "blurred": ("blurred compared with photos from nearby", "take them again, with more light or a steadier camera"),
-    "badly exposed": ("exposed differently from the rest", "take them again with locked exposure"),
+    "blurred": ("blurred compared with photos from nearby", "take such photos again, with more light or a steadier camera"),
+    "badly exposed": ("exposed differently from the rest", "take such photos again with locked exposure"),
 }  # fmt: skip
 """How each problem reads after "is" or "are", and what helps."""
 
