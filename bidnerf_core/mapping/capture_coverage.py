@@ -22,6 +22,8 @@ OPEN_SIDE = 120.0
 """Degrees without a camera from which on a capture is of one side."""
 LEAST_GAP = 15.0
 """Degrees: SIFT matches well across less, so that a narrower gap costs nothing."""
+WIDE_GAP = 45.0
+"""Degrees from which on a gap counts however irregular the capture is: from its middle, SIFT matches neither side well."""
 RARE = 0.01
 """Probability that a capture whose cameras are spread at random has a gap that counts."""
 STEEP = 75.0
@@ -73,7 +75,7 @@ def _around(
     open_side = named[order[0]] if is_open else None
     # Random directions have exponential steps: of n, one exceeds mean * log(n / p) with probability p.
     mean = float(steps.median()) / math.log(2)
-    least = max(LEAST_GAP + hidden, mean * math.log(len(names) / RARE))
+    least = hidden + min(max(LEAST_GAP, mean * math.log(len(names) / RARE)), WIDE_GAP)
     gaps = tuple(named[i] for i in order[int(is_open) :] if float(steps[i]) > least)
     arrangement: Arrangement = "one side" if is_open else "around" if converge else "inside"
     return arrangement, open_side, gaps, (low, high)
