@@ -146,7 +146,7 @@ def test_photos_from_one_place_have_no_parallax() -> None:
     report = surveyed(tracked_views(views, points), views, points)
     assert report.coverage.arrangement == "one place"
     assert report.coverage.parallax_deg < 0.1
-    assert not any(photo.problems for photo in report.photos)
+    assert not report.with_problem("isolated", "apart", "badly posed")
     assert any("from one place show no distances" in sentence for sentence in sentences(report))
 
 
