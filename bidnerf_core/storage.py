@@ -27,6 +27,7 @@ from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.files import write_file
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
+from bidnerf_core.mapping.capture_report import CaptureReport
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.registry import load_backend
@@ -38,8 +39,10 @@ from bidnerf_core.training import TrainingState
 FORMAT = "bidnerf map"
 VERSION = 1
 DESCRIPTION = "map.json"
-TENSORS = r"(weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors"
-OURS = re.compile(rf"{TENSORS}|\.({TENSORS}|map\.json)\.[0-9a-f]{{8}}")
+PARTS = (
+    r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
+)
+OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 """Names of files that a save may leave behind; other files in the folder are never removed."""
 
 
@@ -73,6 +76,7 @@ class MapInfo:
     surface: str | None = None  # baked from these weights
     landmarks: str | None = None
     landmark_source: LandmarkSource | None = None  # what they were built from, where that is recorded
+    capture: str | None = None  # record of the photos that gave the landmarks
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
@@ -132,6 +136,7 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
         surface=None,
         landmarks=None,
         landmark_source=None,
+        capture=None,
         colour_noise=None,
     )
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
@@ -151,7 +156,7 @@ def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
 
     Raises ``InputError`` where another training has replaced that map meanwhile.
     """
-    return _save_part(folder, of, "surface", surface_tensors(surface))
+    return _save_part(folder, of, "surface", tensors_to_bytes(surface_tensors(surface)))
 
 
 def save_landmarks(
@@ -163,21 +168,50 @@ def save_landmarks(
     ``source`` says which images the landmarks were built from. Raises ``InputError`` where another training has replaced
     that map meanwhile.
     """
-    tensors = landmark_tensors(landmarks)
-    return _save_part(folder, of, "landmarks", tensors, colour_noise=colour_noise, landmark_source=source)
+    content = tensors_to_bytes(landmark_tensors(landmarks))
+    return _save_part(folder, of, "landmarks", content, colour_noise=colour_noise, landmark_source=source)
+
+
+def save_capture(folder: Path, of: MapInfo, capture: CaptureReport) -> MapInfo:
+    """Add the record of its photos to map ``of``, in place of the one that it had.
+
+    Raises ``InputError`` where another training has replaced that map meanwhile.
+    """
+    content = json.dumps(to_plain(capture), indent=1, allow_nan=False).encode()
+    return _save_part(folder, of, "capture", content, "json")
+
+
+def load_capture(path: Path) -> CaptureReport:
+    """Return the record of a capture. Raises ``InputError`` where the file does not hold one."""
+    try:
+        found = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{path}: missing, although the map names it; bake the map again with --data"
+        ) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path}: not JSON ({error}), expected the record of a capture; bake the map again with --data"
+        ) from error
+    return from_plain(CaptureReport, found, str(path))
 
 
 def _save_part(
-    folder: Path, of: MapInfo, part: str, tensors: dict[str, Tensor], **facts: float | str | None
+    folder: Path,
+    of: MapInfo,
+    part: str,
+    content: bytes,
+    ending: str = "safetensors",
+    **facts: float | str | None,
 ) -> MapInfo:
-    """Add a file of tensors to a map under the name of a part of its description."""
+    """Add a file to a map under the name of a part of its description."""
     if load_info(folder).weights != of.weights:
         raise InputError(f"{folder}: was trained anew while its {part} was made; bake it again")
-    name = f"{part}-{of.step:08d}-{secrets.token_hex(4)}.safetensors"
+    name = f"{part}-{of.step:08d}-{secrets.token_hex(4)}.{ending}"
     info = replace(load_info(folder), **{part: name}, **facts)  # type: ignore[arg-type]
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     try:
-        write_file(folder / name, tensors_to_bytes(tensors))
+        write_file(folder / name, content)
         write_file(folder / DESCRIPTION, description)
     finally:
         _sweep(folder)
@@ -211,7 +245,7 @@ def load_info(folder: Path) -> MapInfo:
         advice = "it was written by a newer bidnerf, update yours" if newer else "train the map anew"
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; {advice}")
     info = from_plain(MapInfo, found, str(path))
-    for name in (info.weights, info.training, info.surface, info.landmarks):
+    for name in (info.weights, info.training, info.surface, info.landmarks, info.capture):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
     for camera in info.cameras:
@@ -279,7 +313,7 @@ def _sweep(folder: Path) -> None:
     """Remove files of earlier and of interrupted saves, which ``map.json`` does not name."""
     try:
         found = json.loads((folder / DESCRIPTION).read_bytes())
-        kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks")}
+        kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks", "capture")}
     except FileNotFoundError:
         kept = set()
     except (OSError, ValueError, AttributeError):  # damaged: which files are in use is unknown
