@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.arrays import read_array
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
-from bidnerf_core.images import decode, reason, to_numpy
+from bidnerf_core.images import decode, to_numpy
 
 FARTHEST = 1e9
 """Metres. No sensor measures more, and float32 has no use for it."""
@@ -60,7 +60,7 @@ def read_depth_image(path: Path, unit: float | None) -> DepthImage:
 
     Raises ``InputError`` for anything else.
     """
-    raw = _load(path) if path.suffix.lower() == ".npy" else decode(path)
+    raw = read_array(path, "a .npy file") if path.suffix.lower() == ".npy" else decode(path)
     return depth_image(raw, unit, f"{path}: depth")
 
 
@@ -107,13 +107,3 @@ def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
     }
     known = np.logical_or.reduce(list(absent.values()))
     return absent | {f"over {FARTHEST:g} m": ~known & (metres > FARTHEST)}
-
-
-def _load(path: Path) -> np.ndarray:
-    with open_binary(path, "a .npy file") as file:
-        try:
-            return np.asarray(np.load(file, allow_pickle=False))
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(
-                f"{path}: not readable as an array ({reason(error)}), expected a .npy file"
-            ) from error

@@ -11,6 +11,8 @@ from typing import BinaryIO
 
 from bidnerf_core.errors import InputError
 
+LARGEST_TEXT = 128 * 2**20
+"""Bytes. What is parsed as text takes ten times as much memory as its file; the size is checked before it is read."""
 FILE_KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
@@ -39,6 +41,24 @@ def open_binary(path: Path, expected: str) -> BinaryIO:
         raise InputError(f"{path}: cannot be opened ({reason}), expected {expected}") from error
     kind = FILE_KINDS.get(stat.S_IFMT(mode), "no regular file")
     raise InputError(f"{path}: is {kind}, expected {expected}")
+
+
+def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
+    """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and for more than ``most`` bytes."""
+    with open_binary(path, expected) as file:
+        return read_open_file(file, path, expected, most)
+
+
+def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
+    """Return the rest of the open file ``path``. Raises ``InputError`` where it cannot be read or has more than ``most`` bytes."""
+    size = os.fstat(file.fileno()).st_size
+    if size > most:
+        found, limit = (f"{count / 2**20:,.0f} MiB" for count in (size, most))
+        raise InputError(f"{path}: has {found}, expected {expected} of at most {limit}")
+    try:
+        return file.read()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}), expected {expected}") from error
 
 
 def write_file(path: Path, content: bytes) -> None:

@@ -22,7 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bidnerf_core.cli.help_page import Page, without_expert_settings
-from bidnerf_core.cli.text import printable
+from bidnerf_core.cli.text import PrintableStream, printable
 from bidnerf_core.errors import InputError
 
 if sys.platform != "win32":
@@ -86,7 +86,12 @@ def parse(command: str, function: Callable[..., _T], arguments: list[str]) -> _T
 
 
 def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
-    return tyro.cli(function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,))
+    odd = any(printable(word) != word for word in arguments)
+    # The parser repeats the arguments in its messages, and may colour them; words that could control the terminal must not.
+    with contextlib.redirect_stderr(PrintableStream(sys.stderr)) if odd else contextlib.nullcontext():
+        return tyro.cli(
+            function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,)
+        )
 
 
 def _show_help(command: str, function: Callable[..., _T], hidden: int) -> _T:
