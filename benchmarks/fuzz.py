@@ -17,7 +17,6 @@ import gc
 import io
 import json
 import os
-import re
 import resource
 import shutil
 import signal
@@ -44,6 +43,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.memory import STATUS, forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened, opened_points
+from bidnerf_core.files import is_temporary
 
 RESULTS = Path(__file__).parent / "results"
 LONGEST, MOST_MEMORY = 10.0, 2 * 2**30
@@ -51,8 +51,6 @@ LONGEST, MOST_MEMORY = 10.0, 2 * 2**30
 MOST_WAITING = 30.0
 """Seconds on the clock, of which a busy machine may give a case a third only."""
 NOBODY = 65534
-TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}")
-"""Names under which files are written before they get their own."""
 
 
 class TooLong(BaseException):
@@ -165,8 +163,8 @@ def defects_of_text(ending: str, out: str, err: str) -> Iterator[str]:
         yield f"control characters {sorted(odd)!r}"
     if "Traceback" in out + err:
         yield "a traceback"
-    named = [line for line in err.splitlines() if line.startswith("bidnerf ")]
-    if ending == "refused" and (len(named) != 1 or not err.endswith(named[0] + "\n")):
+    last = err.splitlines()[-1:]
+    if ending == "refused" and not (last and last[0].startswith("bidnerf ") and err.endswith("\n")):
         yield f"not one line of refusal: {err[-300:]!r}"
     if ending not in ("done", "refused", "wrong usage", "interrupted"):
         yield f"ended with {ending}"
@@ -176,7 +174,7 @@ def defects_of_files(folder: Path, before: set[Path]) -> Iterator[str]:
     """Yield the files that a command left half-written."""
     for path in files_of(folder):
         name = path.relative_to(folder)
-        if TEMPORARY.fullmatch(path.name):
+        if is_temporary(path.name):
             yield f"left {name}"
         elif name not in before and not whole(path):
             yield f"half-written {name}"

@@ -253,7 +253,7 @@ PLACES: dict[str, Callable[[Path], None]] = {
 
 COMMANDS: list[Words] = [
     TRAIN, RENDER, FRAME, [*EVALUATE, "{}/new.jsonl"], BAKE, ["info", "{}/map"], COMPARE, [*PHOTO, "--hfov", "40"],
-    ["report", "{}/results.jsonl", "--out", "{}/new"], ["backends"], ["demo", "--out", "{}/new", "--frames", "1", "--steps", "1"],
+    ["report", "{}/results.jsonl", "--out", "{}/new"], ["backends"], ["demo", "--out", "{}/new", "--frames", "0"],
 ]  # fmt: skip
 OPTIONS = [
     "--out",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 import stat
 from pathlib import Path
@@ -13,6 +14,7 @@ from bidnerf_core.errors import InputError
 
 LARGEST_TEXT = 128 * 2**20
 """Bytes. What is parsed as text takes ten times as much memory as its file; the size is checked before it is read."""
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}")
 FILE_KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
@@ -61,12 +63,22 @@ def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGES
         raise InputError(f"{path}: cannot be read ({error.strerror}), expected {expected}") from error
 
 
+def temporary(path: Path) -> Path:
+    """Return a new name beside ``path`` that ``is_temporary`` recognises."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+
+
+def is_temporary(name: str) -> bool:
+    """Return whether a file of this name was being written when its process was killed."""
+    return TEMPORARY.fullmatch(name) is not None
+
+
 def write_file(path: Path, content: bytes) -> None:
     """Write a file that appears under its name only once all of it is on the disk.
 
     Raises ``OSError``, which names the file; whatever stood there before is then untouched.
     """
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    beside = temporary(path)
     try:
         with beside.open("wb") as file:
             file.write(content)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from numbers import Integral
 from pathlib import Path
 
 from jaxtyping import Float
@@ -94,7 +95,10 @@ def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
     folders inside are left out. Raises ``InputError`` where ``folder`` is not a folder that may be read.
     """
     try:
-        files = sorted((file for file in Path(folder).iterdir() if file.is_file()), key=_natural)
+        files = sorted(
+            (file for file in Path(folder).iterdir() if file.is_file()),
+            key=lambda file: natural_order(file.name),
+        )
     except FileNotFoundError as error:
         raise InputError(f"{folder}: no such folder") from error
     except OSError as error:
@@ -110,17 +114,17 @@ def _is_photo(file: Path) -> bool:
     return image and not hidden and not file.stem.endswith(DEPTH_STEM)
 
 
-def _natural(file: Path) -> list[tuple[int, str]]:
+def natural_order(name: str) -> list[tuple[int, str]]:
     """Return a sort key that compares digits as numbers."""
-    parts = re.split(r"(\d+)", file.name.lower())
+    parts = re.split(r"(\d+)", name.lower())
     return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)]
 
 
 def _limited(source: CameraSource, largest: int | None) -> tuple[CameraSource, tuple[int, int]]:
     """Return the camera and the size (width, height) of an image whose longer side has at most ``largest`` pixels."""
     camera = source.intrinsics
-    if largest is not None and largest < 1:
-        raise InputError(f"largest is {largest}, expected a positive number of pixels")
+    if largest is not None and (not isinstance(largest, Integral) or largest < 1):
+        raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
     longer = max(camera.width, camera.height)
     if largest is None or longer <= largest:
         return source, (camera.width, camera.height)

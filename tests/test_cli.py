@@ -225,6 +225,21 @@ def test_without_depth_colour_alone_is_used_and_that_is_said(bidnerf: Run, tmp_p
     assert found.err == "t_0000, t_0001: no measured depth; colour only\n"
 
 
+def test_values_that_are_no_depth_are_mentioned_once(
+    bidnerf: Run, shared: Path, data: Path, tmp_path: Path
+) -> None:
+    for file in sorted((data / "depth").glob("t_*.png")):
+        depth = iio.imread(file)
+        depth[0, :3] = 65535
+        iio.imwrite(file, depth)
+    outcome = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
+    assert outcome.status == 0
+    assert outcome.err == (
+        f"bidnerf render: {data}/depth/t_0000.png: depth: counted as not measured: 3 x 65535, here and in the images that"
+        " follow\n"
+    )
+
+
 # Names that do not exist.
 
 

@@ -86,14 +86,14 @@ def _criterion(asked: str | None, groups: Sequence[Group]) -> str:
 def _check_ours(out: Path) -> None:
     """Raise ``InputError`` where ``out`` holds something else than a report, which a newer report may replace."""
     from bidnerf_core.evaluation.page import MARK
-    from bidnerf_core.files import open_binary
+    from bidnerf_core.files import is_temporary, open_binary
 
     try:
         with open_binary(out / "index.html", "the page of a report") as file:
             written = MARK.encode() in file.read(LENGTH_OF_HEAD)
     except InputError:
         written = False
-    if out.is_dir() and any(out.iterdir()) and not written:
+    if out.is_dir() and not written and not all(is_temporary(file.name) for file in out.iterdir()):
         raise InputError(
             f"{out}: holds something that is no report of bidnerf's; name another --out or remove it"
         )

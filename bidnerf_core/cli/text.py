@@ -19,7 +19,7 @@ def printable(text: str) -> str:
 class PrintableStream(io.TextIOBase):
     """A stream that passes on what is written to it line by line, with ``printable`` text."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO | io.TextIOBase) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 from bidnerf_core.datasets.dataset import ReadingProgress, positions, unique_names
+from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, SequenceEntry
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.images import Background, background_colour
+from bidnerf_core.photos import natural_order
+from bidnerf_core.se3 import SE3
 
 HOLD_OUT_EVERY = 8
 
@@ -24,6 +29,11 @@ class NamedFrame(Protocol):
     @property
     def parts(self) -> tuple[str, ...]:
         """The folders of the image, then its stem."""
+        ...
+
+    @property
+    def time(self) -> float | None:
+        """When the image was taken (seconds), where the format records it."""
         ...
 
 
@@ -65,6 +75,13 @@ class Splits(Generic[F]):
         """Return the first frame of each split."""
         return [group[0] for group in self._frames.values()]
 
+    def distinct(self) -> list[tuple[str, F]]:
+        """Return every description once, with the first split that holds it; splits may share frames."""
+        found = {
+            id(frame): (split, frame) for split in reversed(self.splits) for frame in self._frames[split]
+        }
+        return list(found.values())
+
     def _known(self, split: str) -> None:
         if split not in self._frames:
             raise InputError(f"{self.path}: no split {split!r}, expected one of {', '.join(self.splits)}")
@@ -102,9 +119,43 @@ class SplitDataset(ABC, Generic[F]):
                 progress(done, len(frames))
         return views
 
+    def sequence(self, others: Sequence[F] = ()) -> FrameSequence:
+        """Return the frames of all splits in the order of time, or of their files' names where times are not recorded.
+
+        ``others`` are frames that no split has, since they lack what a dataset needs.
+        """
+        listed: list[tuple[str | None, F]] = [*self._frames.distinct(), *((None, frame) for frame in others)]
+        listed.sort(key=lambda item: natural_order("/".join(item[1].parts)))
+        names = unique_names([(split or "", *frame.parts) for split, frame in listed])
+        return FileSequence.ordered(
+            self.path,
+            [
+                SequenceEntry(name, frame.time, split, partial(self._posed, frame, name))
+                for name, (split, frame) in zip(names, listed, strict=True)
+            ],
+        )
+
+    def _posed(self, frame: F, name: str) -> tuple[Frame, SE3 | None]:
+        """Read a frame of a sequence, and its pose where there is one."""
+        view = self._view(frame, name)
+        return view.frame, view.T_ref_camera
+
     @abstractmethod
     def _view(self, frame: F, name: str) -> View:
         """Read the frame's image and depth. Raises ``InputError`` where a file is missing or not usable."""
+
+
+class OpaqueDataset(SplitDataset[F]):
+    """A ``SplitDataset`` of images that have no alpha channel as a rule: the background is black unless it is given."""
+
+    def __init__(self, frames: Splits[F], background: Background | None) -> None:
+        super().__init__(frames)
+        self._background = background_colour("black" if background is None else background)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The requested colour, or black."""
+        return self._background
 
 
 def hold_out(frames: list[F]) -> dict[str, list[F]]:

@@ -10,7 +10,8 @@ These keys are read from a frame or, where it lacks them, from the file: ``camer
 0.001; as in nerfstudio it holds for ``.npy`` depth as well). These are read from a frame only: ``file_path`` (its extension
 may be missing), ``transform_matrix``, ``depth_file_path`` (planar z; see ``depth_images`` for values that count as not
 measured). ``applied_transform`` and ``applied_scale`` record what was already done to the poses. They are not undone, so
-the world is that of the file. Other keys are ignored.
+the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or by the number
+that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
 
 Images are used as they are stored: poses and intrinsics describe that raster, so an EXIF orientation is not applied.
 """
@@ -21,9 +22,10 @@ from functools import cached_property
 from pathlib import Path
 
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
-from bidnerf_core.depth_images import read_depth
+from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, background_colour, over, read_header, read_image
@@ -42,6 +44,9 @@ class TransformsReader:
     def open(self, path: Path, background: Background | None) -> Dataset:
         return TransformsDataset(path, read_splits(path), background)
 
+    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+        return TransformsDataset(path, read_splits(path), background).sequence()
+
 
 class TransformsDataset(SplitDataset[FrameRecord]):
     """Views of a folder with ``transforms.json``; see ``Dataset``."""
@@ -50,6 +55,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         self, path: Path, frames: dict[str, list[FrameRecord]], background: Background | None = None
     ) -> None:
         super().__init__(Splits(path, frames))
+        self._read_depth = DepthReader()
         self._background = None if background is None else background_colour(background)
         self._first: tuple[str, int, int] | None = (
             None  # file, width, height of the first image of unknown size
@@ -75,7 +81,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         colour, alpha = read_image(path)
         depth = None
         if frame.depth_path is not None:
-            depth = read_depth(self._depth_file(frame), frame.depth_unit)
+            depth = self._read_depth(self._depth_file(frame), frame.depth_unit).metres
             if depth.shape != colour.shape[:2]:
                 found = f"{depth.shape[1]}x{depth.shape[0]}"
                 raise frame.record.error(

@@ -16,11 +16,11 @@ import torch
 
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.arcs import arc
 from bidnerf_core.evaluation.closed_form_data import ClosedFormData
 from bidnerf_core.evaluation.faults import NO_FAULT, check_depth
 from bidnerf_core.evaluation.protocols import Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.sequences import sequence
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import (
     input_digests,
@@ -292,6 +292,6 @@ def _found_sequences(
 ) -> Iterator[tuple[str, ...]]:
     poses = [view.T_ref_camera for view in dataset.views(plan.split)]
     for name in kept:
-        places = sequence(poses, names.index(name), plan.images, plan.angle)
+        places = arc(poses, names.index(name), plan.images, plan.angle)
         if places is not None:
             yield tuple(names[place] for place in places)

@@ -19,7 +19,7 @@ import torch
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import ReadingProgress
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.sequences import turned_about
+from bidnerf_core.evaluation.arcs import turned_about
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.rendering import render_image

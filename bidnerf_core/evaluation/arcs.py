@@ -1,4 +1,4 @@
-"""Sequences of images around an object: frames of a split that are a given angle apart (BID-NeRF, Table 2)."""
+"""Arcs of images around an object: frames of a split that are a given angle apart (BID-NeRF, Table 2)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def mean_up(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
     return torch.nn.functional.normalize(mean if mean.norm() > 1e-3 else -poses[0].rotation[:, 1], dim=0)
 
 
-def sequence(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
+def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
     """Return the indices of ``count`` frames that end with ``last`` and lie ``angle_deg`` apart about their common middle.
 
     At each step about the vertical axis, the frame with the nearest direction from the middle is chosen. Both senses of
