@@ -74,17 +74,15 @@ class Intrinsics:
     @staticmethod
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
         """Return a camera without distortion; ``focal`` is in pixels, the principal point in the middle of the image."""
-        for name, value in (("width", width), ("height", height)):
-            _require(name, value, Integral, "a whole number of pixels")
-            if not 1 <= value <= LARGEST_SIZE:
-                raise InputError(f"{name} is {value!r:.30}, expected 1 to {LARGEST_SIZE} pixels")
+        _require_size("width", width)
+        _require_size("height", height)
         return Intrinsics(focal, focal, width / 2, height / 2, width, height)
 
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
         """Return a camera without distortion that sees ``degrees`` from the left edge of the image to the right one."""
         _require("horizontal field of view", degrees, Real, "degrees between 0 and 180")
-        _require("width", width, Integral, "a whole number of pixels")
+        _require_size("width", width)
         if not 0 < degrees < 180:
             raise InputError(
                 f"horizontal field of view is {degrees}, expected degrees between 0 and 180 (both excluded)"
@@ -163,6 +161,12 @@ class Intrinsics:
 def _require(name: str, value: object, kind: type, expected: str) -> None:
     if isinstance(value, bool) or not isinstance(value, kind):
         raise InputError(f"{name} is {value!r:.60}, expected {expected}")
+
+
+def _require_size(name: str, value: object) -> None:
+    _require(name, value, Integral, "a whole number of pixels")
+    if not 1 <= int(value) <= LARGEST_SIZE:  # type: ignore[call-overload]
+        raise InputError(f"{name} is {value!r:.30}, expected 1 to {LARGEST_SIZE} pixels")
 
 
 P1, P2, S1, S2, S3, S4, TAU_X, TAU_Y = 2, 3, 8, 9, 10, 11, 12, 13
