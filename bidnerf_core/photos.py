@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from numbers import Integral
 from pathlib import Path
 
 from jaxtyping import Float
@@ -123,7 +122,7 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 def _limited(source: CameraSource, largest: int | None) -> tuple[CameraSource, tuple[int, int]]:
     """Return the camera and the size (width, height) of an image whose longer side has at most ``largest`` pixels."""
     camera = source.intrinsics
-    if largest is not None and (not isinstance(largest, Integral) or largest < 1):
+    if largest is not None and not (isinstance(largest, int) and largest >= 1):
         raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
     longer = max(camera.width, camera.height)
     if largest is None or longer <= largest:
