@@ -50,7 +50,7 @@ def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     return _array(io.BytesIO(archive.read(name)), size)
 
 
-def _array(file: BinaryIO, size: int) -> np.ndarray:
+def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
     """Read an array from a file of ``size`` bytes. Raises ``ValueError``, and ``OSError`` of numpy."""
     version = np.lib.format.read_magic(file)
     if version not in HEADERS:
