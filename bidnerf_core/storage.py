@@ -24,7 +24,7 @@ from bidnerf_core.backend import Backend
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
-from bidnerf_core.files import write_file
+from bidnerf_core.files import read_file, write_file
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
 from bidnerf_core.mapping.capture_report import CaptureReport
@@ -123,6 +123,17 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
         found = type(field).__name__
         raise InputError(f"{where}: backend {info.backend!r} built a {found}, expected an nn.Module")
     return field, config
+
+
+def _outline(backend: Backend, info: MapInfo, where: str) -> RadianceField | None:
+    """Return the field with the shapes of its tensors only, or None where its backend needs real ones to build it."""
+    try:
+        with torch.device("meta"):
+            return build_field(backend, info, where)[0]
+    except InputError:
+        raise
+    except Exception:  # whatever a backend does with the numbers that it does not get
+        return None
 
 
 def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
@@ -232,10 +243,11 @@ def load_info(folder: Path) -> MapInfo:
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {what}, expected a map: a folder as written by 'bidnerf train'")
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"{folder}: no {DESCRIPTION} in it, expected a map as written by 'bidnerf train'")
+    content = read_file(path, "the description of a map")
     try:
-        found = json.loads(path.read_bytes())
+        found = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}), expected the description of a map") from error
     if not isinstance(found, dict) or found.get("format") != FORMAT:
@@ -265,8 +277,13 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     """
     folder = Path(folder)
     info, tensors, surface, landmarks = _read(folder, baked)
-    field, _ = build_field(load_backend(info.backend, str(folder)), info, str(folder / DESCRIPTION))
-    check_weights(field, tensors, folder / info.weights)
+    backend, where = load_backend(info.backend, str(folder)), str(folder / DESCRIPTION)
+    outline = _outline(backend, info, where)
+    if outline is not None:  # before memory is taken for a field of any size that map.json describes
+        check_weights(outline, tensors, folder / info.weights)
+    field, _ = build_field(backend, info, where)
+    if outline is None:
+        check_weights(field, tensors, folder / info.weights)
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bidnerf_core.cli.common import Flag, MapFolder, UsageError, option, parse, read_views, say
+from bidnerf_core.cli.common import Flag, MapFolder, UsageError, locked, option, parse, read_views, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
@@ -64,8 +64,9 @@ def _bake(
     if rendered_landmarks and data is not None:
         raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
     background = load_info(map).bounds.background
-    views = [] if data is None else read_views(open_dataset(data, background), split)
-    bake_map(map, views, config, rendered_landmarks)
+    with locked(map):
+        views = [] if data is None else read_views(open_dataset(data, background), split)
+        bake_map(map, views, config, rendered_landmarks)
 
 
 def bake_map(
