@@ -10,7 +10,6 @@ import contextlib
 import json
 import re
 import secrets
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -25,15 +24,16 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.files import read_file, write_file
-from bidnerf_core.frames import View
-from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
+from bidnerf_core.map_cameras import StoredCamera
+from bidnerf_core.map_parts import load_landmarks, load_surface
+from bidnerf_core.mapping import SurfaceMap, surface_tensors
 from bidnerf_core.mapping.capture_report import CaptureReport
-from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
+from bidnerf_core.mapping.landmark_tensors import landmark_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.registry import load_backend
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
-from bidnerf_core.tensor_files import check_weights, load_part, packed, read_tensors
+from bidnerf_core.tensor_files import check_weights, packed, read_tensors
 from bidnerf_core.training import TrainingState
 
 FORMAT = "bidnerf map"
@@ -47,15 +47,6 @@ OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 
 
 LandmarkSource = Literal["photos", "rendered images"]
-
-
-@dataclass(frozen=True)
-class StoredCamera:
-    """Camera and pose of a training image, from which the scene is known to be visible."""
-
-    name: str
-    intrinsics: Intrinsics
-    T_world_camera: tuple[tuple[float, float, float, float], ...]  # 4x4, rows
 
 
 @dataclass(frozen=True)
@@ -100,16 +91,6 @@ class Map:
     def colour_noise(self) -> float | None:
         """Root mean square error of the field's colours on its own training images, in [0, 1]."""
         return self.info.colour_noise
-
-
-def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
-    """Return the cameras of training views in the form that ``map.json`` holds."""
-    return tuple(
-        StoredCamera(
-            v.frame.name, v.frame.intrinsics, tuple(tuple(r) for r in v.T_ref_camera.matrix().tolist())
-        )
-        for v in views
-    )
 
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
@@ -190,21 +171,6 @@ def save_capture(folder: Path, of: MapInfo, capture: CaptureReport) -> MapInfo:
     """
     content = json.dumps(to_plain(capture), indent=1, allow_nan=False).encode()
     return _save_part(folder, of, "capture", content, "json")
-
-
-def load_capture(path: Path) -> CaptureReport:
-    """Return the record of a capture. Raises ``InputError`` where the file does not hold one."""
-    try:
-        found = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: missing, although the map names it; bake the map again with --data"
-        ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: not JSON ({error}), expected the record of a capture; bake the map again with --data"
-        ) from error
-    return from_plain(CaptureReport, found, str(path))
 
 
 def _save_part(
@@ -288,16 +254,6 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
     return Map(info, field, surface, landmarks)
-
-
-def load_surface(path: Path) -> SurfaceMap:
-    """Raises ``InputError`` where the file does not hold what ``surface_tensors`` gives."""
-    return load_part(path, surface_from_tensors, "a baked surface")
-
-
-def load_landmarks(path: Path) -> LandmarkMap:
-    """Raises ``InputError`` where the file does not hold what ``landmark_tensors`` gives."""
-    return load_part(path, landmarks_from_tensors, "landmarks")
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:

@@ -180,7 +180,7 @@ def test_blur_in_any_direction_costs_sharpness(size: tuple[int, int]) -> None:
         view, frame=replace(view.frame, rgb=torch.from_numpy(cv2.blur(view.frame.rgb.numpy(), size)))
     )
     before, after = photo_measures([view, soft]).sharpness.tolist()
-    assert after < before - 0.5
+    assert after < before - 0.3
 
 
 def test_exposure_of_photos_without_landmarks_is_that_of_the_whole_image() -> None:

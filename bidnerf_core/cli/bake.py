@@ -14,6 +14,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.capture_survey import surveyed
 from bidnerf_core.localization.landmark_trial import tried_landmarks
+from bidnerf_core.map_parts import load_landmarks
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.capture_advice import summary
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
@@ -25,7 +26,6 @@ from bidnerf_core.storage import (
     MapInfo,
     cameras_of,
     load_info,
-    load_landmarks,
     load_map,
     save_capture,
     save_landmarks,

@@ -9,10 +9,11 @@ from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json, 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.capture_figure import draw_capture
 from bidnerf_core.field import levels
+from bidnerf_core.map_parts import load_capture
 from bidnerf_core.mapping.capture_advice import sentences
 from bidnerf_core.mapping.capture_report import CaptureReport
 from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import Map, load_capture, load_map
+from bidnerf_core.storage import Map, load_map
 
 
 def run(arguments: list[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -105,8 +105,8 @@ def surveyed(
     near = _comparable(nearby(views), group)
     count = torch.bincount(seen.image, minlength=len(views))
     suspects = _suspects(seen, count, group)
-    posed = _by_others(tracked, views, suspects, features, config)
-    posed = {**_by_own_landmarks(seen, positions, views), **dict.fromkeys(suspects), **posed}
+    posed: dict[int, _Posed | None] = dict(_by_own_landmarks(seen, positions, views))
+    posed |= dict.fromkeys(suspects) | _by_others(tracked, views, suspects, features, config)
     exposure = exposures(views, seen, measures.brightness, near)
     problems = _problems(measures, exposure, near, group, posed)
     sharpness = above_neighbours(measures.sharpness, near)
@@ -224,7 +224,7 @@ def _problems(
     exposure: Float[Tensor, "v"],
     near: Bool[Tensor, "v v"],
     group: Int[Tensor, "v"],
-    posed: dict[int, _Posed | None],
+    posed: Mapping[int, _Posed | None],
 ) -> list[tuple[Problem, ...]]:
     """Return the problems of each photo, the gravest first."""
     blurred = _standing_out(-above_neighbours(measures.sharpness, near), LEAST_BLUR)
@@ -238,7 +238,9 @@ def _problems(
         found = posed.get(i)
         wrong = found.problem if found else None
         place: Problem | None = wrong or (_place(int(group[i])) if grouped and not found else None)
-        listed = (place, "blurred" if blurred[i] else None, "badly exposed" if badly_exposed[i] else None)
+        listed: tuple[Problem | None, ...] = (
+            place, "blurred" if blurred[i] else None, "badly exposed" if badly_exposed[i] else None,
+        )  # fmt: skip
         names.append(tuple(problem for problem in listed if problem is not None))
     return names
 
