@@ -20,9 +20,10 @@ from bidnerf_core.cli import main, train
 from bidnerf_core.cli.common import read_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import View
+from bidnerf_core.mapping.capture_report import CaptureReport, CoverageRecord
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
 from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.storage import Map, load_info, load_map
+from bidnerf_core.storage import Map, load_info, load_map, save_capture
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
 from commands import Run
@@ -272,3 +273,38 @@ def test_images_with_silhouettes_are_trained_on_without_landmarks() -> None:
     tracked, views = train.located(bare)
     assert tracked is None
     assert all(view.landmarks is None for view in views)
+
+
+def test_photos_leave_a_record_that_info_shows_and_draws(
+    shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
+    assert json.loads(bidnerf("info", folder, "--json")[1])["capture"] is None
+    status, _, err = bidnerf("info", folder, "--draw", folder / "capture.png")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "no record of its photos" in err
+    status, _, err = bidnerf("bake", folder, "--data", shared / "data")
+    assert status == 0
+    lines = [line for line in err.splitlines() if "24 photos, " in line]
+    assert len(lines) == 1
+    facts = json.loads(bidnerf("info", folder, "--json")[1])
+    assert len(facts["capture"]["photos"]) == 24
+    status, out, _ = bidnerf("info", folder, "--draw", folder / "capture.png")
+    assert (status, lines[0] in out) == (0, True)
+    assert (folder / "capture.png").read_bytes().startswith(b"\x89PNG")
+    status, _, err = bidnerf("info", folder, "--draw", folder / "capture.jpg")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "PNG" in err
+
+
+@pytest.mark.parametrize("content", ["", "{}", '{"photos": 3}'])
+def test_a_damaged_record_of_photos_is_named_in_a_line(folder: Path, content: str, bidnerf: Run) -> None:
+    save_capture(folder, load_info(folder), CaptureReport((), CoverageRecord()))
+    assert bidnerf("info", folder).status == 0
+    file = folder / str(load_info(folder).capture)
+    file.write_text(content)
+    status, _, err = bidnerf("info", folder)
+    assert (status, err.count("\n")) == (1, 1)
+    assert file.name in err
+    file.unlink()
+    assert "missing" in bidnerf("info", folder).err

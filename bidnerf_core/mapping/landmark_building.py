@@ -91,6 +91,11 @@ class TrackedViews:
         kept, positions, covariance = _triangulated(self.observations, radians(config.parallax))
         return seen_landmarks(kept, positions, noise(kept.sightings, positions) ** 2 * covariance)
 
+    def triangulated(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
+        """Return the keypoints that agree on a triangulated point, and those points (metres, world)."""
+        kept, positions, _ = _triangulated(self.observations, radians(config.parallax))
+        return kept, positions
+
     def without(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks without the keypoints of some images."""
         left = ~torch.isin(self.observations.image, torch.tensor(images))
