@@ -285,7 +285,7 @@ def test_photos_leave_a_record_that_info_shows_and_draws(
     assert "no record of its photos" in err
     status, _, err = bidnerf("bake", folder, "--data", shared / "data")
     assert status == 0
-    lines = [line for line in err.splitlines() if "24 photos, " in line]
+    lines = [line for line in err.splitlines() if "24 photos, " in line and "horizon" in line]
     assert len(lines) == 1
     facts = json.loads(bidnerf("info", folder, "--json")[1])
     assert len(facts["capture"]["photos"]) == 24
