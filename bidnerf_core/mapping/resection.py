@@ -12,8 +12,10 @@ from bidnerf_core.se3 import SE3, skew
 
 RESECTION_STEPS = 20
 """Largest number of steps; from a good start, four or five suffice."""
-FIRM = 1e-6
-"""Squared length of a step, in standard deviations of the pose, below which the iteration has converged."""
+FIRM = 0.05**2
+"""Squared length of a step, in standard deviations of the pose, below which the iteration has converged. Much shorter steps
+need not lower the cost, since the gradient leaves out that the deviations of landmarks depend on the pose.
+"""
 SETTLED = 0.01
 """Relative change of the estimated noise below which it has converged."""
 LEAST_NOISE = 0.05
@@ -91,8 +93,8 @@ def resect(
         T_new = T.retract(step[:6]).normalized()
         factor_new = log_factor + step[6] if free_focal else log_factor
         tried = _linearized(data, T_new, factor_new, noise, free_focal)
+        size = float(step @ system.hessian @ step)
         if tried.cost <= system.cost:
-            size = float(step @ system.hessian @ step)
             T, log_factor, damping, system = T_new, factor_new, max(1e-10, damping / 10), tried
             better = max(LEAST_NOISE, noise * system.spread)
             settled = abs(better / noise - 1) < SETTLED
@@ -101,10 +103,10 @@ def resect(
                 system = _linearized(data, T, log_factor, noise, free_focal)
             elif size < FIRM:
                 break
+        elif size < FIRM or damping > 1e8:
+            break
         else:
             damping *= 10
-            if damping > 1e8:
-                break
     covariance = _sandwich(system)
     return ReprojectionFit(T, float(log_factor.exp()), noise, covariance)
 

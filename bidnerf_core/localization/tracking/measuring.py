@@ -162,12 +162,12 @@ class ByLandmarks:
             return Measurement(PoseEstimate(T, noise, bias), verdict, found.noise, state)
         here = CloudInCamera(self._cloud(frame, found, state.frames), T)
         cloud = joined(here, state.window)
-        T, (total, alone) = fused_with_surface(
+        T, (_, noise) = fused_with_surface(
             T, (noise + bias, noise), surface, cloud, self.config.depth_steps, 1 + len(state.window)
         )
         kept_clouds = (*state.window, here)[-(self.config.window - 1) :] if self.config.window > 1 else ()
         verdict = replace(verdict, reason=f"{verdict.reason}, fused with depth")
-        pose = PoseEstimate(T, alone, total - alone)
+        pose = PoseEstimate(T, noise, bias)
         return Measurement(pose, verdict, found.noise, replace(state, window=kept_clouds))
 
     def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:
