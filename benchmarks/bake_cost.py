@@ -22,13 +22,13 @@ from typing import Any
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.storage import load_info, load_map
 
+RESULTS = Path(__file__).parent / "results"
 # The child measures itself: a parent's figure for the peak of a child includes the parent's own.
 MAIN = """
 import json, sys, time
 from bidnerf_core.cli import main
 from bidnerf_core.evaluation.memory import peak_memory_bytes
 
-RESULTS = Path(__file__).parent / "results"
 status = main(sys.argv[1:])
 print(json.dumps([time.process_time(), peak_memory_bytes()]))
 sys.exit(status)

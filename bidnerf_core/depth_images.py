@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.files import open_binary
 from bidnerf_core.images import decode, reason, to_numpy
 
@@ -20,6 +22,12 @@ NOTHING = 1e10
 """Floating-point values from here on stand for "nothing", whatever the unit: Blender's 1e10, the largest float."""
 INTEGER_UNIT, FLOAT_UNIT = 0.001, 1.0
 """Metres a step where the user gives none."""
+SPIKE = 0.05
+"""Share of an image's pixels from which on its largest value may be the sensor's limit rather than a measurement ..."""
+NEAREST_LIMIT, LIMIT_STEP = 4.0, 0.5
+"""... if that is a round number: a multiple of 0.5 m, as ranges are set and data sheets have them, from 4 m on ..."""
+LARGEST_OF_BITS = tuple(2**bits - 1 for bits in range(11, 17))
+"""... or all bits of a sensor of 11 to 16. A wall that faces the camera has one depth as well, but not a round one."""
 SATURATED = np.iinfo(np.uint16).max
 """A 16-bit sensor writes this for "too far" or "nothing"; 65.535 once it is converted to metres."""
 
@@ -68,8 +76,10 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     """Convert an array (h, w) or (h, w, 1) of ``unit`` metres a step; None is 0.001 for integers and 1 for floats.
 
     Values that no sensor measures become 0: NaN, infinite, negative, the largest of an integer type, 65535 and 65.535 of a
-    floating-point one, and floats of more than 1e9 m (1e10, the largest float). Raises ``InputError``, which begins with
-    ``what``, for arrays of another shape or type and a unit that is not positive.
+    floating-point one, and floats of more than 1e9 m (1e10, the largest float). So does the largest value of the image
+    where it is a sensor's limit: a round number (``LIMIT_STEP``, ``LARGEST_OF_BITS``) in a twentieth of all pixels or more,
+    but not in all that were measured. Raises ``InputError``, which begins with ``what``, for arrays of another shape or type
+    and a unit that is not positive.
     """
     values = to_numpy(raw)
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
@@ -83,6 +93,9 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     metres = values.astype(np.float64) * unit
     absent = _absent(values, metres)
     unmeasured = np.logical_or.reduce([metres == 0, *absent.values()])
+    limit = _at_limit(values, metres, unmeasured)
+    absent |= limit
+    unmeasured = np.logical_or.reduce([unmeasured, *limit.values()])
     counts = {name: int(mask.sum()) for name, mask in absent.items() if mask.any()}
     return DepthImage(
         torch.from_numpy(np.where(unmeasured, 0, metres).astype(np.float32)), float(unit), counts
@@ -107,6 +120,45 @@ def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
     }
     known = np.logical_or.reduce(list(absent.values()))
     return absent | {f"over {FARTHEST:g} m": ~known & (metres > FARTHEST)}
+
+
+def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the mask of the pixels at the sensor's limit, by its name in messages; nothing where there is none."""
+    measured = metres[~unmeasured]
+    if not measured.size:
+        return {}
+    largest = float(measured.max())
+    mask = ~unmeasured & (metres == largest)
+    count = int(mask.sum())
+    steps = round(largest / LIMIT_STEP)
+    is_round = largest >= NEAREST_LIMIT and abs(largest - steps * LIMIT_STEP) < 1e-6 * largest
+    fills_bits = values.dtype.kind != "f" and int(values[mask][0]) in LARGEST_OF_BITS
+    if count < SPIKE * values.size or count == measured.size or not (is_round or fills_bits):
+        return {}
+    return {f"{float(values[mask][0]):g} (the sensor's limit)": mask}
+
+
+class DepthReader:
+    """Reads the depth images of a recording, and warns once of each kind of value that stands for "not measured".
+
+    ``documented`` are kinds that the format of the recording defines, by their names in ``DepthImage.replaced``; they are
+    not mentioned.
+    """
+
+    def __init__(self, documented: Collection[str] = ()) -> None:
+        self._mentioned = set(documented)
+
+    def __call__(self, path: Path, unit: float) -> DepthImage:
+        """Read an image as ``read_depth_image`` does. New kinds of values are an ``InputWarning``."""
+        found = read_depth_image(path, unit)
+        new = {name: count for name, count in found.replaced.items() if name not in self._mentioned}
+        if new:
+            self._mentioned |= new.keys()
+            remark = replace(found, replaced=new).remark(unit_assumed=False)
+            warnings.warn(
+                f"{path}: depth: {remark}, here and in the images that follow", InputWarning, stacklevel=2
+            )
+        return found
 
 
 def _load(path: Path) -> np.ndarray:

@@ -42,6 +42,9 @@ class Frame:
     focal_is_approximate: bool = False
     """Whether the focal length is a nominal one, such as that in EXIF, which may be off by several percent."""
 
+    has_colour: bool = True
+    """Whether colours were recorded. Where only depth was, as between the photos of a LiDAR scan, ``rgb`` is black."""
+
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[-1] != 3:
             raise InputError(

@@ -94,7 +94,10 @@ def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
     folders inside are left out. Raises ``InputError`` where ``folder`` is not a folder that may be read.
     """
     try:
-        files = sorted((file for file in Path(folder).iterdir() if file.is_file()), key=_natural)
+        files = sorted(
+            (file for file in Path(folder).iterdir() if file.is_file()),
+            key=lambda file: natural_order(file.name),
+        )
     except FileNotFoundError as error:
         raise InputError(f"{folder}: no such folder") from error
     except OSError as error:
@@ -110,9 +113,9 @@ def _is_photo(file: Path) -> bool:
     return image and not hidden and not file.stem.endswith(DEPTH_STEM)
 
 
-def _natural(file: Path) -> list[tuple[int, str]]:
+def natural_order(name: str) -> list[tuple[int, str]]:
     """Return a sort key that compares digits as numbers."""
-    parts = re.split(r"(\d+)", file.name.lower())
+    parts = re.split(r"(\d+)", name.lower())
     return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)]
 
 

@@ -100,9 +100,11 @@ def measured_middle(views: Sequence[View], stride: int = 4) -> Float[Tensor, "3"
     """Return the median, axis by axis, of the measured points, in the views' reference frame; None if there are none."""
     points = []
     for view in views:
+        if not view.frame.has_depth:
+            continue
         pixels = observe(view, all_pixels(view.frame)[::stride], torch.float64, "cpu")
         points.append(pixels.points[pixels.measured])
-    together = torch.cat(points)
+    together = torch.cat(points) if points else torch.zeros((0, 3))
     return together.median(0).values if len(together) else None
 
 
@@ -112,7 +114,7 @@ QUALITY = 0.01
 FAINTEST = 1e-5
 """Least corner response of an interest point in any image. A blank wall with noise of 1/255 stays below it."""
 BORDER = 3
-"""Observations around each that the corner detector looks at; it does not take smaller images."""
+"""Width, in pixels, of the margin that the corner detector needs; smaller images have no corners."""
 REACH, ROUNDS = 5, 3
 """Regions are points dilated by squares of so many pixels, so many times."""
 

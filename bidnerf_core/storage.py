@@ -24,7 +24,7 @@ from bidnerf_core.backend import Backend
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
-from bidnerf_core.files import write_file as write_file
+from bidnerf_core.files import write_file
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors

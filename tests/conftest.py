@@ -19,6 +19,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+from commands import CommandResult, Run
+
 THREADS = "BIDNERF_TEST_THREADS"
 DATA = "BIDNERF_DATA"
 
@@ -58,3 +60,17 @@ def _seeded() -> Iterator[None]:
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a command in this process."""
+    from bidnerf_core.cli import main
+
+    def run(*words: object) -> CommandResult:
+        capsys.readouterr()
+        status = main([str(word) for word in words])
+        printed = capsys.readouterr()
+        return CommandResult(status, printed.out, printed.err)
+
+    return run

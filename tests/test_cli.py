@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
 from bidnerf_core.registry import list_backends
 from bidnerf_core.storage import load_info, load_map
+from commands import CommandResult, Run
 from tiny import backends_listed_once  # noqa: F401
 
 pytestmark = pytest.mark.usefixtures("backends_listed_once")
@@ -40,26 +40,6 @@ LOCALIZE_KEYS = {
 }  # fmt: skip
 QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64"]
 Edit = Callable[[Path], None]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    status: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def bidnerf(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
-    """Runs a command in this process."""
-
-    def run(*arguments: object) -> Outcome:
-        capsys.readouterr()
-        status = main([str(argument) for argument in arguments])
-        said = capsys.readouterr()
-        return Outcome(status, said.out, said.err)
-
-    return run
 
 
 @pytest.fixture(scope="session")
@@ -107,7 +87,7 @@ def contents(folder: Path) -> dict[str, bytes | None]:
     return {str(f.relative_to(folder)): f.read_bytes() if f.is_file() else None for f in files}
 
 
-def assert_refused(outcome: Outcome, status: int, *fragments: str) -> None:
+def assert_refused(outcome: CommandResult, status: int, *fragments: str) -> None:
     """One line, which names what is at fault."""
     assert outcome.status == status, outcome
     assert outcome.out == ""
@@ -209,7 +189,7 @@ BAD_DATA: dict[str, tuple[Edit, tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("case", BAD_DATA)
 def test_a_dataset_that_cannot_be_used_is_told_in_a_line(
-    case: str, bidnerf: Callable[..., Outcome], data: Path, tmp_path: Path
+    case: str, bidnerf: Run, data: Path, tmp_path: Path
 ) -> None:
     edit, fragments = BAD_DATA[case]
     edit(data)
@@ -222,7 +202,7 @@ def test_a_dataset_that_cannot_be_used_is_told_in_a_line(
 @pytest.mark.parametrize("case", ["missing image", "truncated depth", "depth of another size"])
 @pytest.mark.parametrize("command", ["localize", "render"])
 def test_the_frames_that_are_asked_for_are_judged_and_no_others(
-    case: str, command: str, bidnerf: Callable[..., Outcome], shared: Path, data: Path, tmp_path: Path
+    case: str, command: str, bidnerf: Run, shared: Path, data: Path, tmp_path: Path
 ) -> None:
     edit, fragments = BAD_DATA[case]
     edit(data)
@@ -233,9 +213,7 @@ def test_the_frames_that_are_asked_for_are_judged_and_no_others(
     assert bidnerf(*arguments, "r_0000").status == 0
 
 
-def test_without_depth_colour_alone_is_used_and_that_is_said(
-    bidnerf: Callable[..., Outcome], tmp_path: Path
-) -> None:
+def test_without_depth_colour_alone_is_used_and_that_is_said(bidnerf: Run, tmp_path: Path) -> None:
     data = tiny.write_dataset(tmp_path / "data", depth=False)
     trained = bidnerf("train", data, "--out", tmp_path / "map", *tiny.options(2))
     assert trained.status == 0
@@ -251,7 +229,7 @@ def test_without_depth_colour_alone_is_used_and_that_is_said(
 
 
 def test_names_that_do_not_exist_are_told_with_those_that_do(
-    bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
+    bidnerf: Run, shared: Path, tmp_path: Path
 ) -> None:
     data, place = shared / "data", shared / "map"
     train = ["train", data, "--out", tmp_path / "out"]
@@ -394,7 +372,7 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("case", BAD_MAPS)
 def test_a_map_that_cannot_be_used_is_told_in_a_line(
-    case: str, bidnerf: Callable[..., Outcome], shared: Path, map_folder: Path, tmp_path: Path
+    case: str, bidnerf: Run, shared: Path, map_folder: Path, tmp_path: Path
 ) -> None:
     edit, fragments = BAD_MAPS[case]
     edit(map_folder)
@@ -409,7 +387,7 @@ def test_a_map_that_cannot_be_used_is_told_in_a_line(
 
 
 def test_what_cannot_be_resumed_is_told_in_a_line(
-    bidnerf: Callable[..., Outcome], shared: Path, interrupted: Path, tmp_path: Path
+    bidnerf: Run, shared: Path, interrupted: Path, tmp_path: Path
 ) -> None:
     data = shared / "data"
     before = contents(interrupted)
@@ -440,7 +418,7 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
 
 @pytest.mark.parametrize("command", ["train", "render", "demo"])
 def test_what_exists_is_not_overwritten_unasked(
-    command: str, bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
+    command: str, bidnerf: Run, shared: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
@@ -462,7 +440,7 @@ def test_what_exists_is_not_overwritten_unasked(
 
 @pytest.mark.parametrize("place", ["/dev/null/x", "/proc/x", "{file}/x/y", "/dev/null"])
 def test_a_place_that_cannot_be_written_is_told_before_any_work(
-    place: str, bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
+    place: str, bidnerf: Run, shared: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "file").touch()
     out = place.format(file=tmp_path / "file")
@@ -480,7 +458,7 @@ def no_space(*_: object) -> None:
 
 
 def test_a_full_disk_leaves_nothing_behind(
-    bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "fsync", no_space)
     out = tmp_path / "some" / "where"
@@ -505,9 +483,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(place)], check=True, capture_output=True)
 
 
-def test_a_disk_that_fills_up_keeps_the_last_whole_map(
-    bidnerf: Callable[..., Outcome], shared: Path, small_disk: Path
-) -> None:
+def test_a_disk_that_fills_up_keeps_the_last_whole_map(bidnerf: Run, shared: Path, small_disk: Path) -> None:
     """The finished map fits once (40 KiB), not twice, nor with its optimizer's state."""
     train = ["train", shared / "data", "--out", small_disk / "map", *tiny.options(2)]
     full = bidnerf(*train, "--checkpoint-every", "0")
@@ -589,7 +565,7 @@ def test_a_disk_that_fills_up_keeps_the_last_whole_map(
     ids=" ".join,
 )
 def test_wrong_usage_has_status_2_and_no_output(
-    arguments: list[str], bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
+    arguments: list[str], bidnerf: Run, shared: Path, tmp_path: Path
 ) -> None:
     places = {"data": shared / "data", "map": shared / "map", "out": tmp_path / "out"}
     outcome = bidnerf(*[word.format(**places) for word in arguments])
@@ -599,7 +575,7 @@ def test_wrong_usage_has_status_2_and_no_output(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_a_command_the_commands_are_listed(bidnerf: Callable[..., Outcome]) -> None:
+def test_without_a_command_the_commands_are_listed(bidnerf: Run) -> None:
     nothing, asked, near = bidnerf(), bidnerf("--help"), bidnerf("rendr")
     assert (nothing.status, nothing.out, nothing.err) == (2, "", asked.out)
     assert asked.status == 0
@@ -628,7 +604,7 @@ POSES = {
 
 @pytest.mark.parametrize("case", POSES)
 def test_a_start_that_is_no_pose_is_told_in_a_line(
-    case: str, bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
+    case: str, bidnerf: Run, shared: Path, tmp_path: Path
 ) -> None:
     text, finding = POSES[case]
     path = tmp_path / "pose.json"
@@ -641,14 +617,14 @@ def test_a_start_that_is_no_pose_is_told_in_a_line(
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("command", ["localize", "evaluate", "compare"])
 def test_each_method_has_its_settings_beside_those_of_the_command(
-    command: str, method: str, bidnerf: Callable[..., Outcome]
+    command: str, method: str, bidnerf: Run
 ) -> None:
     found = bidnerf(command, "--method", method, "--help")
     assert (found.status, found.err) == (0, "")
     assert "--" in found.out
 
 
-def test_a_perturbation_is_judged(bidnerf: Callable[..., Outcome], shared: Path) -> None:
+def test_a_perturbation_is_judged(bidnerf: Run, shared: Path) -> None:
     place = ["localize", shared / "map", shared / "data", "--frame", "t_0000", "--perturb"]
     for wrong in (("-1", "5"), ("nan", "5"), ("inf", "5")):
         assert_refused(bidnerf(*place, *wrong), 2, "--perturb: T is", "expected metres from 0 to 1e+06")
@@ -672,7 +648,7 @@ def strict(text: str) -> Any:
 
 @pytest.mark.parametrize("frames", [["t_0000"], ["t_0000", "t_0001", "t_0002"]], ids=["one", "rig"])
 def test_localize_prints_the_object_that_was_agreed_on(
-    frames: list[str], bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
+    frames: list[str], bidnerf: Run, shared: Path, tmp_path: Path
 ) -> None:
     quick = ["--method", "bid", "--max-steps", "3", "--rays", "64"]
     localize = ["localize", shared / "map", shared / "data", "--json", *quick]
@@ -708,7 +684,7 @@ def test_localize_prints_the_object_that_was_agreed_on(
 
 
 def test_every_frame_that_is_named_counts(
-    bidnerf: Callable[..., Outcome], shared: Path, monkeypatch: pytest.MonkeyPatch
+    bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from bidnerf_core.cli import queries
 
@@ -723,7 +699,7 @@ def test_every_frame_that_is_named_counts(
     assert seen == [["a", "b", "c"]]
 
 
-def test_a_frame_is_no_rig_by_being_named_twice(bidnerf: Callable[..., Outcome], shared: Path) -> None:
+def test_a_frame_is_no_rig_by_being_named_twice(bidnerf: Run, shared: Path) -> None:
     place = ["localize", shared / "map", shared / "data", *QUICK]
     for twice in (["t_0001", "t_0001"], ["t_0000", "t_0001", "--frame", "t_0001"]):
         assert_refused(bidnerf(*place, "--frame", *twice), 2, "--frame names t_0001 more than once")
@@ -741,7 +717,7 @@ def test_a_frame_is_no_rig_by_being_named_twice(bidnerf: Callable[..., Outcome],
 
 
 def test_a_window_is_the_frame_and_those_before_it(
-    bidnerf: Callable[..., Outcome], shared: Path, monkeypatch: pytest.MonkeyPatch
+    bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from bidnerf_core.cli import queries
 
@@ -768,7 +744,7 @@ def test_a_window_is_the_frame_and_those_before_it(
     assert_refused(bidnerf(*place, "--frame", "t_9", "--window", 2), 1, "'t_9'")
 
 
-def test_points_of_a_sensor_are_used(bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path) -> None:
+def test_points_of_a_sensor_are_used(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     place = ["localize", shared / "map", shared / "data", *QUICK, "--frame", "t_0001", "--json"]
     points = tmp_path / "points.txt"
     points.write_text("0 0 2.5\n0.1 0.1 2.6\n")
@@ -780,13 +756,13 @@ def test_points_of_a_sensor_are_used(bidnerf: Callable[..., Outcome], shared: Pa
     assert_refused(bidnerf(*place, "--depth-points", points), 1, str(points), "rows of x, y, z")
 
 
-def test_inerf_takes_one_image(bidnerf: Callable[..., Outcome], shared: Path) -> None:
+def test_inerf_takes_one_image(bidnerf: Run, shared: Path) -> None:
     place = ["localize", shared / "map", shared / "data", *QUICK, "--method", "inerf"]
     assert bidnerf(*place, "--frame", "t_0000", "--pixels", "interest-points", "--no-renew").status == 0
     assert_refused(bidnerf(*place, "--frame", "t_0000", "t_0001"), 1, "method inerf takes one image, got 2")
 
 
-def test_localize_without_json_prints_to_stdout_too(bidnerf: Callable[..., Outcome], shared: Path) -> None:
+def test_localize_without_json_prints_to_stdout_too(bidnerf: Run, shared: Path) -> None:
     found = bidnerf("localize", shared / "map", shared / "data", "--frame", "t_0001", *QUICK)
     assert (found.status, found.err) == (0, "")
     assert found.out.startswith("t_0001: ")
@@ -794,7 +770,7 @@ def test_localize_without_json_prints_to_stdout_too(bidnerf: Callable[..., Outco
 
 
 def test_an_answer_that_is_not_finite_is_no_answer(
-    bidnerf: Callable[..., Outcome], shared: Path, monkeypatch: pytest.MonkeyPatch
+    bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from dataclasses import replace
 
@@ -810,14 +786,14 @@ def test_an_answer_that_is_not_finite_is_no_answer(
     assert_refused(found, 1, "t_0001", "not finite")
 
 
-def test_no_start_is_refused_by_methods_that_need_one(bidnerf: Callable[..., Outcome], shared: Path) -> None:
+def test_no_start_is_refused_by_methods_that_need_one(bidnerf: Run, shared: Path) -> None:
     found = bidnerf(
         "localize", shared / "map", shared / "data", "--frame", "t_0000", "--no-start", "--method", "bid"
     )
     assert_refused(found, 1, "'bid' needs a start", "give one, or take method 'auto'")
 
 
-def test_backends_are_listed(bidnerf: Callable[..., Outcome]) -> None:
+def test_backends_are_listed(bidnerf: Run) -> None:
     listed = strict(bidnerf("backends", "--json").out)
     assert "hashgrid" in [entry["name"] for entry in listed]
     assert {"name", "summary", "distribution", "version", "value", "fault"} == set(listed[0])
@@ -826,7 +802,7 @@ def test_backends_are_listed(bidnerf: Callable[..., Outcome]) -> None:
     assert all(entry["name"] in shown.out for entry in listed)
 
 
-def test_info_describes_a_map(bidnerf: Callable[..., Outcome], shared: Path) -> None:
+def test_info_describes_a_map(bidnerf: Run, shared: Path) -> None:
     facts = strict(bidnerf("info", shared / "map", "--json").out)
     assert facts["backend"] == "hashgrid"
     assert (facts["cameras"], facts["step"], facts["complete"], facts["levels"]) == (6, tiny.STEPS, True, 2)
@@ -836,9 +812,7 @@ def test_info_describes_a_map(bidnerf: Callable[..., Outcome], shared: Path) -> 
     assert all(f"{key}:" in shown for key in facts)
 
 
-def test_render_writes_the_images_that_were_agreed_on(
-    bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
-) -> None:
+def test_render_writes_the_images_that_were_agreed_on(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     render = ["render", shared / "map", shared / "data"]
     outcome = bidnerf(*render, "--out", tmp_path / "all")
     assert (outcome.status, outcome.err) == (0, "")
@@ -859,7 +833,7 @@ def test_render_writes_the_images_that_were_agreed_on(
     assert (tmp_path / "one/t_0001.png").read_bytes() == fine
 
 
-def test_progress_goes_to_stderr(bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path) -> None:
+def test_progress_goes_to_stderr(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     trained = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options(2))
     assert (trained.status, trained.out) == (0, "")
     assert "step 2/2" in trained.err
@@ -875,9 +849,7 @@ def columns(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_fits_the_terminal_and_explains_every_option(
-    command: str, columns: int, bidnerf: Callable[..., Outcome]
-) -> None:
+def test_help_fits_the_terminal_and_explains_every_option(command: str, columns: int, bidnerf: Run) -> None:
     outcome = bidnerf(command, "--help")
     assert (outcome.status, outcome.err) == (0, "")
     lines = outcome.out.splitlines()
@@ -896,14 +868,14 @@ def unexplained(page: str) -> list[str]:
     return [text for text in texts if len(text.partition("(default")[0].split()) < 3]
 
 
-def test_the_options_of_a_backend_are_shown_and_explained(bidnerf: Callable[..., Outcome]) -> None:
+def test_the_options_of_a_backend_are_shown_and_explained(bidnerf: Run) -> None:
     page = bidnerf("train", "--backend", "hashgrid", "--help").out
     assert "--log2-table-size" in page
     assert "--carve, --no-carve" in page
     assert unexplained(page) == []
 
 
-def test_positional_arguments_are_named_as_in_the_manual(bidnerf: Callable[..., Outcome]) -> None:
+def test_positional_arguments_are_named_as_in_the_manual(bidnerf: Run) -> None:
     assert " DATA" in bidnerf("train", "--help").out.splitlines()[0]
     assert " MAP" in bidnerf("info", "--help").out.splitlines()[0]
     assert " MAP DATA" in bidnerf("render", "--help").out.splitlines()[0]
@@ -923,7 +895,7 @@ def assert_same_map(one: Path, other: Path) -> None:
 
 
 def test_a_stopped_training_goes_on_as_if_nothing_had_happened(
-    bidnerf: Callable[..., Outcome], shared: Path, interrupted: Path
+    bidnerf: Run, shared: Path, interrupted: Path
 ) -> None:
     info = load_info(interrupted)
     assert (info.step, info.complete) == (tiny.STEPS // 2, False)
@@ -937,7 +909,7 @@ def test_a_stopped_training_goes_on_as_if_nothing_had_happened(
 
 
 def test_a_training_resumes_over_the_background_that_it_began_with(
-    bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train = ["train", shared / "data", "--background", "black", *tiny.options()]
     assert bidnerf(*train, "--out", tmp_path / "whole").status == 0
@@ -950,7 +922,7 @@ def test_a_training_resumes_over_the_background_that_it_began_with(
 
 
 def test_ctrl_c_before_anything_is_made_leaves_nothing(
-    bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from bidnerf_core.cli import train
 
@@ -963,9 +935,7 @@ def test_ctrl_c_before_anything_is_made_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_diverging_training_is_told_and_leaves_nothing(
-    bidnerf: Callable[..., Outcome], shared: Path, tmp_path: Path
-) -> None:
+def test_a_diverging_training_is_told_and_leaves_nothing(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     wild = [*tiny.options(), "--learning-rate", "1e30"]
     outcome = bidnerf("train", shared / "data", "--out", tmp_path / "map", *wild)
     assert_refused(outcome, 1, "training diverged", "smaller learning rate")
@@ -1020,7 +990,7 @@ def whole(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_ctrl_c_saves_and_resuming_loses_nothing(
-    bidnerf: Callable[..., Outcome], shared: Path, whole: Path, tmp_path: Path
+    bidnerf: Run, shared: Path, whole: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "map"
     train = ["train", str(shared / "data"), "--out", str(out)]

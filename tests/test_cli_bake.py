@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,25 +18,12 @@ from bidnerf_core.cli.common import read_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.storage import Map, load_info, load_map
+from commands import Run
 from tiny import backends_listed_once  # noqa: F401
 
 pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
-Run = Callable[..., tuple[int, str, str]]
 COARSE = ["--cells", "30000"]
-
-
-@pytest.fixture
-def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Status, output and what was said, of a command in this process."""
-
-    def run(*words: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        status = main([str(word) for word in words])
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -18,31 +16,11 @@ from bidnerf_core.evaluation.groups import grouped
 from bidnerf_core.evaluation.results import read_results
 from bidnerf_core.storage import load_info
 from bidnerf_core.training import Progress
+from commands import CommandResult, Run
 from tiny import backends_listed_once  # noqa: F401
 
 pytestmark = pytest.mark.usefixtures("backends_listed_once")
 QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64", "--json"]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    status: int
-    out: str
-    err: str
-
-
-Run = Callable[..., Outcome]
-
-
-@pytest.fixture
-def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
-    def run(*arguments: object) -> Outcome:
-        capsys.readouterr()
-        status = main([str(argument) for argument in arguments])
-        said = capsys.readouterr()
-        return Outcome(status, said.out, said.err)
-
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -58,13 +36,13 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def assert_refused(outcome: Outcome, status: int, *fragments: str) -> None:
+def assert_refused(outcome: CommandResult, status: int, *fragments: str) -> None:
     assert (outcome.status, outcome.out) == (status, "")
     assert outcome.err.count("\n") == 1, outcome.err
     assert all(fragment in outcome.err for fragment in fragments), outcome.err
 
 
-def assert_refused_last(outcome: Outcome, *fragments: str) -> None:
+def assert_refused_last(outcome: CommandResult, *fragments: str) -> None:
     """Assert that a run was refused in its last line; other lines may stand before it."""
     assert (outcome.status, outcome.out) == (1, "")
     assert all(fragment in outcome.err.splitlines()[-1] for fragment in fragments), outcome.err

@@ -7,7 +7,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,26 +22,13 @@ from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.settings import EXPERT, Settings
 from bidnerf_core.storage import load_info
+from commands import Run
 from tiny import backends_listed_once  # noqa: F401
 
 pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
-Run = Callable[..., tuple[int, str, str]]
 FOCAL = ["--focal", tiny.CAMERA.fx]
 QUICK = ["--method", "bid", "--max-steps", "2", "--rays", "64"]
-
-
-@pytest.fixture
-def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Status, stdout and stderr of a command in this process."""
-
-    def run(*words: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        status = main([str(word) for word in words])
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save as tensors_to_bytes
 
 import baked
 import tiny
-from bidnerf_core import storage
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import write_file
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
@@ -120,7 +121,7 @@ def test_damaged_landmarks_are_named(
         path.write_bytes(content)
     else:
         kept = {} if "other" in request.node.name else landmark_tensors(landmarks)
-        storage.write_file(path, storage.tensors_to_bytes(kept | content))
+        write_file(path, tensors_to_bytes(kept | content))
     with pytest.raises(InputError, match=said) as told:
         load_map(tmp_path)
     assert str(path) in str(told.value)

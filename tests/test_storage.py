@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
 import baked
@@ -20,6 +21,7 @@ import tiny
 from bidnerf_core import storage
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
+from bidnerf_core.files import write_file
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
 from bidnerf_core.registry import load_backend
 from bidnerf_core.scenes.fields import HomogeneousBall
@@ -32,7 +34,6 @@ from bidnerf_core.storage import (
     save_map,
     save_surface,
     stored_cameras,
-    write_file,
 )
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
@@ -369,7 +370,7 @@ def test_a_damaged_surface_is_named(content: Any, said: str, tmp_path: Path) -> 
     elif isinstance(content, bytes):
         path.write_bytes(content)
     else:
-        storage.write_file(path, storage.tensors_to_bytes(content))
+        write_file(path, tensors_to_bytes(content))
     with pytest.raises(InputError, match=said) as told:
         load_map(tmp_path)
     assert str(path) in str(told.value)

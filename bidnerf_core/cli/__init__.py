@@ -7,11 +7,12 @@ import difflib
 import importlib
 import os
 import sys
-from collections.abc import Sequence
-from typing import TextIO
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any, TextIO
 
 from bidnerf_core.cli.text import printable
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 
 COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
@@ -50,7 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _guarded(name: str, given: list[str]) -> int:
     """Run a command; a user's mistake ends in one line instead of a traceback."""
     try:
-        return _dispatch(given)
+        with _warnings_as_lines(name):
+            return _dispatch(given)
     except SystemExit as stopped:  # the parser has printed why
         return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
     except KeyboardInterrupt:
@@ -81,8 +83,25 @@ def _dispatch(given: list[str]) -> int:
     return DONE
 
 
+@contextlib.contextmanager
+def _warnings_as_lines(name: str) -> Iterator[None]:
+    """Print each ``InputWarning`` as a line on stderr, without the place in the code that Python would name."""
+    with warnings.catch_warnings():
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
+            if issubclass(category, InputWarning):
+                _failed(name, str(message), DONE)
+            else:
+                others(message, category, *place)
+
+        warnings.simplefilter("always", InputWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield
+
+
 def _failed(name: str, message: str, status: int, more: str = "") -> int:
-    """Print why a command failed, on one line, and return ``status``; a closed stderr does not change it."""
+    """Print why a command failed, or a warning, on one line, and return ``status``; a closed stderr does not change it."""
     with contextlib.suppress(OSError):
         print(f"{name}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
         print(more, end=more and "\n", file=sys.stderr, flush=True)

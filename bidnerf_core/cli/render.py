@@ -30,9 +30,10 @@ from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.files import write_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.rendering import RenderedImage, render_image
-from bidnerf_core.storage import Map, load_map, write_file
+from bidnerf_core.storage import Map, load_map
 
 DEEPEST = 65.535  # metres in a 16-bit image of millimetres
 

@@ -1,4 +1,4 @@
-"""Readers of posed images, and a writer. All conventions of file formats are converted here."""
+"""Readers of posed images and of sequences, and writers. All conventions of file formats are converted here."""
 
 from __future__ import annotations
 
@@ -6,9 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.image_folders import open_images
 from bidnerf_core.datasets.scanner_app import ScannerAppReader
+from bidnerf_core.datasets.sequence import (
+    FileSequence,
+    FrameSequence,
+    SequenceEntry,
+    TimedFrame,
+    sequence_of,
+)
+from bidnerf_core.datasets.seven_scenes import SevenScenesReader
 from bidnerf_core.datasets.transforms import TransformsReader
+from bidnerf_core.datasets.tum import TumReader
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError
 from bidnerf_core.images import Background
@@ -17,9 +28,15 @@ __all__ = [
     "READERS",
     "Background",
     "Dataset",
+    "FileSequence",
+    "FrameSequence",
     "Reader",
     "ReadingProgress",
+    "SequenceEntry",
+    "SequenceReader",
+    "TimedFrame",
     "open_dataset",
+    "open_sequence",
     "write_transforms",
 ]
 
@@ -40,7 +57,17 @@ class Reader(Protocol):
     def open(self, path: Path, background: Background | None) -> Dataset: ...
 
 
-READERS: list[Reader] = [TransformsReader(), ScannerAppReader()]
+@runtime_checkable
+class SequenceReader(Protocol):
+    """A reader whose format records times, or frames that no split of the dataset has.
+
+    The sequences of other readers have the frames of all splits in the natural order of their names.
+    """
+
+    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence: ...
+
+
+READERS: list[Reader] = [TransformsReader(), ScannerAppReader(), TumReader(), SevenScenesReader()]
 """The formats that ``open_dataset`` tries, in this order; append a reader to add one."""
 
 
@@ -59,9 +86,40 @@ def open_dataset(
     if not folder.is_dir():
         raise InputError(f"{folder}: is a file, expected the folder of a dataset")
     readers = READERS if readers is None else readers
-    for reader in readers:
-        if reader.recognises(folder):
-            return reader.open(folder, background)
-    raise InputError(
-        f"{folder}: no dataset found, expected {' or '.join(reader.expected for reader in readers)}"
-    )
+    reader = _reader_of(folder, readers)
+    if reader is None:
+        expected = " or ".join(reader.expected for reader in readers)
+        raise InputError(f"{folder}: no dataset found, expected {expected}")
+    return reader.open(folder, background)
+
+
+def open_sequence(
+    path: str | Path,
+    *,
+    camera: Intrinsics | str | Path | None = None,
+    focal: float | None = None,
+    hfov: float | None = None,
+    background: Background | None = None,
+    readers: Sequence[Reader] | None = None,
+) -> FrameSequence:
+    """Open the frames of ``path`` in the order of time: a dataset, or a folder of images. Frames are read as they are used.
+
+    Images have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in ``Frame.open``,
+    or that of their EXIF. Datasets have their own cameras. Raises ``InputError`` where nothing is found, where a
+    description is not usable, and for a camera where the dataset has its own.
+    """
+    folder = Path(path)
+    if not folder.exists():
+        raise InputError(f"{folder}: no such folder")
+    reader = _reader_of(folder, READERS if readers is None else readers)
+    if reader is None:
+        return open_images(folder, camera, focal, hfov, background)
+    if any(given is not None for given in (camera, focal, hfov)):
+        raise InputError(f"{folder}: is a dataset, which has its own cameras; expected no other camera")
+    if isinstance(reader, SequenceReader):
+        return reader.open_sequence(folder, background)
+    return sequence_of(reader.open(folder, background))
+
+
+def _reader_of(folder: Path, readers: Sequence[Reader]) -> Reader | None:
+    return next((reader for reader in readers if reader.recognises(folder)), None)

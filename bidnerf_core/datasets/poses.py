@@ -1,7 +1,6 @@
-"""Camera poses as NeRF's and nerfstudio's JSON and ARKit's exports describe them, in our conventions.
+"""Camera poses as datasets describe them, in our conventions: ``T_world_camera`` with OpenCV axes.
 
-They come as camera-to-world matrices with OpenGL axes (x right, y up, z backward) and leave as ``T_world_camera`` with
-OpenCV axes.
+NeRF's and nerfstudio's JSON and ARKit's exports hold camera-to-world matrices with OpenGL axes (x right, y up, z backward).
 """
 
 from __future__ import annotations
@@ -9,8 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.records import Record
 from bidnerf_core.se3 import SE3
 
@@ -29,14 +30,22 @@ def pose(record: Record) -> SE3:
 def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
     """Return ``T_world_camera`` as ``pose`` does; ``key`` is where ``record`` has ``rows``, for messages."""
     matrix = _matrix(record, key, rows)
-    flip = matrix.new_tensor(
-        [1.0, -1.0, -1.0]
-    )  # of columns: y up becomes y down, z backward becomes z forward
-    given = SE3(matrix[:3, :3] * flip, matrix[:3, 3])
+    matrix[:, 1:3] *= -1  # y up becomes y down, z backward becomes z forward
+    try:
+        return rigid_pose(matrix)
+    except InputError as error:
+        raise record.error(f"the rotation of {key} is {error}, expected a rigid transform") from error
+
+
+def rigid_pose(matrix: Float[Tensor, "3 4"]) -> SE3:
+    """Return the rigid transform that ``matrix`` is up to rounding.
+
+    Raises ``InputError``, with nothing but what the rotation is instead, where it is none.
+    """
+    given = SE3(matrix[:3, :3], matrix[:3, 3])
     if not given.is_rigid(RIGID_TO):
         off = (given.rotation.mT @ given.rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
-        finding = f"off orthonormal by {off:.2g}" if off > RIGID_TO else "a mirror image"
-        raise record.error(f"the rotation of {key} is {finding}, expected a rigid transform")
+        raise InputError(f"off orthonormal by {off:.2g}" if not off <= RIGID_TO else "a mirror image")
     return given.normalized()
 
 

@@ -3,8 +3,9 @@
 A frame N has ``frame_N.json`` (ARKit's ``cameraPoseARFrame``, a camera-to-world matrix row by row with OpenGL axes, and
 ``intrinsics``, 3x3 row by row, of the photo), some frames a photo ``frame_N.jpg``, and scans with a LiDAR ``depth_N.png``
 (16-bit planar z in millimetres, of lower resolution) with ``conf_N.png`` (ARKit's confidence: 0 low, 1 medium, 2 high).
-Frames without a photo are left out, the others ordered by their number. Every eighth photo (the first, the ninth ...) is
-held out as "test" and the others are "train".
+The dataset has the frames with a photo, ordered by their number. Every eighth photo (the first, the ninth ...) is held out
+as "test" and the others are "train". The sequence has the frames between them as well, which have depth alone, at the
+resolution of the depth; its times are ``time``, in seconds since the phone was switched on.
 
 Photos are large and many: those with more than 640 pixels on the longer side are reduced to that size as they are read,
 and the intrinsics with them. A scan of 127 training photos then takes 0.6 GB instead of 1.4 GB. Depth is dropped where the
@@ -18,7 +19,6 @@ pixel is added.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,11 +28,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera import Intrinsics, same_aspect
 from bidnerf_core.camera_sources import Raster
-from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.poses import pose_of_rows
-from bidnerf_core.datasets.splits import Splits, hold_out
+from bidnerf_core.datasets.sequence import FrameSequence
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.depth_images import DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
@@ -51,30 +52,36 @@ RANGE = 5.0
 HIGH_CONFIDENCE = 2
 POSE, INTRINSICS, PROJECTION = "cameraPoseARFrame", "intrinsics", "projectionMatrix"
 PHOTO = re.compile(r"frame_(\d+)\.jpe?g", re.IGNORECASE)
+DEPTH = re.compile(r"depth_(\d+)\.png")
 OTHER_SIZE = 0.01
 """Relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that shows another image size."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScannerFrame:
-    """A frame that has a photo."""
+    """A frame with a photo, with depth, or with both."""
 
-    photo: Path
+    description: Path
+    photo: Path | None
     record: Record
     T_world_camera: SE3
     has_depth: bool
 
     @property
     def stem(self) -> str:
-        return self.photo.stem
+        return self.description.stem
 
     @property
     def parts(self) -> tuple[str, ...]:
         return (self.stem,)
 
+    @property
+    def time(self) -> float | None:
+        return self.record.number("time")
+
     def beside(self, kind: str) -> Path:
         """Return the frame's file "depth" or "conf"."""
-        return self.photo.with_name(f"{kind}_{self.stem.split('_')[1]}.png")
+        return self.description.with_name(f"{kind}_{self.stem.split('_')[1]}.png")
 
 
 @dataclass(frozen=True)
@@ -97,49 +104,38 @@ class ScannerAppReader:
         colour = background_colour("black" if background is None else background)
         return ScannerAppDataset(Splits(path, hold_out(scanner_frames(path))), colour, self.largest)
 
+    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+        """Read all descriptions, those of frames that have depth alone included."""
+        colour = background_colour("black" if background is None else background)
+        splits = Splits(path, hold_out(scanner_frames(path)))
+        return ScannerAppDataset(splits, colour, self.largest).sequence(depth_frames(path))
 
-class ScannerAppDataset:
+
+class ScannerAppDataset(SplitDataset[ScannerFrame]):
     """Views of a folder of "3D Scanner App"; see ``Dataset``."""
 
     def __init__(
         self, frames: Splits[ScannerFrame], background: tuple[float, float, float], largest: int
     ) -> None:
-        self._frames = frames
+        super().__init__(frames)
         self._background = background
         self._largest = largest
-
-    @property
-    def path(self) -> Path:
-        return self._frames.path
-
-    @property
-    def splits(self) -> tuple[str, ...]:
-        return self._frames.splits
 
     @property
     def background(self) -> tuple[float, float, float]:
         """The requested colour, or black: photos have no alpha channel."""
         return self._background
 
-    def frame_names(self, split: str) -> list[str]:
-        return self._frames.names(split)
-
-    def views(
-        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
-    ) -> list[View]:
-        frames = self._frames.select(split, names)
-        views = []
-        for done, (name, frame) in enumerate(frames, start=1):
-            views.append(self._view(frame, name))
-            if progress is not None:
-                progress(done, len(frames))
-        return views
-
     def _view(self, frame: ScannerFrame, name: str) -> View:
-        header = read_header(frame.photo)
+        return (
+            self._between(frame, name) if frame.photo is None else self._with_photo(frame, frame.photo, name)
+        )
+
+    def _with_photo(self, frame: ScannerFrame, photo: Path, name: str) -> View:
+        header = read_header(photo)
         camera = scanner_camera(frame.record, header.width, header.height)
         small = camera.scaled(min(1.0, self._largest / max(camera.width, camera.height)))
-        colour, alpha = read_image(frame.photo)
+        colour, alpha = read_image(photo)
         rgb = over(colour, alpha, self._background)
         if small != camera:
             rgb = reduced(rgb, small.width, small.height)
@@ -151,6 +147,20 @@ class ScannerAppDataset:
                 measured, raster, (small.width, small.height), f"{frame.beside('depth')}: depth"
             )
         return View(Frame(name, rgb, small, depth), frame.T_world_camera)
+
+    def _between(self, frame: ScannerFrame, name: str) -> View:
+        """Read a frame of depth alone. Its description has the camera of the photo that was not taken."""
+        depth = read_measured(frame.beside("depth"), frame.beside("conf")).metres
+        height, width = depth.shape
+        photo_width, photo_height = projected_size(frame.record)
+        if not same_aspect((width, height), (photo_width, photo_height)):
+            raise InputError(
+                f"{frame.beside('depth')}: depth is {width}x{height}, its camera's photos are "
+                f"{photo_width}x{photo_height}; expected the same aspect ratio"
+            )
+        camera = scanner_camera(frame.record, photo_width, photo_height).resized(width, height)
+        black = torch.zeros(height, width, 3)
+        return View(Frame(name, black, camera, depth, has_colour=False), frame.T_world_camera)
 
 
 def scanner_frames(folder: Path) -> list[ScannerFrame]:
@@ -166,18 +176,39 @@ def scanner_frames(folder: Path) -> list[ScannerFrame]:
         if number == following:
             raise InputError(f"{folder}: {path.name} and {other.name} have one number, expected each once")
     has_depth = any(folder.glob("depth_*.png")) or any(folder.glob("conf_*.png"))
-    return [_frame(path, has_depth) for _, path in photos]
+    return [_frame(path.with_suffix(".json"), path, has_depth) for _, path in photos]
 
 
-def _frame(photo: Path, has_depth: bool) -> ScannerFrame:
-    record = read_record(photo.with_suffix(".json"))
+def depth_frames(folder: Path) -> list[ScannerFrame]:
+    """Read the descriptions of the frames that have depth and no photo. Raises ``InputError`` as ``scanner_frames``."""
+    photos = {path.stem for path in folder.iterdir() if PHOTO.fullmatch(path.name)}
+    numbered = {path: DEPTH.fullmatch(path.name) for path in sorted(folder.glob("depth_*.png"))}
+    descriptions = [folder / f"frame_{found[1]}.json" for found in numbered.values() if found]
+    return [_frame(path, None, True) for path in descriptions if path.stem not in photos]
+
+
+def _frame(description: Path, photo: Path | None, has_depth: bool) -> ScannerFrame:
+    record = read_record(description)
     numbers = _numbers(record, POSE, 16)
     rows = [numbers[first : first + 4] for first in range(0, 16, 4)]
-    frame = ScannerFrame(photo, record, pose_of_rows(record, POSE, rows), has_depth)
+    frame = ScannerFrame(description, photo, record, pose_of_rows(record, POSE, rows), has_depth)
     for kind in ("depth", "conf") if has_depth else ():
         if not frame.beside(kind).is_file():
-            raise InputError(f"{frame.beside(kind)}: no such file, expected it as {photo.name} is there")
+            there = description if photo is None else photo
+            raise InputError(f"{frame.beside(kind)}: no such file, expected it as {there.name} is there")
     return frame
+
+
+def projected_size(record: Record) -> tuple[int, int]:
+    """Return the size (width, height) of the photos to which the intrinsics belong.
+
+    Raises ``InputError`` where there is no projection matrix to tell it from.
+    """
+    fx, _, _, _, fy, *_ = _numbers(record, INTRINSICS, 9)
+    projection = _numbers(record, PROJECTION, 16)
+    if projection[0] <= 0 or projection[5] <= 0:
+        raise record.error(f"{PROJECTION} has no positive focal lengths, expected a matrix of ARKit's")
+    return round(2 * fx / projection[0]), round(2 * fy / projection[5])
 
 
 def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:

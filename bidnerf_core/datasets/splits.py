@@ -1,13 +1,19 @@
-"""The frames of a dataset in named splits, before any image is read."""
+"""The frames of a dataset in named splits, before any image is read, and the dataset that reads them."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
-from bidnerf_core.datasets.dataset import positions, unique_names
+from bidnerf_core.datasets.dataset import ReadingProgress, positions, unique_names
+from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, SequenceEntry
 from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.photos import natural_order
+from bidnerf_core.se3 import SE3
 
 HOLD_OUT_EVERY = 8
 
@@ -22,6 +28,11 @@ class NamedFrame(Protocol):
     @property
     def parts(self) -> tuple[str, ...]:
         """The folders of the image, then its stem."""
+        ...
+
+    @property
+    def time(self) -> float | None:
+        """When the image was taken (seconds), where the format records it."""
         ...
 
 
@@ -63,9 +74,74 @@ class Splits(Generic[F]):
         """Return the first frame of each split."""
         return [group[0] for group in self._frames.values()]
 
+    def distinct(self) -> list[tuple[str, F]]:
+        """Return every description once, with the first split that holds it; splits may share frames."""
+        found = {
+            id(frame): (split, frame) for split in reversed(self.splits) for frame in self._frames[split]
+        }
+        return list(found.values())
+
     def _known(self, split: str) -> None:
         if split not in self._frames:
             raise InputError(f"{self.path}: no split {split!r}, expected one of {', '.join(self.splits)}")
+
+
+class SplitDataset(ABC, Generic[F]):
+    """A ``Dataset`` whose frames are described in ``Splits``; a subclass reads one frame and has the background."""
+
+    def __init__(self, frames: Splits[F]) -> None:
+        self._frames = frames
+
+    @property
+    def path(self) -> Path:
+        return self._frames.path
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return self._frames.splits
+
+    @property
+    @abstractmethod
+    def background(self) -> tuple[float, float, float]: ...
+
+    def frame_names(self, split: str) -> list[str]:
+        return self._frames.names(split)
+
+    def views(
+        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+    ) -> list[View]:
+        frames = self._frames.select(split, names)
+        views = []
+        for done, (name, frame) in enumerate(frames, start=1):
+            views.append(self._view(frame, name))
+            if progress is not None:
+                progress(done, len(frames))
+        return views
+
+    def sequence(self, others: Sequence[F] = ()) -> FrameSequence:
+        """Return the frames of all splits in the order of time, or of their files' names where times are not recorded.
+
+        ``others`` are frames that no split has, since they lack what a dataset needs.
+        """
+        listed: list[tuple[str | None, F]] = [*self._frames.distinct(), *((None, frame) for frame in others)]
+        listed.sort(key=lambda item: natural_order("/".join(item[1].parts)))
+        names = unique_names([(split or "", *frame.parts) for split, frame in listed])
+        return FileSequence.ordered(
+            self.path,
+            [
+                SequenceEntry(name, frame.time, split, partial(self._posed, frame, name))
+                for name, (split, frame) in zip(names, listed, strict=True)
+            ],
+        )
+
+    def _posed(self, frame: F, name: str) -> tuple[Frame, SE3 | None]:
+        """Read a frame of a sequence, and its pose where there is one."""
+        view = self._view(frame, name)
+        return view.frame, view.T_ref_camera
+
+    @abstractmethod
+    def _view(self, frame: F, name: str) -> View:
+        """Read the frame's image and depth. Raises ``InputError`` where a file is missing or not usable."""
 
 
 def hold_out(frames: list[F]) -> dict[str, list[F]]:

@@ -10,21 +10,22 @@ These keys are read from a frame or, where it lacks them, from the file: ``camer
 0.001; as in nerfstudio it holds for ``.npy`` depth as well). These are read from a frame only: ``file_path`` (its extension
 may be missing), ``transform_matrix``, ``depth_file_path`` (planar z; see ``depth_images`` for values that count as not
 measured). ``applied_transform`` and ``applied_scale`` record what was already done to the poses. They are not undone, so
-the world is that of the file. Other keys are ignored.
+the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or by the number
+that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
 
 Images are used as they are stored: poses and intrinsics describe that raster, so an EXIF orientation is not applied.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
-from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
-from bidnerf_core.datasets.splits import Splits
+from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.sequence import FrameSequence
+from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
-from bidnerf_core.depth_images import read_depth
+from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, background_colour, over, read_header, read_image
@@ -43,26 +44,22 @@ class TransformsReader:
     def open(self, path: Path, background: Background | None) -> Dataset:
         return TransformsDataset(path, read_splits(path), background)
 
+    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+        return TransformsDataset(path, read_splits(path), background).sequence()
 
-class TransformsDataset:
+
+class TransformsDataset(SplitDataset[FrameRecord]):
     """Views of a folder with ``transforms.json``; see ``Dataset``."""
 
     def __init__(
         self, path: Path, frames: dict[str, list[FrameRecord]], background: Background | None = None
     ) -> None:
-        self._frames = Splits(path, frames)
+        super().__init__(Splits(path, frames))
+        self._read_depth = DepthReader()
         self._background = None if background is None else background_colour(background)
         self._first: tuple[str, int, int] | None = (
             None  # file, width, height of the first image of unknown size
         )
-
-    @property
-    def path(self) -> Path:
-        return self._frames.path
-
-    @property
-    def splits(self) -> tuple[str, ...]:
-        return self._frames.splits
 
     @cached_property
     def background(self) -> tuple[float, float, float]:
@@ -70,20 +67,6 @@ class TransformsDataset:
         if self._background is not None:
             return self._background
         return background_colour("white" if any(map(self._has_alpha, self._frames.first())) else "black")
-
-    def frame_names(self, split: str) -> list[str]:
-        return self._frames.names(split)
-
-    def views(
-        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
-    ) -> list[View]:
-        frames = self._frames.select(split, names)
-        views = []
-        for done, (name, frame) in enumerate(frames, start=1):
-            views.append(self._view(frame, name))
-            if progress is not None:
-                progress(done, len(frames))
-        return views
 
     def image_file(self, split: str, name: str) -> Path:
         """Return the image file of a frame. Raises ``InputError`` where there is none."""
@@ -98,7 +81,7 @@ class TransformsDataset:
         colour, alpha = read_image(path)
         depth = None
         if frame.depth_path is not None:
-            depth = read_depth(self._depth_file(frame), frame.depth_unit)
+            depth = self._read_depth(self._depth_file(frame), frame.depth_unit).metres
             if depth.shape != colour.shape[:2]:
                 found = f"{depth.shape[1]}x{depth.shape[0]}"
                 raise frame.record.error(

@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from bidnerf_core.camera_records import CameraRecord, camera_record
 from bidnerf_core.datasets.poses import pose
+from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError
 from bidnerf_core.images import IMAGE_SUFFIXES
@@ -27,6 +28,7 @@ class FrameRecord:
     T_world_camera: SE3
     depth_path: str | None
     depth_unit: float  # metres
+    time: float | None  # seconds
 
     @property
     def stem(self) -> str:
@@ -102,7 +104,17 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
         pose(Record(record.where, entry)),
         own.text("depth_file_path"),
         METRES_PER_DEPTH_UNIT if unit is None else unit,
+        _time(own),
     )
+
+
+def _time(own: Record) -> float | None:
+    """Return ``time`` or ``timestamp`` (seconds), or the number that names the file ``source`` was made of."""
+    for key in ("time", "timestamp"):
+        if (found := own.number(key)) is not None:
+            return found
+    source = own.value("source")
+    return timestamp(PurePosixPath(source).stem) if isinstance(source, str) else None
 
 
 def file_of(split: str) -> str:

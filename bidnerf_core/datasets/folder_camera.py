@@ -1,0 +1,46 @@
+"""The one camera of a recording whose format has none in its files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera_sources import Raster, read_camera
+from bidnerf_core.errors import InputError
+from bidnerf_core.orientation import UPRIGHT
+
+CAMERA_FILES = ("camera.json", "cameras.txt")
+"""Files in the folder of a recording that hold its camera, as ``read_camera`` takes them."""
+
+
+class FolderCamera:
+    """The camera ``given`` (intrinsics or a file), or that of a file in ``folder``, or the ``published`` one of the format.
+
+    Raises ``InputError`` where there is none of them; the message begins with ``unknown``, which says why.
+    """
+
+    def __init__(
+        self, folder: Path, given: Intrinsics | Path | None, published: Intrinsics | None, unknown: str = ""
+    ) -> None:
+        beside = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+        found = given or beside or published
+        if found is None:
+            raise InputError(
+                f"{folder}: {unknown}; expected its camera: {' or '.join(CAMERA_FILES)} in the folder, or camera= in Python"
+            )
+        self._source = found
+
+    def at(self, image: Path, width: int, height: int) -> Intrinsics:
+        """Return the camera at the size of an image. Raises ``InputError`` where it is of another aspect ratio."""
+        camera = (
+            self._source
+            if isinstance(self._source, Intrinsics)
+            else read_camera(self._source, (width, height))
+        )
+        fitted = Raster(width, height, UPRIGHT).upright(camera)
+        if fitted is None:
+            raise InputError(
+                f"{image}: image is {width}x{height}, its camera is for {camera.width}x{camera.height}; "
+                "expected one of the same aspect ratio"
+            )
+        return fitted

@@ -1,0 +1,53 @@
+"""Folders of images without poses, as sequences."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets.sequence import FileSequence, SequenceEntry, timestamp
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame
+from bidnerf_core.images import Background
+from bidnerf_core.photos import DEPTH_STEM, photos_in
+
+
+def open_images(
+    folder: Path,
+    camera: Intrinsics | str | Path | None = None,
+    focal: float | None = None,
+    hfov: float | None = None,
+    background: Background | None = None,
+) -> FileSequence:
+    """Return the images of a folder by their times where all names are times (``12.345.png``), or in natural order.
+
+    ``NAME.depth.png`` (millimetres) beside ``NAME.png`` is its depth, as ``bidnerf render`` writes it. The other arguments
+    are those of ``Frame.open``. Raises ``InputError`` where there is no image.
+    """
+    photos, _ = photos_in(folder)
+    if not photos:
+        raise InputError(f"{folder}: no images in it, expected image files or a dataset")
+    names = unique_names([(*photo.parts[:-1], photo.stem) for photo in photos])
+
+    def read(photo: Path) -> tuple[Frame, None]:
+        beside = photo.with_name(f"{photo.stem}{DEPTH_STEM}.png")
+        depth, unit = (beside, MILLIMETRE) if beside.is_file() else (None, None)
+        behind: Background = "black" if background is None else background
+        frame = Frame.open(
+            photo, depth=depth, camera=camera, focal=focal, hfov=hfov, depth_unit=unit, background=behind
+        )
+        return frame, None
+
+    return FileSequence.ordered(
+        folder,
+        [
+            SequenceEntry(name, timestamp(photo.stem), None, partial(read, photo))
+            for name, photo in zip(names, photos, strict=True)
+        ],
+    )
+
+
+MILLIMETRE = 0.001
+"""The step of depth images that ``bidnerf render`` writes, metres."""

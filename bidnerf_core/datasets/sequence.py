@@ -1,0 +1,128 @@
+"""Sequences: frames in the order of time, read one at a time.
+
+``open_sequence`` (see ``bidnerf_core.datasets``) returns one for every format that ``open_dataset`` reads, for folders of
+images, and for video files.
+"""
+
+from __future__ import annotations
+
+import collections.abc
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol, TypeAlias, overload, runtime_checkable
+
+from bidnerf_core.datasets.dataset import Dataset, unique_names
+from bidnerf_core.frames import Frame
+from bidnerf_core.photos import natural_order
+from bidnerf_core.se3 import SE3
+
+ReadFrame: TypeAlias = Callable[[], tuple[Frame, SE3 | None]]
+"""Reads the files of a frame; the pose is its ``T_world_camera`` where that is known."""
+
+TIMESTAMP = re.compile(r"\d+\.\d+")
+
+
+@dataclass(frozen=True, eq=False)
+class TimedFrame:
+    """A frame of a sequence, when it was taken, and where."""
+
+    time: float | None  # seconds, from an origin that the recording chose
+    frame: Frame  # without colours (``has_colour``) where only depth was recorded at this time
+    truth: SE3 | None = None  # T_world_camera, OpenCV axes, where the recording has it
+    split: str | None = None  # the split of the dataset that holds the frame
+
+
+@runtime_checkable
+class FrameSequence(Protocol):
+    """Frames in the order of time. Each is read when the iteration reaches it, and raises ``InputError`` as it is read.
+
+    Either all frames have a time or none has. Iterating again starts anew.
+    """
+
+    @property
+    def path(self) -> Path: ...
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[TimedFrame]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceEntry:
+    """A frame that is not read yet."""
+
+    name: str
+    time: float | None  # seconds
+    split: str | None
+    read: ReadFrame
+
+
+class FileSequence(collections.abc.Sequence[TimedFrame]):
+    """A sequence whose frames are files of their own, so that it can be indexed, sliced and reversed."""
+
+    def __init__(self, path: Path, entries: Sequence[SequenceEntry]) -> None:
+        self._path, self._entries = path, entries
+
+    @staticmethod
+    def ordered(path: Path, entries: Sequence[SequenceEntry]) -> FileSequence:
+        """Return the frames by their times; as they are listed, and without any time, where a frame has none."""
+        if any(entry.time is None for entry in entries):
+            return FileSequence(path, [replace(entry, time=None) for entry in entries])
+        return FileSequence(path, sorted(entries, key=lambda entry: entry.time or 0.0))
+
+    @property
+    def path(self) -> Path:
+        return self._path
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the frames; none is read."""
+        return [entry.name for entry in self._entries]
+
+    @property
+    def times(self) -> list[float | None]:
+        """The times of the frames (seconds); none is read."""
+        return [entry.time for entry in self._entries]
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @overload
+    def __getitem__(self, place: int) -> TimedFrame: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> FileSequence: ...
+
+    def __getitem__(self, place: int | slice) -> TimedFrame | FileSequence:
+        """Read one frame, or return a part of the sequence, such as every second frame (``[::2]``)."""
+        if isinstance(place, slice):
+            return FileSequence(self._path, self._entries[place])
+        entry = self._entries[place]
+        frame, truth = entry.read()
+        return TimedFrame(entry.time, frame, truth, entry.split)
+
+
+def timestamp(stem: str) -> float | None:
+    """Return the time (seconds) that names a file, as ``1305031102.175304.png``; None for names without a fraction."""
+    return float(stem) if TIMESTAMP.fullmatch(stem) else None
+
+
+def sequence_of(dataset: Dataset) -> FileSequence:
+    """Return the frames of all splits of a dataset in the natural order of their names; it has no times."""
+    listed = [(split, name) for split in dataset.splits for name in dataset.frame_names(split)]
+    listed.sort(key=lambda frame: natural_order(frame[1]))
+    return FileSequence.ordered(
+        dataset.path,
+        [
+            SequenceEntry(name, None, split, partial(_posed, dataset, split, own))
+            for name, (split, own) in zip(unique_names(listed), listed, strict=True)
+        ],
+    )
+
+
+def _posed(dataset: Dataset, split: str, name: str) -> tuple[Frame, SE3]:
+    (view,) = dataset.views(split, [name])
+    return view.frame, view.T_ref_camera

@@ -1,0 +1,222 @@
+"""Folders of 7-Scenes (https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes).
+
+A frame is ``frame-000000.color.png``, ``frame-000000.depth.png`` (16-bit planar z in millimetres, 0 and 65535 where nothing
+was measured) and ``frame-000000.pose.txt`` (4x4, camera to world, OpenCV axes, metres). A scene has folders ``seq-01``,
+``seq-02`` ..., and the files ``TrainSplit.txt`` and ``TestSplit.txt`` list them ("sequence1" or "seq-01"). The folder of one
+sequence is read as well; there, and in a scene without split files, every eighth frame (the first, the ninth ...) is held out
+as "test" and the others are "train". The format records no times: a sequence is in the order of folders and numbers.
+
+The Kinect's two cameras were not calibrated, and its depth is not registered to its colour images. The poses are those of
+the depth camera (focal length 585 px); the colour camera has 525 px and is 2.6 cm beside it. By default both are treated as
+the literature on relocalization does (ACE, CVPR 2023, and the pseudo ground truth of Brachmann et al., ICCV 2021): poses
+are moved to the colour camera and depth is registered to it, by a calibration of another Kinect. With
+``register_depth=False`` images, depth and poses are taken as they are, with the 585 px of the dataset's page for both, as in
+KinectFusion and its successors; colours at the border are then some 30 px beside their depth.
+
+Cameras of images of other sizes are scaled. A camera that is given, or in ``camera.json`` or ``cameras.txt`` of the folder, is
+taken for the colour camera; without registration for both.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.depth_registration import register_depth
+from bidnerf_core.datasets.folder_camera import FolderCamera
+from bidnerf_core.datasets.pose_files import read_pose_matrix
+from bidnerf_core.datasets.sequence import FrameSequence
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
+from bidnerf_core.depth_images import DepthReader
+from bidnerf_core.errors import InputError
+from bidnerf_core.files import open_binary
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.photos import natural_order
+from bidnerf_core.se3 import SE3
+
+MILLIMETRE = 0.001
+DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
+COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)
+T_COLOUR_DEPTH = SE3(
+    torch.tensor(
+        [
+            [9.9996518012567637e-01, 2.6765126468950343e-03, -7.9041012313000904e-03],
+            [-2.7409311281316700e-03, 9.9996302803027592e-01, -8.1504520778013286e-03],
+            [7.8819942130445332e-03, 8.1718328771890631e-03, 9.9993554558014031e-01],
+        ],
+        dtype=torch.float64,
+    ),
+    torch.tensor(
+        [-2.5558943178152542e-02, 1.0109636268061706e-04, 2.0318321729487039e-03], dtype=torch.float64
+    ),
+).normalized()
+"""https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html, as used by ACE's ``setup_7scenes.py``."""
+
+COLOUR = re.compile(r"(frame-\d+)\.color\.(?:png|jpe?g)", re.IGNORECASE)
+SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
+SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFrame:
+    """A colour image, and the paths of what may lie beside it."""
+
+    image: Path
+
+    time = None
+
+    @property
+    def stem(self) -> str:
+        return self.image.name.partition(".")[0]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return (*self.image.parts[:-1], self.stem)
+
+    @property
+    def depth(self) -> Path:
+        return self.image.with_name(f"{self.stem}.depth.png")
+
+    @property
+    def pose(self) -> Path:
+        return self.image.with_name(f"{self.stem}.pose.txt")
+
+
+@dataclass(frozen=True)
+class SevenScenesReader:
+    """The reader of folders of 7-Scenes; ``register_depth`` moves poses and depth to the colour camera."""
+
+    register_depth: bool = True
+    camera: Intrinsics | Path | None = None
+    expected = "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)"
+
+    def recognises(self, path: Path) -> bool:
+        return any(_has_frames(folder) for folder in (path, *_sequence_folders(path).values()))
+
+    def with_camera(self, camera: Intrinsics | Path) -> SevenScenesReader:
+        return replace(self, camera=camera)
+
+    def open(self, path: Path, background: Background | None) -> Dataset:
+        """List the frames. Raises ``InputError`` where one has no pose, and for split files that are not usable."""
+        splits = _splits(path)
+        for frames in splits.values():
+            for frame in frames:
+                if not frame.pose.is_file():
+                    raise InputError(
+                        f"{frame.pose}: no such file, expected it as {frame.image.name} is there"
+                    )
+        return self._dataset(path, splits, background)
+
+    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+        """List the frames, those without a pose as well."""
+        splits = _splits(path)
+        posed = {split: [frame for frame in group if frame.pose.is_file()] for split, group in splits.items()}
+        unposed = {frame: None for group in splits.values() for frame in group if not frame.pose.is_file()}
+        return self._dataset(path, {s: g for s, g in posed.items() if g}, background).sequence(list(unposed))
+
+    def _dataset(
+        self, path: Path, splits: dict[str, list[SceneFrame]], background: Background | None
+    ) -> SevenScenesDataset:
+        published = COLOUR_CAMERA if self.register_depth else DEPTH_CAMERA
+        camera = FolderCamera(path, self.camera, published)
+        return SevenScenesDataset(Splits(path, splits), camera, self.register_depth, background)
+
+
+class SevenScenesDataset(SplitDataset[SceneFrame]):
+    """Views of a folder of 7-Scenes; see ``Dataset``."""
+
+    def __init__(
+        self, frames: Splits[SceneFrame], camera: FolderCamera, register: bool, background: Background | None
+    ) -> None:
+        super().__init__(frames)
+        self._camera, self._register = camera, register
+        self._background = background_colour("black" if background is None else background)
+        self._read_depth = DepthReader(documented=("65535",))
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The requested colour, or black: the images have no alpha channel."""
+        return self._background
+
+    def _view(self, frame: SceneFrame, name: str) -> View:
+        return View(self._frame(frame, name), self._pose(frame))
+
+    def _posed(self, frame: SceneFrame, name: str) -> tuple[Frame, SE3 | None]:
+        return self._frame(frame, name), self._pose(frame) if frame.pose.is_file() else None
+
+    def _pose(self, frame: SceneFrame) -> SE3:
+        T_world_depth = read_pose_matrix(frame.pose)
+        return T_world_depth @ T_COLOUR_DEPTH.inverse() if self._register else T_world_depth
+
+    def _frame(self, frame: SceneFrame, name: str) -> Frame:
+        header = read_header(frame.image)
+        camera = self._camera.at(frame.image, header.width, header.height)
+        colour, alpha = read_image(frame.image)
+        depth = None
+        if frame.depth.is_file():
+            depth = self._read_depth(frame.depth, MILLIMETRE).metres
+            if depth.shape != colour.shape[:2]:
+                raise InputError(
+                    f"{frame.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
+                    "as the colour image"
+                )
+            if self._register:
+                sensor = DEPTH_CAMERA.resized(header.width, header.height)
+                depth = register_depth(depth, sensor, camera, T_COLOUR_DEPTH)
+        return Frame(name, over(colour, alpha, self._background), camera, depth, alpha)
+
+
+def _splits(path: Path) -> dict[str, list[SceneFrame]]:
+    """Return the frames of the listed sequences; without split files, of all sequences with every eighth held out."""
+    folders = _sequence_folders(path)
+    listed = {split: path / name for split, name in SPLIT_FILES.items() if (path / name).is_file()}
+    if listed and folders:
+        return {
+            split: [frame for number in _listed(file, folders) for frame in _frames(folders[number])]
+            for split, file in listed.items()
+        }
+    groups = [folders[number] for number in sorted(folders)] if folders else [path]
+    return hold_out([frame for folder in groups for frame in _frames(folder)])
+
+
+def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
+    """Return the numbers of the sequences that a split file lists. Raises ``InputError``."""
+    with open_binary(file, "a list of sequences") as opened:
+        lines = opened.read().decode("utf-8-sig", "replace").split("\n")
+    numbers = list[int]()
+    for number, line in enumerate(map(str.strip, lines), start=1):
+        if not line:
+            continue
+        found = SEQUENCE.fullmatch(line)
+        if found is None:
+            raise InputError(f"{file}: line {number}: {line[:40]!r}, expected a sequence such as sequence1")
+        if int(found[1]) not in folders:
+            raise InputError(f"{file}: line {number}: no folder of {line}, expected seq-{int(found[1]):02d}")
+        if int(found[1]) in numbers:
+            raise InputError(f"{file}: line {number}: {line} again, expected each sequence once")
+        numbers.append(int(found[1]))
+    if not numbers:
+        raise InputError(f"{file}: lists no sequence, expected lines such as sequence1")
+    return numbers
+
+
+def _frames(folder: Path) -> list[SceneFrame]:
+    frames = [SceneFrame(file) for file in folder.iterdir() if COLOUR.fullmatch(file.name)]
+    if not frames:
+        raise InputError(f"{folder}: has no frames, expected frame-000000.color.png ...")
+    return sorted(frames, key=lambda frame: natural_order(frame.image.name))
+
+
+def _sequence_folders(path: Path) -> dict[int, Path]:
+    found = {child: SEQUENCE.fullmatch(child.name) for child in path.glob("seq*") if child.is_dir()}
+    return {int(match[1]): child for child, match in found.items() if match}
+
+
+def _has_frames(folder: Path) -> bool:
+    return any(COLOUR.fullmatch(file.name) for file in folder.glob("frame-*"))

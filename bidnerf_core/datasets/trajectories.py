@@ -1,0 +1,91 @@
+"""Trajectories: poses at given times, and poses at the times in between."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
+
+from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows
+from bidnerf_core.errors import InputError
+from bidnerf_core.se3 import SE3
+
+COLUMNS = "tx ty tz qx qy qz qw"
+UNIT_TO = 0.01
+"""How far the length of a quaternion may be from 1, as rounding to four decimals causes it."""
+LARGEST_GAP = 0.1
+"""Seconds. Over it a hand-held camera strays some millimetres from the interpolated path; motion capture that lost its
+markers leaves longer gaps, in which no pose is known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses ``T_world_camera`` (OpenCV axes, metres) in the order of time (seconds); no time occurs twice."""
+
+    times: Float[Tensor, "n"]
+    rotations: Float[Tensor, "n 3 3"]
+    translations: Float[Tensor, "n 3"]
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def at(self, time: float, largest_gap: float = LARGEST_GAP) -> SE3 | None:
+        """Return the pose at a time: the sample, or an interpolation of its two neighbours (slerp and linear).
+
+        None before the first sample, after the last, and between two that are more than ``largest_gap`` seconds apart.
+        """
+        after = int(np.searchsorted(self.times.numpy(), time))
+        if after < len(self) and float(self.times[after]) == time:
+            return SE3(self.rotations[after], self.translations[after])
+        if after in (0, len(self)):
+            return None
+        start, end = (float(self.times[place]) for place in (after - 1, after))
+        if end - start > largest_gap:
+            return None
+        share = (time - start) / (end - start)
+        turns = Slerp([0.0, 1.0], Rotation.from_matrix(self.rotations[after - 1 : after + 1].numpy()))
+        rotation = torch.from_numpy(turns(share).as_matrix())
+        return SE3(rotation, torch.lerp(self.translations[after - 1], self.translations[after], share))
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a file of rows ``timestamp tx ty tz qx qy qz qw``, as TUM's ``groundtruth.txt`` and ``bidnerf`` write it.
+
+    Raises ``InputError`` with the file and its line where a row is cut off, a number is not finite, a quaternion is not of
+    length 1, or two rows have one time and different poses.
+    """
+    rows = read_timed_rows(path, COLUMNS)
+    numbers = [_pose_numbers(row) for row in rows]
+    kept = list[int]()
+    for place, row in enumerate(rows):
+        if kept and rows[kept[-1]].time == row.time:
+            if numbers[kept[-1]] != numbers[place]:
+                raise InputError(
+                    f"{row.where}: another pose at the time {row.time:.6f}, expected one pose a time"
+                )
+            continue
+        kept.append(place)
+    values = torch.tensor([numbers[place] for place in kept], dtype=torch.float64)
+    rotations = torch.from_numpy(Rotation.from_quat(values[:, 3:].numpy()).as_matrix())
+    times = torch.tensor([rows[place].time for place in kept], dtype=torch.float64)
+    return Trajectory(times, rotations, values[:, :3])
+
+
+def _pose_numbers(row: TimedRow) -> list[float]:
+    """Return the translation and the quaternion (x, y, z, w) of a row."""
+    try:
+        numbers = [float(word) for word in row.words[:7]]
+    except ValueError as error:
+        raise InputError(f"{row.where}: {error}, expected timestamp {COLUMNS}") from error
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(f"{row.where}: the pose is not finite, expected timestamp {COLUMNS}")
+    length = math.hypot(*numbers[3:])
+    if abs(length - 1) > UNIT_TO:
+        raise InputError(f"{row.where}: the quaternion has length {length:.3g}, expected 1 (qx qy qz qw)")
+    return numbers

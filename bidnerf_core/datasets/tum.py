@@ -1,0 +1,198 @@
+"""Folders of the TUM RGB-D benchmark as it is distributed (https://cvg.cit.tum.de/data/datasets/rgbd-dataset).
+
+``rgb.txt`` and ``depth.txt`` list images with their time stamps (seconds), ``groundtruth.txt`` the poses of the colour
+camera in the frame of the motion capture: ``timestamp tx ty tz qx qy qz qw``, camera to world, OpenCV axes. The three have
+clocks and rates of their own. An image has the depth image that is nearest in time, if it is no other's and at most 20 ms
+away, and the pose that is interpolated between the samples before and after it. A frame outside the time of the ground truth,
+or in a gap of it of more than 0.1 s, has no pose: it is in the sequence and not in the dataset. Of the posed frames every
+eighth (the first, the ninth ...) is held out as "test" and the others are "train".
+
+Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image. The published
+images contain the correction of the depth scale already.
+
+The camera is, in this order, the one that is given; that in ``camera.json`` or ``cameras.txt`` of the folder (as ``--camera``
+of ``bidnerf localize`` takes them); and the published one of freiburg1, 2 or 3, which the folder's name says. Published
+principal points count pixels from the centre of the upper left one and are half a pixel larger here. Colour images of
+freiburg1 and freiburg2 are distorted; the camera models it (k1 k2 p1 p2 k3), so that no image is resampled.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.folder_camera import FolderCamera
+from bidnerf_core.datasets.sequence import FrameSequence
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
+from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows, require_distinct_times
+from bidnerf_core.datasets.trajectories import LARGEST_GAP, read_trajectory
+from bidnerf_core.depth_images import DepthReader
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.se3 import SE3
+
+COLOURS, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
+METRES_PER_STEP = 1 / 5000
+LARGEST_DIFFERENCE = 0.02
+"""Seconds between a colour image and its depth image, as the benchmark's own association has it."""
+CAMERAS = {
+    "1": Intrinsics(517.3, 516.5, 319.1, 255.8, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": Intrinsics(520.9, 521.0, 325.6, 250.2, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": Intrinsics(535.4, 539.2, 320.6, 248.1, 640, 480),
+}
+"""The benchmark's "ROS default" is none of them: these are its calibrations of the three colour cameras."""
+SENSOR = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class TumFrame:
+    """A colour image of the list, with what belongs to it."""
+
+    where: str  # the file and line that lists it
+    image: Path
+    time: float
+    depth: Path | None
+    truth: SE3 | None  # T_world_camera
+
+    @property
+    def stem(self) -> str:
+        return self.image.stem
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return (*self.image.parts[:-1], self.stem)
+
+
+@dataclass(frozen=True)
+class TumReader:
+    """The reader of folders of the TUM RGB-D benchmark; ``camera`` (intrinsics or a file) goes before all others."""
+
+    camera: Intrinsics | Path | None = None
+    expected = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
+
+    def recognises(self, path: Path) -> bool:
+        return (path / COLOURS).is_file()
+
+    def with_camera(self, camera: Intrinsics | Path) -> TumReader:
+        return replace(self, camera=camera)
+
+    def open(self, path: Path, background: Background | None) -> Dataset:
+        """Read the lists. Raises ``InputError`` where one is missing or broken, and where no frame has a pose."""
+        if not (path / TRUTH).is_file():
+            raise InputError(f"{path / TRUTH}: no such file, expected the poses of the frames of a dataset")
+        posed = [frame for frame in tum_frames(path) if frame.truth is not None]
+        if not posed:
+            raise InputError(
+                f"{path / TRUTH}: covers no image of {COLOURS}, expected samples before and after their times, "
+                f"at most {LARGEST_GAP:g} s apart"
+            )
+        return TumDataset(Splits(path, hold_out(posed)), self._camera(path), background)
+
+    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+        """Read the lists; frames without a pose are in the sequence as well, and all where there is no ground truth."""
+        frames = tum_frames(path)
+        posed = [frame for frame in frames if frame.truth is not None]
+        unposed = [frame for frame in frames if frame.truth is None]
+        splits = hold_out(posed) if posed else {}
+        return TumDataset(Splits(path, splits), self._camera(path), background).sequence(unposed)
+
+    def _camera(self, path: Path) -> FolderCamera:
+        unknown = "its name says none of freiburg1, freiburg2 and freiburg3"
+        return FolderCamera(path, self.camera, published_camera(path), unknown)
+
+
+class TumDataset(SplitDataset[TumFrame]):
+    """Views of a folder of the TUM RGB-D benchmark; see ``Dataset``."""
+
+    def __init__(self, frames: Splits[TumFrame], camera: FolderCamera, background: Background | None) -> None:
+        super().__init__(frames)
+        self._camera = camera
+        self._background = background_colour("black" if background is None else background)
+        self._read_depth = DepthReader(documented=("65535",))
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The requested colour, or black: the images have no alpha channel."""
+        return self._background
+
+    def _view(self, frame: TumFrame, name: str) -> View:
+        found, truth = self._posed(frame, name)
+        assert truth is not None  # only frames with a pose are in splits
+        return View(found, truth)
+
+    def _posed(self, frame: TumFrame, name: str) -> tuple[Frame, SE3 | None]:
+        for file in (frame.image, frame.depth):
+            if file is not None and not file.is_file():
+                raise InputError(f"{frame.where}: no image {file}, expected that file")
+        header = read_header(frame.image)
+        camera = self._camera.at(frame.image, header.width, header.height)
+        colour, alpha = read_image(frame.image)
+        depth = None
+        if frame.depth is not None:
+            depth = self._read_depth(frame.depth, METRES_PER_STEP).metres
+            if depth.shape != colour.shape[:2]:
+                raise InputError(
+                    f"{frame.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
+                    "as its colour image, to which it is registered"
+                )
+        return Frame(name, over(colour, alpha, self._background), camera, depth, alpha), frame.truth
+
+
+def published_camera(folder: Path) -> Intrinsics | None:
+    """Return the benchmark's calibration of the sensor that the folder's name says, or None."""
+    found = SENSOR.search(folder.resolve().name)
+    return CAMERAS[found[1]] if found else None
+
+
+def tum_frames(folder: Path) -> list[TumFrame]:
+    """Read the lists of a folder and associate them by time; no image is opened. Raises ``InputError``."""
+    colours = _listed(folder / COLOURS)
+    depths = _listed(folder / DEPTHS) if (folder / DEPTHS).is_file() else []
+    path = read_trajectory(folder / TRUTH) if (folder / TRUTH).is_file() else None
+    partners = associate([row.time for row in colours], [row.time for row in depths], LARGEST_DIFFERENCE)
+    return [
+        TumFrame(
+            row.where,
+            folder / row.words[0],
+            row.time,
+            folder / depths[partners[place]].words[0] if place in partners else None,
+            path.at(row.time) if path is not None else None,
+        )
+        for place, row in enumerate(colours)
+    ]
+
+
+def associate(times: Sequence[float], others: Sequence[float], largest: float) -> dict[int, int]:
+    """Return the indices of those pairs that are each other's nearest in time, at most ``largest`` seconds apart.
+
+    Both lists are in the order of time.
+    """
+    if not len(times) or not len(others):
+        return {}
+    forth, back = _nearest(np.array(times), np.array(others)), _nearest(np.array(others), np.array(times))
+    return {
+        place: int(other)
+        for place, other in enumerate(forth)
+        if back[other] == place and abs(times[place] - others[other]) <= largest
+    }
+
+
+def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return for each time the index of the nearest of the others; the earlier one of two equally near ones."""
+    after = np.searchsorted(others, times).clip(1, max(1, len(others) - 1))
+    before = after - 1
+    after = after.clip(max=len(others) - 1)
+    return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
+
+
+def _listed(path: Path) -> list[TimedRow]:
+    rows = read_timed_rows(path, "filename")
+    require_distinct_times(rows)
+    return rows
