@@ -90,13 +90,15 @@ class Tracker:
         """
         began = clocks.perf_counter()
         clock, seconds = self._state.clock.step(time)
-        image = grey_image(frame.rgb)
+        image = grey_image(frame.rgb) if frame.has_colour else None
         state = replace(self._state, clock=clock, frames=self._state.frames + 1)
         if state.motion is None:
             answer, state = self._begun(frame, image, state)
         else:
             answer, state = self._continued(frame, image, state, state.motion, seconds)
-        self._state = replace(state, image=image)
+        if image is not None:  # points are followed from the last image, even past frames without one
+            state = replace(state, image=image)
+        self._state = state
         return replace(answer, seconds=clocks.perf_counter() - began)
 
     def save(self, path: str | Path) -> None:
@@ -107,7 +109,7 @@ class Tracker:
         """Continue where the tracker that wrote the file was. Raises ``InputError`` for another map's file, or a damaged one."""
         self._state = load_state(Path(path), self._key)
 
-    def _begun(self, frame: Frame, image: Grey, state: TrackerState) -> tuple[Localization, TrackerState]:
+    def _begun(self, frame: Frame, image: Grey | None, state: TrackerState) -> tuple[Localization, TrackerState]:
         """Find the first pose of the sequence: around the start, if there is one, or by a search."""
         if self._start is not None and state.frames == 1:
             motion = self._at_start(frame, self._start)
@@ -126,7 +128,7 @@ class Tracker:
         return Motion.at(PoseEstimate(start, covariance, torch.zeros_like(covariance)), self._reach(frame))
 
     def _continued(
-        self, frame: Frame, image: Grey, state: TrackerState, motion: Motion, seconds: float
+        self, frame: Frame, image: Grey | None, state: TrackerState, motion: Motion, seconds: float
     ) -> tuple[Localization, TrackerState]:
         """Find the pose from that of the last frame. If it is not accepted, search anew from the next frame on."""
         predicted = motion.predicted(seconds)
@@ -158,16 +160,19 @@ class Tracker:
         return predicted, points[points.landmark != FRESH], "constant velocity"
 
     def _measured(
-        self, frame: Frame, image: Grey, state: TrackerState, points: FollowedPoints, predicted: Motion
+        self, frame: Frame, image: Grey | None, state: TrackerState, points: FollowedPoints, predicted: Motion
     ) -> Measurement | None:
         """Measure the pose by the best means that map and frame offer."""
-        if self._by_landmarks is not None:
+        if self._by_landmarks is not None and image is not None:
             known = points[points.landmark != FRESH]
             return self._by_landmarks(frame, image, state, known, predicted)
         surface, config = self.localizer.map.surface, self.localizer.config
-        state = replace(state, points=points)
+        if image is not None:
+            state = replace(state, points=points)
         if surface is not None and has_points(frame):
             found = by_surface(surface, frame, state, predicted, self.config)
+        elif image is None:
+            return None
         else:
             colour = config.by_colour if isinstance(config, AutoConfig) else AutoConfig().by_colour
             found = by_colour(self.localizer.map, frame, state, predicted, colour)
@@ -175,7 +180,7 @@ class Tracker:
         return replace(found, verdict=determined(found.verdict, covariance, self._extent))
 
     def _accepted(
-        self, frame: Frame, image: Grey, measured: Measurement, predicted: Motion
+        self, frame: Frame, image: Grey | None, measured: Measurement, predicted: Motion
     ) -> tuple[Localization, TrackerState]:
         """Fuse an accepted pose with the prediction, unless the camera moved in a way that no prediction could foresee."""
         motion = replace(predicted, reach=self._reach(frame, measured.state.points, measured.pose.T_world_camera))
@@ -190,7 +195,7 @@ class Tracker:
         return _localization(motion, measured.verdict, predicted, measured.loss), state
 
     def _found(
-        self, frame: Frame, image: Grey, state: TrackerState, found: Localization
+        self, frame: Frame, image: Grey | None, state: TrackerState, found: Localization
     ) -> tuple[Localization, TrackerState]:
         """Begin to track at a pose that a search has found."""
         covariance = found.covariance
@@ -211,7 +216,7 @@ class Tracker:
         return answer, replace(state, motion=motion, lost=0)
 
     def _adrift(
-        self, frame: Frame, image: Grey, state: TrackerState, points: FollowedPoints, predicted: Motion
+        self, frame: Frame, image: Grey | None, state: TrackerState, points: FollowedPoints, predicted: Motion
     ) -> TrackerState:
         """Return the state of a tracker that is lost: corners to follow, and a velocity that is trusted less and less."""
         corners = self._odometry.replenished(frame, image, points, predicted.T_world_camera)

@@ -52,11 +52,11 @@ class Odometry:
         return motion.moved(found.T_world_camera, relative, seconds), points[found.inliers]
 
     def replenished(
-        self, frame: Frame, image: Grey, points: FollowedPoints, T_world_camera: SE3
+        self, frame: Frame, image: Grey | None, points: FollowedPoints, T_world_camera: SE3
     ) -> FollowedPoints:
         """Return the corners among ``points``, or new ones at the pose of this frame where they have become few."""
         points = points[points.landmark == FRESH]
-        if len(points) >= REPLENISHED * self.count or not frame.has_depth:
+        if image is None or not frame.has_depth or len(points) >= REPLENISHED * self.count:
             return points
         apart = 0.7 * (image.shape[0] * image.shape[1] / self.count) ** 0.5
         pixels = corners(image, self.count, apart)
