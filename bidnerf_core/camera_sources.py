@@ -29,6 +29,15 @@ COLMAP_MODELS: dict[str, tuple[int, ...]] = {
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
 """Parameters of COLMAP's perspective models (https://colmap.github.io/cameras.html), which also has pixel centres at +0.5."""
+COLMAP_MODEL_IDS = {
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    6: "FULL_OPENCV",
+}
+"""How ``cameras.bin`` names these models."""
 
 
 @dataclass(frozen=True)
@@ -163,12 +172,18 @@ def read_camera(path: Path, size: tuple[int, int]) -> Intrinsics:
         record = camera_record(parse_record(str(path), content))
         return record.intrinsics(record.width or size[0], record.height or size[1])
     cameras = _colmap_cameras(path, content)
-    if len(set(cameras)) != 1:
+    if len(set(cameras.values())) != 1:
         raise InputError(f"{path}: holds {len(cameras)} cameras, expected one; keep the line of this photo's")
-    return cameras[0]
+    return next(iter(cameras.values()))
 
 
-def _colmap_cameras(path: Path, content: bytes) -> list[Intrinsics]:
+def read_text_cameras(path: Path) -> dict[int, Intrinsics]:
+    """Read COLMAP's ``cameras.txt``; its cameras by their ids. Raises ``InputError``."""
+    with open_binary(path, "COLMAP's cameras.txt") as file:
+        return _colmap_cameras(path, file.read())
+
+
+def _colmap_cameras(path: Path, content: bytes) -> dict[int, Intrinsics]:
     try:
         lines = [line.partition("#")[0].split() for line in content.decode("utf-8-sig").splitlines()]
     except UnicodeDecodeError as error:
@@ -176,25 +191,42 @@ def _colmap_cameras(path: Path, content: bytes) -> list[Intrinsics]:
             f"{path}: neither JSON nor text, expected transforms.json or cameras.txt "
             "(COLMAP's model_converter makes it of cameras.bin)"
         ) from error
-    return [_colmap_camera(f"{path}: line {i}", words) for i, words in enumerate(lines, start=1) if words]
+    found: dict[int, Intrinsics] = {}
+    for number, words in enumerate(lines, start=1):
+        if words:
+            key, camera = _text_camera(f"{path}: line {number}", words)
+            if found.setdefault(key, camera) != camera:
+                raise InputError(f"{path}: line {number}: camera {key} again, expected each id once")
+    return found
 
 
-def _colmap_camera(where: str, words: Sequence[str]) -> Intrinsics:
+def _text_camera(where: str, words: Sequence[str]) -> tuple[int, Intrinsics]:
     """Read ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``."""
     expected = "expected CAMERA_ID MODEL WIDTH HEIGHT and parameters"
     if len(words) < 5:
         raise InputError(f"{where} has {len(words)} entries, {expected}")
-    places = COLMAP_MODELS.get(words[1])
-    if places is None:
+    if words[1] not in COLMAP_MODELS:
         raise InputError(f"{where}: camera model {words[1]}, expected one of {', '.join(COLMAP_MODELS)}")
     try:
-        width, height = int(words[2]), int(words[3])
+        number, width, height = int(words[0]), int(words[2]), int(words[3])
         parameters = [float(word) for word in words[4:]]
     except ValueError as error:
         raise InputError(f"{where}: {error}, {expected}") from error
-    if len(parameters) != max(places) + 1:
-        raise InputError(f"{where}: {words[1]} has {len(parameters)} parameters, expected {max(places) + 1}")
-    fx, fy, cx, cy, *lens = (0.0 if place < 0 else parameters[place] for place in places)
+    return number, colmap_camera(where, words[1], width, height, parameters)
+
+
+def colmap_parameters(model: str) -> int:
+    """Return the number of parameters of one of ``COLMAP_MODELS``."""
+    return max(COLMAP_MODELS[model]) + 1
+
+
+def colmap_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Intrinsics:
+    """Return a camera of one of ``COLMAP_MODELS``. Raises ``InputError``, which begins with ``where``."""
+    if len(parameters) != colmap_parameters(model):
+        raise InputError(
+            f"{where}: {model} has {len(parameters)} parameters, expected {colmap_parameters(model)}"
+        )
+    fx, fy, cx, cy, *lens = (0.0 if place < 0 else parameters[place] for place in COLMAP_MODELS[model])
     try:
         return Intrinsics(fx, fy, cx, cy, width, height, tuple(lens) if any(lens) else ())
     except InputError as error:

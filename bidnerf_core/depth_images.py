@@ -22,8 +22,8 @@ NOTHING = 1e10
 """Floating-point values from here on stand for "nothing", whatever the unit: Blender's 1e10, the largest float."""
 INTEGER_UNIT, FLOAT_UNIT = 0.001, 1.0
 """Metres a step where the user gives none."""
-SPIKE = 0.05
-"""Share of an image's pixels from which on its largest value may be the sensor's limit rather than a measurement ..."""
+SPIKE, SPIKE_PIXELS = 0.05, 20
+"""Share and count of an image's pixels from which on its largest value may be the sensor's limit, not a measurement ..."""
 NEAREST_LIMIT, LIMIT_STEP = 4.0, 0.5
 """... if that is a round number: a multiple of 0.5 m, as ranges are set and data sheets have them, from 4 m on ..."""
 LARGEST_OF_BITS = tuple(2**bits - 1 for bits in range(11, 17))
@@ -133,7 +133,11 @@ def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) ->
     steps = round(largest / LIMIT_STEP)
     is_round = largest >= NEAREST_LIMIT and abs(largest - steps * LIMIT_STEP) < 1e-6 * largest
     fills_bits = values.dtype.kind != "f" and int(values[mask][0]) in LARGEST_OF_BITS
-    if count < SPIKE * values.size or count == measured.size or not (is_round or fills_bits):
+    if (
+        count < max(SPIKE * values.size, SPIKE_PIXELS)
+        or count == measured.size
+        or not (is_round or fills_bits)
+    ):
         return {}
     return {f"{float(values[mask][0]):g} (the sensor's limit)": mask}
 

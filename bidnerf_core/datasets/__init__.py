@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets.colmap_project import ColmapReader
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.image_folders import open_images
 from bidnerf_core.datasets.scanner_app import ScannerAppReader
 from bidnerf_core.datasets.sequence import (
@@ -20,6 +22,7 @@ from bidnerf_core.datasets.sequence import (
 from bidnerf_core.datasets.seven_scenes import SevenScenesReader
 from bidnerf_core.datasets.transforms import TransformsReader
 from bidnerf_core.datasets.tum import TumReader
+from bidnerf_core.datasets.video import VIDEO_SUFFIXES, open_video
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError
 from bidnerf_core.images import Background
@@ -27,6 +30,7 @@ from bidnerf_core.images import Background
 __all__ = [
     "READERS",
     "Background",
+    "CameraReader",
     "Dataset",
     "FileSequence",
     "FrameSequence",
@@ -67,18 +71,35 @@ class SequenceReader(Protocol):
     def open_sequence(self, path: Path, background: Background | None) -> FrameSequence: ...
 
 
-READERS: list[Reader] = [TransformsReader(), ScannerAppReader(), TumReader(), SevenScenesReader()]
+@runtime_checkable
+class CameraReader(Protocol):
+    """A reader whose format has no camera in its files, so that one may be given."""
+
+    def with_camera(self, camera: Intrinsics | Path) -> Reader: ...
+
+
+READERS: list[Reader] = [
+    TransformsReader(),
+    ScannerAppReader(),
+    TumReader(),
+    SevenScenesReader(),
+    ColmapReader(),
+]
 """The formats that ``open_dataset`` tries, in this order; append a reader to add one."""
 
 
 def open_dataset(
-    path: str | Path, background: Background | None = None, readers: Sequence[Reader] | None = None
+    path: str | Path,
+    background: Background | None = None,
+    readers: Sequence[Reader] | None = None,
+    camera: Intrinsics | str | Path | None = None,
 ) -> Dataset:
     """Open the dataset in the folder ``path``. Descriptions are read and checked now, images when views are requested.
 
     ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. The default is
-    white where the images have one, as is the convention of NeRF-Synthetic, and black otherwise. Raises ``InputError``
-    where there is no such folder, where no reader recognises it, and where a description is not usable.
+    white where the images have one, as is the convention of NeRF-Synthetic, and black otherwise. ``camera`` (intrinsics or
+    a file of them) is for formats without a camera of their own, such as TUM RGB-D. Raises ``InputError`` where there is no
+    such folder, where no reader recognises it, and where a description is not usable.
     """
     folder = Path(path)
     if not folder.exists():
@@ -90,7 +111,7 @@ def open_dataset(
     if reader is None:
         expected = " or ".join(reader.expected for reader in readers)
         raise InputError(f"{folder}: no dataset found, expected {expected}")
-    return reader.open(folder, background)
+    return _with_camera(reader, folder, GivenCamera(camera)).open(folder, background)
 
 
 def open_sequence(
@@ -102,24 +123,40 @@ def open_sequence(
     background: Background | None = None,
     readers: Sequence[Reader] | None = None,
 ) -> FrameSequence:
-    """Open the frames of ``path`` in the order of time: a dataset, or a folder of images. Frames are read as they are used.
+    """Open the frames of ``path`` in the order of time: a dataset, a folder of images, or a video. None is read yet.
 
-    Images have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in ``Frame.open``,
-    or that of their EXIF. Datasets have their own cameras. Raises ``InputError`` where nothing is found, where a
-    description is not usable, and for a camera where the dataset has its own.
+    Images and videos have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in
+    ``Frame.open``; images without them that of their EXIF. Datasets have their own, but for those of which ``open_dataset``
+    takes one. Raises ``InputError`` where nothing is found, where a description is not usable, and for a camera that is
+    missing or one too many.
     """
-    folder = Path(path)
-    if not folder.exists():
-        raise InputError(f"{folder}: no such folder")
-    reader = _reader_of(folder, READERS if readers is None else readers)
+    place, given = Path(path), GivenCamera(camera, focal, hfov)
+    if not place.exists():
+        raise InputError(f"{place}: no such file or folder")
+    if not place.is_dir():
+        if place.suffix.lower() not in VIDEO_SUFFIXES:
+            raise InputError(
+                f"{place}: is a file, expected a video ({', '.join(VIDEO_SUFFIXES)}) or a folder"
+            )
+        return open_video(place, given)
+    reader = _reader_of(place, READERS if readers is None else readers)
     if reader is None:
-        return open_images(folder, camera, focal, hfov, background)
-    if any(given is not None for given in (camera, focal, hfov)):
-        raise InputError(f"{folder}: is a dataset, which has its own cameras; expected no other camera")
+        return open_images(place, given, background)
+    reader = _with_camera(reader, place, given)
     if isinstance(reader, SequenceReader):
-        return reader.open_sequence(folder, background)
-    return sequence_of(reader.open(folder, background))
+        return reader.open_sequence(place, background)
+    return sequence_of(reader.open(place, background))
 
 
 def _reader_of(folder: Path, readers: Sequence[Reader]) -> Reader | None:
     return next((reader for reader in readers if reader.recognises(folder)), None)
+
+
+def _with_camera(reader: Reader, folder: Path, given: GivenCamera) -> Reader:
+    if not given.is_given:
+        return reader
+    if not isinstance(reader, CameraReader):
+        raise InputError(f"{folder}: is a dataset with cameras of its own, expected no other camera")
+    if given.camera is None:
+        raise InputError(f"{folder}: is a dataset, expected a camera with all its intrinsics (camera=)")
+    return reader.with_camera(given.camera if isinstance(given.camera, Intrinsics) else Path(given.camera))

@@ -1,8 +1,7 @@
-"""The files of a COLMAP sparse model: ``images`` and ``points3D``, as .bin or .txt.
+"""The files of a COLMAP sparse model: ``cameras``, ``images`` and ``points3D``, as .bin or .txt.
 
-Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. ``cameras`` is not
-needed, as points are given in space. Nor are ``rigs`` and ``frames`` of newer versions, which still write each image's pose
-to ``images``. pycolmap is not used, because it hangs on a truncated ``points3D.bin``.
+Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. ``rigs`` and ``frames``
+of newer versions are not needed, which still write each image's pose to ``images``. pycolmap is not used, because it hangs on a truncated ``points3D.bin``.
 """
 
 from __future__ import annotations
@@ -19,6 +18,13 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera_sources import (
+    COLMAP_MODEL_IDS,
+    colmap_camera,
+    colmap_parameters,
+    read_text_cameras,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.files import open_binary
 from bidnerf_core.se3 import SE3
@@ -29,6 +35,7 @@ Number = TypeVar("Number", int, float)
 NAMES = ("images", "points3D")
 COUNT, IMAGE, POINT = struct.Struct("<Q"), struct.Struct("<I7dI"), struct.Struct("<q3d3BdQ")
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+CAMERA = struct.Struct("<IiQQ")
 TRACK_BYTES = 8  # an image and one of its key points, 4 bytes each
 
 
@@ -37,6 +44,7 @@ class ModelImage:
     """A registered image of the model."""
 
     name: str  # path below the folder of images
+    camera: int  # id of its camera
     T_camera_model: SE3  # in units of the model
     points: Int[Tensor, "n"]  # ids of the observed points
 
@@ -75,6 +83,41 @@ def read_model(folder: Path) -> tuple[list[ModelImage], ModelPoints]:
     if suffix == ".bin":
         return _binary(images, _binary_image), _together(points, _binary(points, _binary_point))
     return _text_images(images), _together(points, _text_points(points))
+
+
+def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Intrinsics]]:
+    """Read the images of the model in ``folder``, and their cameras by id; its points may be missing.
+
+    Raises ``InputError`` where there is no model, where a file is damaged, and for a camera that is not perspective.
+    """
+    suffix = next((s for s in (".bin", ".txt") if has_posed_images(folder, s)), None)
+    if suffix is None:
+        raise InputError(f"{folder}: no cameras and images of a COLMAP sparse model, expected .bin or .txt")
+    cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
+    if suffix == ".txt":
+        return _text_images(images), read_text_cameras(cameras)
+    return _binary(images, _binary_image), dict(_binary(cameras, _binary_camera))
+
+
+def has_posed_images(folder: Path, suffix: str | None = None) -> bool:
+    """Whether a folder has the cameras and images of a model, as .bin or .txt where no suffix is given."""
+    suffixes = (".bin", ".txt") if suffix is None else (suffix,)
+    return any(
+        all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")) for suffix in suffixes
+    )
+
+
+def _binary_camera(file: _Bytes) -> tuple[int, Intrinsics]:
+    number, model, width, height = file.take(CAMERA)
+    where = f"{file.path}: camera {number}"
+    name = COLMAP_MODEL_IDS.get(model)
+    if name is None:
+        expected = ", ".join(COLMAP_MODEL_IDS.values())
+        raise InputError(
+            f"{where} is of the model {model}, expected one of {expected}; undistort the images with COLMAP"
+        )
+    parameters = file.array(np.dtype("<f8"), colmap_parameters(name)).tolist()
+    return int(number), colmap_camera(where, name, int(width), int(height), parameters)
 
 
 def _is_model(folder: Path, suffix: str) -> bool:
@@ -136,11 +179,11 @@ def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
 
 
 def _binary_image(file: _Bytes) -> ModelImage:
-    _, *pose, _ = file.take(IMAGE)
+    _, *pose, camera = file.take(IMAGE)
     name = file.text()
     (count,) = file.take(COUNT)
     observed = file.array(OBSERVATION, int(count))["point"]
-    return _image(str(file.path), name, pose, observed[observed >= 0])
+    return _image(str(file.path), name, int(camera), pose, observed[observed >= 0])
 
 
 def _binary_point(file: _Bytes) -> ModelPoint:
@@ -166,7 +209,9 @@ def _text_images(path: Path) -> list[ModelImage]:
                 f"{path}: line {number + 1} has {len(observed)} entries, expected x, y, id of points"
             )
         points = np.array(_numbers(f"{path}: line {number + 1}", observed[2::3], _id), dtype=np.int64)
-        found.append(_image(where, words[9], _numbers(where, words[1:8], float), points[points >= 0]))
+        (camera,) = _numbers(where, words[8:9], _id)
+        pose = _numbers(where, words[1:8], float)
+        found.append(_image(where, words[9], camera, pose, points[points >= 0]))
     return found
 
 
@@ -185,13 +230,13 @@ def _text_points(path: Path) -> list[ModelPoint]:
     return found
 
 
-def _image(where: str, name: str, pose: Sequence[float], points: np.ndarray) -> ModelImage:
+def _image(where: str, name: str, camera: int, pose: Sequence[float], points: np.ndarray) -> ModelImage:
     """Make an image of a ``pose`` that is a quaternion w x y z, then a translation."""
     if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(pose[:4]) < 2):
         raise InputError(f"{where}: image {name!r} has an invalid pose, expected a unit quaternion")
     rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
     T = SE3(torch.from_numpy(rotation), torch.tensor(pose[4:], dtype=torch.float64))
-    return ModelImage(name, T, torch.from_numpy(np.unique(points)))
+    return ModelImage(name, camera, T, torch.from_numpy(np.unique(points)))
 
 
 def _together(path: Path, points: list[ModelPoint]) -> ModelPoints:

@@ -5,26 +5,23 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.sequence import FileSequence, SequenceEntry, timestamp
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.images import Background
 from bidnerf_core.photos import DEPTH_STEM, photos_in
 
+MILLIMETRE = 0.001
+"""The step of the depth images that ``bidnerf render`` writes, metres."""
 
-def open_images(
-    folder: Path,
-    camera: Intrinsics | str | Path | None = None,
-    focal: float | None = None,
-    hfov: float | None = None,
-    background: Background | None = None,
-) -> FileSequence:
+
+def open_images(folder: Path, camera: GivenCamera, background: Background | None = None) -> FileSequence:
     """Return the images of a folder by their times where all names are times (``12.345.png``), or in natural order.
 
-    ``NAME.depth.png`` (millimetres) beside ``NAME.png`` is its depth, as ``bidnerf render`` writes it. The other arguments
-    are those of ``Frame.open``. Raises ``InputError`` where there is no image.
+    ``NAME.depth.png`` (millimetres) beside ``NAME.png`` is its depth, as ``bidnerf render`` writes it. Images have the given
+    camera, or that of their EXIF; both are found as in ``Frame.open``. Raises ``InputError`` where there is no image.
     """
     photos, _ = photos_in(folder)
     if not photos:
@@ -36,8 +33,9 @@ def open_images(
         depth, unit = (beside, MILLIMETRE) if beside.is_file() else (None, None)
         behind: Background = "black" if background is None else background
         frame = Frame.open(
-            photo, depth=depth, camera=camera, focal=focal, hfov=hfov, depth_unit=unit, background=behind
-        )
+            photo, depth=depth, depth_unit=unit, background=behind,
+            camera=camera.camera, focal=camera.focal, hfov=camera.hfov,
+        )  # fmt: skip
         return frame, None
 
     return FileSequence.ordered(
@@ -47,7 +45,3 @@ def open_images(
             for name, photo in zip(names, photos, strict=True)
         ],
     )
-
-
-MILLIMETRE = 0.001
-"""The step of depth images that ``bidnerf render`` writes, metres."""

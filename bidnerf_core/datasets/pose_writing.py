@@ -1,11 +1,11 @@
-"""Files of estimated poses: TUM trajectories, and ``transforms.json`` as nerfstudio reads it."""
+"""Files of estimated poses: TUM trajectories, JSON with covariances, and ``transforms.json`` as nerfstudio reads it."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,17 +36,29 @@ class PosedImage:
     intrinsics: Intrinsics  # of the upright image
     T_world_camera: SE3  # OpenCV axes
     file: Path | None = None
+    time: float | None = None  # seconds
+    covariance: Float[Tensor, "6 6"] | None = (
+        None  # of the tangent at the camera (translation in metres, rotation in rad)
+    )
 
 
 def tum_trajectory(images: Sequence[PosedImage]) -> str:
     """Return rows ``timestamp tx ty tz qx qy qz qw`` (metres, unit quaternions with the scalar last).
 
-    The timestamp is the image's name where all names are numbers, such as those of the TUM RGB-D datasets, else the image's
-    number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
+    The timestamp is the image's time where all have one, else its name where all names are numbers, such as those of the TUM
+    RGB-D datasets, else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
     """
-    timed = all(NUMBER.fullmatch(image.name) for image in images)
-    rows = (_tum_row(image.name if timed else str(image.number), image.T_world_camera) for image in images)
+    stamps = _timestamps(images)
+    rows = (_tum_row(stamp, image.T_world_camera) for stamp, image in zip(stamps, images, strict=True))
     return TUM_HEAD + "".join(rows)
+
+
+def _timestamps(images: Sequence[PosedImage]) -> list[str]:
+    times = [image.time for image in images if image.time is not None]
+    if len(times) == len(images):
+        return [f"{time:.6f}" for time in times]
+    named = all(NUMBER.fullmatch(image.name) for image in images)
+    return [image.name if named else str(image.number) for image in images]
 
 
 def _tum_row(timestamp: str, T_world_camera: SE3) -> str:
@@ -80,8 +92,27 @@ def _transforms_entry(image: PosedImage, folder: Path) -> dict[str, Any]:
     return {
         "file_path": Path(place).as_posix(),
         "transform_matrix": (matrix * matrix.new_tensor(OPENCV_TO_OPENGL)).tolist(),
+        **({} if image.time is None else {"time": image.time}),
         **camera_entry(intrinsics, image.name),
     }
+
+
+def poses_json(images: Sequence[PosedImage]) -> str:
+    """Return a list of objects ``{"frame", "time", "T_world_camera", "covariance"}``, one a line: poses with OpenCV axes.
+
+    ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in metres, then rotation in rad, at the camera) are
+    null where they are not known.
+    """
+    objects = [
+        {
+            "frame": image.name,
+            "time": image.time,
+            "T_world_camera": image.T_world_camera.to("cpu", torch.float64).matrix().tolist(),
+            "covariance": None if image.covariance is None else image.covariance.double().cpu().tolist(),
+        }
+        for image in images
+    ]
+    return "[\n" + ",\n".join(json.dumps(entry, allow_nan=False) for entry in objects) + "\n]\n"
 
 
 def _as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, SE3]:
@@ -106,6 +137,29 @@ def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
     write_file(path, tum_trajectory(images).encode())
 
 
+def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write ``poses_json``, whole or not at all."""
+    write_file(path, poses_json(images).encode())
+
+
 def write_pose_transforms(path: Path, images: Sequence[PosedImage]) -> None:
     """Write ``transforms_json``, whole or not at all."""
     write_file(path, transforms_json(images, path.parent).encode())
+
+
+POSE_WRITERS: dict[str, Callable[[Path, Sequence[PosedImage]], None]] = {
+    "transforms.json": write_pose_transforms,
+    ".json": write_pose_json,
+    ".txt": write_tum,
+    ".tum": write_tum,
+}
+"""Writers by the ending of a file's name; the first that fits is taken."""
+
+
+def write_poses(path: Path, images: Sequence[PosedImage]) -> None:
+    """Write a file in the format that its name's ending says. Raises ``InputError`` for another ending."""
+    for ending, write in POSE_WRITERS.items():
+        if path.name.lower().endswith(ending):
+            write(path, images)
+            return
+    raise InputError(f"{path}: expected a name that ends with {', '.join(POSE_WRITERS)}")

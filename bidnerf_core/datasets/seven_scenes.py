@@ -176,13 +176,13 @@ def _splits(path: Path) -> dict[str, list[SceneFrame]]:
     """Return the frames of the listed sequences; without split files, of all sequences with every eighth held out."""
     folders = _sequence_folders(path)
     listed = {split: path / name for split, name in SPLIT_FILES.items() if (path / name).is_file()}
-    if listed and folders:
-        return {
-            split: [frame for number in _listed(file, folders) for frame in _frames(folders[number])]
-            for split, file in listed.items()
-        }
-    groups = [folders[number] for number in sorted(folders)] if folders else [path]
-    return hold_out([frame for folder in groups for frame in _frames(folder)])
+    if not folders:
+        return hold_out(_frames(path))
+    if not listed:
+        return hold_out([frame for number in sorted(folders) for frame in _frames(folders[number])])
+    numbers = {split: _listed(file, folders) for split, file in listed.items()}
+    frames = {number: _frames(folders[number]) for number in {n for group in numbers.values() for n in group}}
+    return {split: [frame for n in group for frame in frames[n]] for split, group in numbers.items()}
 
 
 def _listed(file: Path, folders: dict[int, Path]) -> list[int]:

@@ -1,0 +1,127 @@
+"""Folders of a COLMAP project: ``images`` and a sparse model, with no other file.
+
+The model is in ``sparse/0``, ``sparse`` or the folder itself, as .bin or .txt (``cameras`` and ``images``; ``points3D`` is not
+read). Images are in ``images``, or in the folder itself, under the names that the model has. Every eighth registered image in
+the natural order of the names (the first, the ninth ...) is held out as "test" and the others are "train", as is usual for
+captures.
+
+The world is that of the model, whose unit of length is arbitrary: poses and maps are in it, not in metres. Images are used as
+they are stored, as COLMAP does, and its pixel centres are at +0.5 like ours. An image that was resized after the
+reconstruction has its camera scaled. COLMAP records no times: a sequence is in the order of the names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera_sources import Raster
+from bidnerf_core.datasets.colmap_files import ModelImage, has_posed_images, read_posed_images
+from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.sequence import FrameSequence
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.orientation import UPRIGHT
+from bidnerf_core.photos import natural_order
+from bidnerf_core.se3 import SE3
+
+MODELS = ("sparse/0", "sparse", ".")
+"""Where a model may be, in this order; of several models COLMAP writes the first one to ``sparse/0``."""
+IMAGES = ("images", ".")
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapFrame:
+    """A registered image."""
+
+    name: PurePosixPath  # below the folder of images
+    image: Path
+    camera: Intrinsics
+    T_world_camera: SE3  # in units of the model
+
+    time = None
+
+    @property
+    def stem(self) -> str:
+        return self.name.stem
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return (*self.name.parts[:-1], self.stem)
+
+
+class ColmapReader:
+    """The reader of folders of COLMAP projects."""
+
+    expected = "images with a sparse model in sparse/0 (COLMAP)"
+
+    def recognises(self, path: Path) -> bool:
+        return _model_of(path) is not None
+
+    def open(self, path: Path, background: Background | None) -> Dataset:
+        """Read the model. Raises ``InputError`` where it is damaged or has no registered image."""
+        return self._open(path, background)
+
+    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+        return self._open(path, background).sequence()
+
+    def _open(self, path: Path, background: Background | None) -> ColmapDataset:
+        model = _model_of(path)
+        assert model is not None  # recognises saw to it
+        return ColmapDataset(Splits(path, hold_out(_frames(path, model))), background)
+
+
+class ColmapDataset(SplitDataset[ColmapFrame]):
+    """Views of a COLMAP project; see ``Dataset``."""
+
+    def __init__(self, frames: Splits[ColmapFrame], background: Background | None) -> None:
+        super().__init__(frames)
+        self._background = background_colour("black" if background is None else background)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The requested colour, or black: photos have no alpha channel."""
+        return self._background
+
+    def _view(self, frame: ColmapFrame, name: str) -> View:
+        header = read_header(frame.image)
+        camera = Raster(header.width, header.height, UPRIGHT).upright(frame.camera)
+        if camera is None:
+            raise InputError(
+                f"{frame.image}: image is {header.width}x{header.height}, its camera in the model "
+                f"{frame.camera.width}x{frame.camera.height}; expected the same aspect ratio"
+            )
+        colour, alpha = read_image(frame.image)
+        return View(
+            Frame(name, over(colour, alpha, self._background), camera, None, alpha), frame.T_world_camera
+        )
+
+
+def _model_of(path: Path) -> Path | None:
+    return next((path / place for place in MODELS if has_posed_images(path / place)), None)
+
+
+def _frames(path: Path, model: Path) -> list[ColmapFrame]:
+    images, cameras = read_posed_images(model)
+    if not images:
+        raise InputError(f"{model}: has no registered image, expected a model with one or more")
+    folder = next(path / place for place in IMAGES if (path / place).is_dir())
+    frames = [_frame(model, folder, image, cameras) for image in images]
+    frames.sort(key=lambda frame: natural_order(str(frame.name)))
+    for frame, following in pairwise(frames):
+        if frame.name == following.name:
+            raise InputError(f"{model}: image {frame.name} is registered twice, expected each once")
+    return frames
+
+
+def _frame(model: Path, folder: Path, image: ModelImage, cameras: dict[int, Intrinsics]) -> ColmapFrame:
+    if image.camera not in cameras:
+        raise InputError(f"{model}: image {image.name!r} has the camera {image.camera}, which cameras lacks")
+    name = PurePosixPath(image.name.replace("\\", "/"))
+    if not (folder / name).is_file():
+        raise InputError(f"{folder / name}: no such file, expected it as {model} has that image")
+    return ColmapFrame(name, folder / name, cameras[image.camera], image.T_camera_model.inverse())
