@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization.auto import AutoConfig
 from bidnerf_core.localization.localizer import Localizer, Start, start_pose
@@ -57,15 +55,16 @@ class Tracker:
     """
 
     def __init__(
-        self, localizer: Localizer, config: TrackerConfig = TrackerConfig(), start: Start | None = None
+        self, localizer: Localizer, config: TrackerConfig | None = None, start: Start | None = None
     ) -> None:
         """Track in the map of ``localizer``. ``start`` is a guess at T_world_camera of the first frame."""
+        config = TrackerConfig() if config is None else config
         self.localizer, self.config = localizer, config
         self._state = TrackerState(Clock(None, config.frame_seconds))
         self._start = None if start is None else start_pose(start)
         scene = localizer.map
         self._by_landmarks: ByLandmarks | None = None
-        if uses_landmarks(localizer):
+        if uses_landmarks(localizer) and localizer.matcher is not None:
             detector = LandmarkDetector(localizer.matcher.landmarks, Sift(count=config.keypoints))
             self._by_landmarks = ByLandmarks(scene, detector, config)
         self._odometry = Odometry(config.points)
@@ -109,7 +108,9 @@ class Tracker:
         """Continue where the tracker that wrote the file was. Raises ``InputError`` for another map's file, or a damaged one."""
         self._state = load_state(Path(path), self._key)
 
-    def _begun(self, frame: Frame, image: Grey | None, state: TrackerState) -> tuple[Localization, TrackerState]:
+    def _begun(
+        self, frame: Frame, image: Grey | None, state: TrackerState
+    ) -> tuple[Localization, TrackerState]:
         """Find the first pose of the sequence: around the start, if there is one, or by a search."""
         if self._start is not None and state.frames == 1:
             motion = self._at_start(frame, self._start)
@@ -139,13 +140,20 @@ class Tracker:
             return self._accepted(frame, image, measured, predicted)
         if state.lost:
             found = relocalized(
-                self.localizer, frame, predicted.T_world_camera, state.lost, self.config.patience, state.frames
+                self.localizer,
+                frame,
+                predicted.T_world_camera,
+                state.lost,
+                self.config.patience,
+                state.frames,
             )
             if found is not None and found.converged:
                 return self._found(frame, image, state, found)
         state = self._adrift(frame, image, state, points, predicted)
         verdict = NOTHING_SEEN if measured is None else measured.verdict
-        reason = f"lost for {state.lost} frame{'s' if state.lost > 1 else ''}, bridged by {how}: {verdict.reason}"
+        reason = (
+            f"lost for {state.lost} frame{'s' if state.lost > 1 else ''}, bridged by {how}: {verdict.reason}"
+        )
         return _localization(predicted, Verdict(verdict.outcome, reason), predicted, 1.0), state
 
     def _by_odometry(
@@ -183,7 +191,9 @@ class Tracker:
         self, frame: Frame, image: Grey | None, measured: Measurement, predicted: Motion
     ) -> tuple[Localization, TrackerState]:
         """Fuse an accepted pose with the prediction, unless the camera moved in a way that no prediction could foresee."""
-        motion = replace(predicted, reach=self._reach(frame, measured.state.points, measured.pose.T_world_camera))
+        motion = replace(
+            predicted, reach=self._reach(frame, measured.state.points, measured.pose.T_world_camera)
+        )
         if predicted.distance(measured.pose) > UNFORESEEN:
             motion = Motion.at(measured.pose, motion.reach)
         else:
@@ -248,7 +258,9 @@ class Tracker:
     ) -> float:
         """Return the distance (metres) to what the camera sees."""
         if points is not None and T_world_camera is not None and len(points):
-            return float(torch.linalg.vector_norm(points.positions - T_world_camera.translation, dim=-1).median())
+            return float(
+                torch.linalg.vector_norm(points.positions - T_world_camera.translation, dim=-1).median()
+            )
         if has_points(frame):
             assert frame.depth is not None
             return float(frame.depth[frame.depth > 0].median())

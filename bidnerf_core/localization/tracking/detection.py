@@ -76,7 +76,9 @@ class LandmarkDetector:
             T, noise = found.T_world_camera, found.fit.noise
         assert found is not None
         evidence = self._evidence(image, near, found, tight, most_distance)
-        usual = _usual_distance(image, near, matches[found.inliers]) if bool(found.inliers.any()) else math.inf
+        usual = (
+            _usual_distance(image, near, matches[found.inliers]) if bool(found.inliers.any()) else math.inf
+        )
         followed = replace(points, landmark=number[points.landmark])
         return Recognized(followed, found, evidence, usual)
 

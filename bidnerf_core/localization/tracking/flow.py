@@ -54,7 +54,7 @@ def flow(
 
 def corners(image: Grey, count: int, apart: float) -> Float[Tensor, "n 2"]:
     """Return up to ``count`` corners (u, v), at least ``apart`` pixels from each other (Shi and Tomasi 1994)."""
-    found = cv2.goodFeaturesToTrack(image, count, 0.01, apart)
+    found: np.ndarray | None = cv2.goodFeaturesToTrack(image, count, 0.01, apart)
     if found is None:
         return torch.zeros((0, 2))
     return torch.from_numpy(found.reshape(-1, 2) + FIRST_CENTRE)

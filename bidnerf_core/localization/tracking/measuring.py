@@ -194,9 +194,7 @@ def by_surface(
     here = replace(here, T_world_camera=found.T_world_camera)
     window = (*state.window, here)[-(config.window - 1) :] if config.window > 1 else ()
     covariance = found.covariance
-    pose = PoseEstimate(
-        found.T_world_camera, (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance
-    )
+    pose = PoseEstimate(found.T_world_camera, (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance)
     loss = 1 - found.diagnostics.colour_inliers
     return Measurement(pose, found.diagnostics.verdict(), loss, replace(state, window=window))
 
@@ -218,9 +216,7 @@ def by_colour(
     return Measurement(pose, answer.verdict, answer.refined.loss, state)
 
 
-def determined(
-    verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float
-) -> Verdict:
+def determined(verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float) -> Verdict:
     """Return the verdict, or that the pose is not determined where its covariance is large."""
     translation, rotation = (float(part.max().sqrt()) for part in covariance.diagonal().split(3))
     if not verdict.accepted or (translation <= DETERMINED[0] * extent and rotation <= DETERMINED[1]):

@@ -47,8 +47,13 @@ class FollowedPoints:
     def of_landmarks(
         landmarks: LandmarkMap, number: Int[Tensor, "m"], pixels: Float[Tensor, "m 2"]
     ) -> FollowedPoints:
-        parts = (landmarks.positions, landmarks.deviations, landmarks.directions)
-        return FollowedPoints(pixels, *(part[number].double() for part in parts), number)
+        return FollowedPoints(
+            pixels,
+            landmarks.positions[number].double(),
+            landmarks.deviations[number].double(),
+            landmarks.directions[number].double(),
+            number,
+        )
 
     def __len__(self) -> int:
         return len(self.pixels)

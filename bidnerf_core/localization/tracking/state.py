@@ -106,8 +106,8 @@ def _read(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
 def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
     motion = None
     if numbers["reach"] is not None:
-        parts = [tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias")]
-        motion = Motion(_pose("motion", tensors), *parts, numbers["reach"])
+        velocity, noise, bias = (tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias"))
+        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers["reach"])
     window = tuple(
         CloudInCamera(
             PointCloud(*(tensors[f"window.{number}.{name}"] for name in CLOUD)),
