@@ -23,6 +23,7 @@ from bidnerf_core.localization.tracking.measuring import (
     by_surface,
     determined,
     followed,
+    is_vague,
 )
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
 from bidnerf_core.localization.tracking.odometry import Odometry
@@ -138,7 +139,7 @@ class Tracker:
         measured = self._measured(frame, image, state, points, predicted)
         if measured is not None and measured.verdict.accepted:
             return self._accepted(frame, image, measured, predicted)
-        if state.lost:
+        if state.lost or is_vague(predicted, frame.intrinsics):
             found = relocalized(
                 self.localizer,
                 frame,

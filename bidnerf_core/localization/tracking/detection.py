@@ -15,13 +15,19 @@ from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, query_image
 from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches
 from bidnerf_core.localization.search.landmarks import LOOSE, THRESHOLD, LandmarkPose
+from bidnerf_core.localization.search.matching import EXACT, LandmarkMatcher
+from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
 from bidnerf_core.mapping.features import Features, paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.se3 import SE3
 
-NEARBY = 5000
+NEARBY = EXACT
 """Largest number of landmarks that are compared with an image: those that most images of the map saw."""
+WIDE = 2.0
+"""Multiple of the radius of guided matching from which on keypoints are compared with all landmarks in view. Guided matching
+compares a keypoint with the few landmarks that project nearest to it, which suits predictions that are off by little.
+"""
 CELLS = 8
 """Cells along each axis of the grid over which the matches of an image should spread."""
 LEAST_CHANCE = 0.5
@@ -68,7 +74,10 @@ class LandmarkDetector:
         near, threshold = self.landmarks[number], pixel_threshold(frame.intrinsics)
         tight, T, found = 1.5 * threshold, T_world_camera, None
         for reach in (radius, tight) if radius > tight else (tight,):
-            matches = guided_matches([image], near, T, reach, most_distance)
+            if reach > WIDE * tight:
+                matches = _matches_within([image], near, T, reach)
+            else:
+                matches = guided_matches([image], near, T, reach, most_distance)
             points = _points(near, image, matches)
             found = fit_pose(points.observed(frame), T, noise, threshold)
             if found is None:
@@ -172,6 +181,17 @@ def well_spread(pixels: Float[Tensor, "m 2"], camera: Intrinsics, most: int) -> 
 
 def _points(near: LandmarkMap, image: QueryImage, matches: LandmarkMatches) -> FollowedPoints:
     return FollowedPoints.of_landmarks(near, matches.landmark, image.keypoints.pixels[matches.keypoint])
+
+
+def _matches_within(
+    images: list[QueryImage], near: LandmarkMap, T_world_camera: SE3, radius: float
+) -> LandmarkMatches:
+    """Return the matches by descriptors, least ambiguous first, whose landmarks project within ``radius`` pixels."""
+    (image,) = images
+    matches = unguided_matches(images, LandmarkMatcher(near))
+    local = T_world_camera.inverse().to(torch.float32).apply(near.positions[matches.landmark])
+    off = (local[:, :2] / local[:, 2:] - image.rays[matches.keypoint, :2]) * image.focal
+    return matches[(local[:, 2] > 0) & (off.square().sum(-1) <= radius**2)]
 
 
 def _usual_distance(image: QueryImage, near: LandmarkMap, matches: LandmarkMatches) -> float:

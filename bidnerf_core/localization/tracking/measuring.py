@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
@@ -42,7 +43,7 @@ from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
-WIDEST = 0.12
+WIDEST = 0.4
 """Largest radius, as a share of the image's diagonal, within which landmarks are sought around their prediction."""
 SIGMAS = 3.0
 """The radius in standard deviations of the prediction."""
@@ -131,7 +132,7 @@ class ByLandmarks:
             T, radius = judged[0].T_world_camera, least
         else:
             T = predicted.T_world_camera
-            radius = max(least, SIGMAS * pixel_radius(predicted.covariance, camera.fx, predicted.reach))
+            radius = max(least, search_radius(predicted, camera))
             if radius > most:
                 return None
         seen = self.detector(frame, T, radius, state.usual_distance, state.noise)
@@ -176,6 +177,16 @@ class ByLandmarks:
             weight = DEPTH_SCALE_PRIOR**2 / (DEPTH_SCALE_PRIOR**2 + 0.01**2)
             scale = 1 + weight * (found.depth_scale - 1)
         return measured_cloud(frame, self.config.depth_points, scale, Generator().manual_seed(seed))
+
+
+def search_radius(predicted: Motion, camera: Intrinsics) -> float:
+    """Return the radius (pixels) around its prediction within which a landmark most likely appears."""
+    return SIGMAS * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
+
+
+def is_vague(predicted: Motion, camera: Intrinsics) -> bool:
+    """Return whether a prediction, such as that after a gap, says too little about where landmarks appear."""
+    return search_radius(predicted, camera) > WIDEST * math.hypot(camera.width, camera.height)
 
 
 def by_surface(
