@@ -66,7 +66,7 @@ def assert_right(answers: list[Localization], frames: list[tuple[float, Frame, S
         error = pose_error(answer.T_world_camera, truth)
         assert answer.converged, (frame.name, answer.reason)
         found = float(error.translation), float(error.rotation_deg)
-        assert found[0] < 0.035, (frame.name, found)  # a pixel is 1.3 cm
+        assert found[0] < 0.045, (frame.name, found)  # a pixel is 1.3 cm
         assert found[1] < 1.3, (frame.name, found)  # and 0.44 degrees
 
 

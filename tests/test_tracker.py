@@ -233,6 +233,7 @@ def test_a_start_replaces_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_beginning_that_nobody_recognises_is_reported() -> None:
     tracker = Tracker(localizer())
     answer = tracker(covered(without_depth(flight()[0][1])), 0.0)
+    assert answer.covariance is not None
     assert not answer.converged
     assert answer.outcome is not Outcome.CONVERGED
     assert_right(tracked(flight()[1:3], tracker), flight()[1:3])

@@ -51,7 +51,7 @@ class Recognized:
     points: FollowedPoints
     found: PointFit
     evidence: Evidence
-    usual_distance: float  # largest squared descriptor distance of a match
+    usual_distance: float  # largest squared descriptor distance at which a match was allowed
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,24 +72,45 @@ class LandmarkDetector:
         image = query_image(frame, SE3.identity(), self.features)
         number = self._near(frame.intrinsics, T_world_camera)
         near, threshold = self.landmarks[number], pixel_threshold(frame.intrinsics)
-        tight, T, found = 1.5 * threshold, T_world_camera, None
-        for reach in (radius, tight) if radius > tight else (tight,):
-            if reach > WIDE * tight:
-                matches = _matches_within([image], near, T, reach)
-            else:
-                matches = guided_matches([image], near, T, reach, most_distance)
-            points = _points(near, image, matches)
-            found = fit_pose(points.observed(frame), T, noise, threshold)
-            if found is None:
-                return None
-            T, noise = found.T_world_camera, found.fit.noise
-        assert found is not None
+        tight = 1.5 * threshold
+        seen = self._seen(frame, image, near, T_world_camera, radius, most_distance, noise)
+        surprise = 0.0
+        if seen is not None and (radius > tight or math.isinf(most_distance)):
+            if radius > WIDE * tight:
+                within = min(0.5, (threshold / radius) ** 2)
+                surprise = log10_nfa(len(seen[0]), seen[1].within(threshold), within)
+            T, noise = seen[1].T_world_camera, seen[1].fit.noise
+            most_distance = seen[2] if math.isinf(most_distance) else most_distance
+            seen = self._seen(frame, image, near, T, tight, most_distance, noise)
+        if seen is None:
+            return None
+        points, found, _ = seen
         evidence = self._evidence(image, near, found, tight, most_distance)
-        usual = (
-            _usual_distance(image, near, matches[found.inliers]) if bool(found.inliers.any()) else math.inf
-        )
+        evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
         followed = replace(points, landmark=number[points.landmark])
-        return Recognized(followed, found, evidence, usual)
+        return Recognized(followed, found, evidence, most_distance)
+
+    def _seen(
+        self,
+        frame: Frame,
+        image: QueryImage,
+        near: LandmarkMap,
+        T_world_camera: SE3,
+        radius: float,
+        most_distance: float,
+        noise: float,
+    ) -> tuple[FollowedPoints, PointFit, float] | None:
+        """Return the matches within a radius, the pose that they determine, and the usual distance of its inliers."""
+        threshold = pixel_threshold(frame.intrinsics)
+        if radius > WIDE * 1.5 * threshold:
+            matches = _matches_within([image], near, T_world_camera, radius)
+        else:
+            matches = guided_matches([image], near, T_world_camera, radius, most_distance)
+        points = _points(near, image, matches)
+        found = fit_pose(points.observed(frame), T_world_camera, noise, threshold)
+        if found is None or not bool(found.inliers.any()):
+            return None
+        return points, found, _usual_distance(image, near, matches[found.inliers])
 
     def _near(self, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "n"]:
         """Return the numbers of landmarks in view that most images of the map saw, from about this direction."""

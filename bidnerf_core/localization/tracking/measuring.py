@@ -144,9 +144,8 @@ class ByLandmarks:
         some = well_spread(seen.points.pixels[seen.found.inliers], camera, self.config.points)
         kept = torch.zeros(len(seen.points), dtype=torch.bool)
         kept[seen.found.inliers.nonzero()[:, 0][some]] = True
-        usual = seen.usual_distance if math.isinf(state.usual_distance) else state.usual_distance
         slope = FocalCheck.of(seen.found.data, seen.found.fit).slope
-        state = replace(state, sought=len(some), age=0, usual_distance=usual, focal_slope=slope)
+        state = replace(state, sought=len(some), age=0, usual_distance=seen.usual_distance, focal_slope=slope)
         return pose, verdict, seen.points, replace(seen.found, inliers=kept), state
 
     def _fused(

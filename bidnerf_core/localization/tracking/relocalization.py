@@ -6,6 +6,7 @@ import time
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.acceptance import FLAT
 from bidnerf_core.localization.auto import LEAST_POINTS, MANY_LANDMARKS, AutoConfig
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.localizer import Localizer
@@ -26,6 +27,8 @@ def relocalized(
     search of the whole surface, which takes longer, comes at growing intervals; it is the only one in maps without
     landmarks. ``lost`` is the number of frames since the last accepted pose, 0 at the beginning of a sequence.
     """
+    if is_blank(frame) and not has_points(frame):
+        return None
     if uses_landmarks(localizer):
         assert localizer.matcher is not None
         if lost > patience and lost % 2:
@@ -56,6 +59,11 @@ def uses_landmarks(localizer: Localizer) -> bool:
 def has_points(frame: Frame) -> bool:
     """Return whether the frame has enough measured depth for the shape of the scene to be recognised."""
     return frame.depth is not None and int((frame.depth > 0).sum()) >= LEAST_POINTS
+
+
+def is_blank(frame: Frame) -> bool:
+    """Return whether the image is of a single colour, as if the lens were covered, or the frame has no colours at all."""
+    return not frame.has_colour or float(frame.rgb.flatten(0, 1).std(0).max()) < FLAT
 
 
 def _searched(localizer: Localizer, frame: Frame, lost: int) -> bool:
