@@ -133,7 +133,7 @@ def test_an_interrupted_run_keeps_what_it_has(
 def lines(data: Path) -> list[dict[str, Any]]:
     written = json.loads((data / "transforms_test.json").read_text())
     unit = (written | written["frames"][0])["depth_unit_scale_factor"]
-    photos, depths = (sorted((data / kind).glob("*.png")) for kind in ("images", "depth"))
+    photos, depths = (sorted((data / kind).rglob("*.png")) for kind in ("images", "depth"))
     return [
         {"image": str(photo), "depth": str(depth), "time": 0.1 * n, "depth_unit": unit}
         for n, (photo, depth) in enumerate(zip(photos, depths, strict=True))
