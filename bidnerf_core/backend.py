@@ -29,7 +29,7 @@ class Backend(Protocol):
         ...
 
     def build(self, config: Any, bounds: SceneBounds) -> RadianceField:
-        """Return an untrained field: an ``nn.Module`` with ``query`` and ``sampler``, of which the ``state_dict`` is saved."""
+        """Return an untrained field: an ``nn.Module`` with ``query`` and ``sampler``. Its ``state_dict`` is saved."""
         ...
 
     def train(self, field: RadianceField, views: Sequence[View], config: Any, report: Report) -> None:

@@ -27,7 +27,10 @@ SPIKE, SPIKE_PIXELS = 0.05, 20
 NEAREST_LIMIT, LIMIT_STEP = 4.0, 0.5
 """... if that is a round number: a multiple of 0.5 m, as ranges are set and data sheets have them, from 4 m on ..."""
 LARGEST_OF_BITS = tuple(2**bits - 1 for bits in range(11, 17))
-"""... or all bits of a sensor of 11 to 16. A wall that faces the camera has one depth as well, but not a round one."""
+"""... or all bits of a sensor of 11 to 16 ..."""
+STANDS_OUT = 4
+"""... and is so many times as frequent as any other. Walls that face the camera have one depth as well, but rarely a round
+one, and images of flat pieces have several."""
 SATURATED = np.iinfo(np.uint16).max
 """A 16-bit sensor writes this for "too far" or "nothing"; 65.535 once it is converted to metres."""
 
@@ -78,7 +81,7 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     Values that no sensor measures become 0: NaN, infinite, negative, the largest of an integer type, 65535 and 65.535 of a
     floating-point one, and floats of more than 1e9 m (1e10, the largest float). So does the largest value of the image
     where it is a sensor's limit: a round number (``LIMIT_STEP``, ``LARGEST_OF_BITS``) in a twentieth of all pixels or more,
-    but not in all that were measured. Raises ``InputError``, which begins with ``what``, for arrays of another shape or type
+    far more frequent than any other, but not all that was measured. Raises ``InputError``, which begins with ``what``, for arrays of another shape or type
     and a unit that is not positive.
     """
     values = to_numpy(raw)
@@ -133,11 +136,10 @@ def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) ->
     steps = round(largest / LIMIT_STEP)
     is_round = largest >= NEAREST_LIMIT and abs(largest - steps * LIMIT_STEP) < 1e-6 * largest
     fills_bits = values.dtype.kind != "f" and int(values[mask][0]) in LARGEST_OF_BITS
-    if (
-        count < max(SPIKE * values.size, SPIKE_PIXELS)
-        or count == measured.size
-        or not (is_round or fills_bits)
-    ):
+    if count < max(SPIKE * values.size, SPIKE_PIXELS) or not (is_round or fills_bits):
+        return {}
+    _, others = np.unique(measured[measured < largest], return_counts=True)
+    if not others.size or count < STANDS_OUT * others.max():
         return {}
     return {f"{float(values[mask][0]):g} (the sensor's limit)": mask}
 

@@ -65,13 +65,17 @@ class RadianceField(Protocol):
     def sampler(self) -> RaySampler: ...
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Return density and colour at ``positions`` (metres, world) seen along unit ``directions``; there may be no points."""
+        """Return density and colour at ``positions`` (metres, world; possibly none) seen along unit ``directions``."""
         ...
 
 
 def levels(field: RadianceField) -> tuple[RadianceField, ...]:
     """Return the field's levels of detail, coarsest first; a field that offers none is its own only level."""
     return tuple(getattr(field, "levels", None) or (field,))
+
+
+LARGEST_LENGTH = 1e15
+"""Metres. Squares of larger lengths come close to the largest number of single precision."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,11 @@ class SceneBounds:
             )
         if not 0 <= self.near < self.far:
             raise InputError(f"scene bounds: expected 0 <= near < far, got near {self.near}, far {self.far}")
+        largest = max(map(abs, (*self.lower, *self.upper, self.far)))
+        if not largest <= LARGEST_LENGTH:
+            raise InputError(
+                f"scene bounds: {largest:g} m is too large, expected at most {LARGEST_LENGTH:g} m"
+            )
 
     @property
     def size(self) -> tuple[float, float, float]:
@@ -115,6 +124,6 @@ class SceneBounds:
 
 
 def widened(rays: Rays, factor: float) -> Rays:
-    """Return the rays with an interval ``factor`` times as long about its middle, but not behind the camera (the paper's "wide")."""
+    """Return rays whose interval is ``factor`` times as long (the paper's "wide"), but does not begin behind the camera."""
     middle, half = (rays.near + rays.far) / 2, (rays.far - rays.near) / 2 * factor
     return replace(rays, near=(middle - half).clamp(min=0), far=middle + half)

@@ -32,8 +32,8 @@ GROUP = "bidnerf.backends"
 
 AnyDistribution: TypeAlias = Any
 AnyEntryPoint: TypeAlias = Any
-"""Types of ``importlib.metadata``, left open: once anything imports the backport ``importlib_metadata``, look-ups return classes
-of its own, which are no subclasses of the standard library's."""
+"""Types of ``importlib.metadata``, left open: once anything imports the backport ``importlib_metadata``, look-ups return
+classes of its own, which are no subclasses of the standard library's."""
 
 UNREADABLE = "?"
 """Stands for the name of entry points that cannot be read."""

@@ -34,7 +34,7 @@ class RenderedImage:
 
 
 def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
-    """Return the field's values at the samples (*r s). Where a sample is not valid, the field is not queried and density is 0."""
+    """Return the field's values at the samples (*r s). At samples that are not valid, it is not queried; density is 0."""
     valid = samples.valid
     positions = rays.at(samples.middles)
     directions = rays.directions[..., None, :].expand_as(positions)

@@ -52,7 +52,7 @@ def depth_residual(
 
     With ``miss`` (metres) it is ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``: what passes through the scene counts as if
     it met something ``miss`` too far. The paper's ``sum_i w_i t_i - d`` leaps by the whole distance at every silhouette,
-    and second-order steps need derivatives that lead somewhere.
+    where its derivative is of no use to second-order steps.
     """
     if miss is None:
         return rendering.distance - observed.distance

@@ -33,7 +33,7 @@ class SE3:
 
     @staticmethod
     def from_matrix(matrix: Float[Tensor, "*b 4 4"]) -> SE3:
-        """Take a homogeneous matrix at its word; ``is_rigid`` tells whether that was wise."""
+        """Return the transform of a homogeneous matrix, which is not checked; ``is_rigid`` does that."""
         return SE3(matrix[..., :3, :3], matrix[..., :3, 3])
 
     @staticmethod

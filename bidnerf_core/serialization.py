@@ -45,7 +45,7 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
         )
     _check_keys(kind, value, where)
     hints = typing.get_type_hints(kind)
-    fields = {key: _converted(hints[key], item, f"{where}: {key}") for key, item in value.items()}
+    fields = {key: converted(hints[key], item, f"{where}: {key}") for key, item in value.items()}
     try:
         return kind(**fields)
     except (TypeError, ValueError) as error:
@@ -70,8 +70,8 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
     return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
-def _converted(kind: Any, value: Any, where: str) -> Any:
-    """Convert ``value``, as read from JSON, to the type ``kind``."""
+def converted(kind: Any, value: Any, where: str) -> Any:
+    """Convert ``value``, as read from JSON, to the type ``kind``. Errors begin with ``where``."""
     origin, arguments = typing.get_origin(kind) or kind, typing.get_args(kind)
     if kind is Any or (origin is typing.Literal and value in arguments):
         return value
@@ -82,10 +82,10 @@ def _converted(kind: Any, value: Any, where: str) -> Any:
     if origin in (tuple, list) and isinstance(value, list | tuple):
         kinds = _kinds_of_items(origin, arguments, len(value))
         if len(kinds) == len(value):
-            return origin(_converted(k, v, where) for k, v in zip(kinds, value, strict=True))
+            return origin(converted(k, v, where) for k, v in zip(kinds, value, strict=True))
     elif origin is dict and isinstance(value, dict):
         inner = arguments[1] if arguments else Any
-        return {key: _converted(inner, item, f"{where}.{key}") for key, item in value.items()}
+        return {key: converted(inner, item, f"{where}.{key}") for key, item in value.items()}
     elif kind is float and type(value) in (int, float):
         if abs(value) <= LARGEST_NUMBER:
             return float(value)
@@ -105,7 +105,7 @@ def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
         kinds, key=lambda kind: type(value) is not kind
     ):  # an exact fit goes first: 1 is an int
         try:
-            return _converted(kind, value, where)
+            return converted(kind, value, where)
         except InputError:
             continue
     raise InputError(f"{where}: found {_shown(value)}, expected {' or '.join(map(_name, kinds))}")

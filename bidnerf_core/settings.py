@@ -14,10 +14,10 @@ import math
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.serialization import converted, to_plain
 
 S = TypeVar("S")
 
@@ -139,16 +139,22 @@ def from_flat(kind: type[S], values: dict[str, Any], where: str, renamed: dict[s
             near = difflib.get_close_matches(name, known, n=1)
             hint = f", did you mean {near[0]!r}?" if near else f", expected some of {', '.join(known)}"
             raise InputError(f"{where}: {kind.__name__} has no setting {name!r}{hint}")
-    return from_plain(kind, _nested(default, given), where)
+    return _with_values(default, given, where)
 
 
-def _nested(default: Any, flat: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of ``flat``, else those of ``default``, in the groups in which the settings are declared."""
-    nested: dict[str, Any] = {}
-    for field in dataclasses.fields(default):
+def _with_values(default: S, flat: dict[str, Any], where: str) -> S:
+    """Return the settings ``default`` with the values of ``flat``, in whatever group each of them is declared."""
+    kind: Any = type(default)
+    hints, values = typing.get_type_hints(kind), dict[str, Any]()
+    for field in dataclasses.fields(kind):
         value = getattr(default, field.name)
         if dataclasses.is_dataclass(value):
-            nested[field.name] = _nested(value, flat)
+            values[field.name] = _with_values(value, flat, where)
+        elif field.name in flat:
+            values[field.name] = converted(hints[field.name], flat[field.name], f"{where}: {field.name}")
         else:
-            nested[field.name] = flat.get(field.name, to_plain(value, field.name))
-    return nested
+            values[field.name] = value
+    try:
+        return cast(S, kind(**values))
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from error

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 from safetensors.torch import save as tensors_to_bytes
@@ -43,6 +43,9 @@ OURS = re.compile(rf"{TENSORS}|\.({TENSORS}|map\.json)\.[0-9a-f]{{8}}")
 """Names of files that a save may leave behind; other files in the folder are never removed."""
 
 
+LandmarkSource = Literal["photos", "rendered images"]
+
+
 @dataclass(frozen=True)
 class StoredCamera:
     """Camera and pose of a training image, from which the scene is known to be visible."""
@@ -68,7 +71,8 @@ class MapInfo:
     weights: str = ""  # file names
     training: str | None = None  # what resuming needs; dropped when training is complete
     surface: str | None = None  # baked from these weights
-    landmarks: str | None = None  # of the training images
+    landmarks: str | None = None
+    landmark_source: LandmarkSource | None = None  # what they were built from, where that is recorded
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
@@ -122,7 +126,13 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
     training = None if info.complete else f"training-{name}"
     info = replace(
-        info, weights=f"weights-{name}", training=training, surface=None, landmarks=None, colour_noise=None
+        info,
+        weights=f"weights-{name}",
+        training=training,
+        surface=None,
+        landmarks=None,
+        landmark_source=None,
+        colour_noise=None,
     )
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     folder.mkdir(parents=True, exist_ok=True)
@@ -145,17 +155,20 @@ def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
 
 
 def save_landmarks(
-    folder: Path, of: MapInfo, landmarks: LandmarkMap, colour_noise: float | None = None
-) -> MapInfo:
+    folder: Path, of: MapInfo, landmarks: LandmarkMap, colour_noise: float | None = None,
+    source: LandmarkSource = "photos",
+) -> MapInfo:  # fmt: skip
     """Add landmarks to map ``of``, in place of those that it had, and how well the field renders its training images.
 
-    Raises ``InputError`` where another training has replaced that map meanwhile.
+    ``source`` says which images the landmarks were built from. Raises ``InputError`` where another training has replaced
+    that map meanwhile.
     """
-    return _save_part(folder, of, "landmarks", landmark_tensors(landmarks), colour_noise=colour_noise)
+    tensors = landmark_tensors(landmarks)
+    return _save_part(folder, of, "landmarks", tensors, colour_noise=colour_noise, landmark_source=source)
 
 
 def _save_part(
-    folder: Path, of: MapInfo, part: str, tensors: dict[str, Tensor], **facts: float | None
+    folder: Path, of: MapInfo, part: str, tensors: dict[str, Tensor], **facts: float | str | None
 ) -> MapInfo:
     """Add a file of tensors to a map under the name of a part of its description."""
     if load_info(folder).weights != of.weights:
@@ -180,7 +193,7 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
 
 
 def load_info(folder: Path) -> MapInfo:
-    """Return the checked content of ``map.json``. Raises ``InputError`` where it describes no map, or one of another version."""
+    """Return the checked content of ``map.json``. Raises ``InputError`` where it describes no map of this version."""
     path = folder / DESCRIPTION
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
@@ -201,14 +214,20 @@ def load_info(folder: Path) -> MapInfo:
     for name in (info.weights, info.training, info.surface, info.landmarks):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
+    for camera in info.cameras:
+        rows = camera.T_world_camera
+        if len(rows) != 4 or not bool(SE3.from_matrix(torch.tensor(rows).double()).is_rigid()):
+            raise InputError(
+                f"{path}: pose of camera {camera.name!r} is not a rigid transform, expected 4x4 rows"
+            )
     return info
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
-    """Return the map in ``folder``, its field built by its backend and frozen, on ``device``; what was baked stays on the CPU.
+    """Return the map in ``folder``, its field built by its backend, frozen, and on ``device``.
 
-    ``baked``: whether to read the surface and the landmarks as well. Raises ``InputError`` where the folder is no map, or a
-    damaged one.
+    The surface and the landmarks stay on the CPU; ``baked`` says whether to read them. Raises ``InputError`` where the
+    folder is no map, or a damaged one.
     """
     folder = Path(folder)
     info, tensors, surface, landmarks = _read(folder, baked)
@@ -223,6 +242,11 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
 def load_surface(path: Path) -> SurfaceMap:
     """Raises ``InputError`` where the file does not hold what ``surface_tensors`` gives."""
     return load_part(path, surface_from_tensors, "a baked surface")
+
+
+def load_landmarks(path: Path) -> LandmarkMap:
+    """Raises ``InputError`` where the file does not hold what ``landmark_tensors`` gives."""
+    return load_part(path, landmarks_from_tensors, "landmarks")
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
@@ -243,9 +267,7 @@ def _read(
         try:
             weights = read_tensors(folder / info.weights)
             surface = load_surface(folder / info.surface) if baked and info.surface else None
-            landmarks = None
-            if baked and info.landmarks:
-                landmarks = load_part(folder / info.landmarks, landmarks_from_tensors, "landmarks")
+            landmarks = load_landmarks(folder / info.landmarks) if baked and info.landmarks else None
             return info, weights, surface, landmarks
         except InputError:
             before, info = info, load_info(folder)

@@ -45,12 +45,18 @@ def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) 
         if tensors[name].shape != value.shape:
             found, wanted = list(tensors[name].shape), list(value.shape)
             raise InputError(f"{path}: tensor {name!r} has shape {found}, expected {wanted}")
+        if tensors[name].is_floating_point() != value.is_floating_point():
+            kinds = (str(kind).removeprefix("torch.") for kind in (tensors[name].dtype, value.dtype))
+            raise InputError(f"{path}: tensor {name!r} is of {next(kinds)}, expected {next(kinds)}")
     surplus = sorted(tensors.keys() - expected.keys())
     if surplus:
         raise InputError(f"{path}: tensor {surplus[0]!r} is not part of the field that map.json describes")
     for name, _ in module.named_parameters():
         if name in tensors and not bool(tensors[name].isfinite().all()):
             raise InputError(f"{path}: tensor {name!r} holds NaN or infinity, expected finite numbers")
+    for name, _ in module.named_buffers():
+        if name in tensors and bool(tensors[name].isnan().any()):
+            raise InputError(f"{path}: tensor {name!r} holds NaN, expected numbers")
 
 
 def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

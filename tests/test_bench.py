@@ -20,13 +20,13 @@ import torch
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.arcs import arc, mean_up, seen_middle, turned_about
 from bidnerf_core.evaluation.bench import InThisProcess, Plan, planned, run_trials, shard_of
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import read_runs, write_record
 from bidnerf_core.evaluation.results import ResultsFile, read_results, result_line
-from bidnerf_core.evaluation.sequences import mean_up, seen_middle, sequence, turned_about
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.localization import METHODS
@@ -118,12 +118,12 @@ def test_what_cannot_be_planned_is_refused(change: dict[str, Any], said: str) ->
 
 def test_a_sequence_goes_round_the_object_in_equal_steps() -> None:
     poses = [look_at((4 * c, 4 * s, 2.0), (0.0, 0.0, 0.0)) for c, s in _circle(24)]
-    places = sequence(poses, 5, 4, 15.0)
+    places = arc(poses, 5, 4, 15.0)
     assert places in ((2, 3, 4, 5), (8, 7, 6, 5))
-    assert sequence(poses, 5, 3, 30.0) in ((1, 3, 5), (9, 7, 5))
-    assert sequence(poses, 5, 4, 7.0) is None
-    assert sequence(poses, 5, 24, 15.0) is not None
-    assert sequence(poses, 5, 25, 15.0) is None
+    assert arc(poses, 5, 3, 30.0) in ((1, 3, 5), (9, 7, 5))
+    assert arc(poses, 5, 4, 7.0) is None
+    assert arc(poses, 5, 24, 15.0) is not None
+    assert arc(poses, 5, 25, 15.0) is None
     assert seen_middle(poses).abs().max() < 1e-6
     assert mean_up(poses).tolist() == pytest.approx([0, 0, 1])
 
@@ -131,9 +131,9 @@ def test_a_sequence_goes_round_the_object_in_equal_steps() -> None:
 def test_a_sequence_follows_a_moved_and_turned_world() -> None:
     poses = orbit(3.0, 60, elevation=(10, 40), seed=2)
     move = look_at((1.0, -2.0, 0.5), (3.0, 1.0, 4.0))
-    found = [sequence(poses, last, 4, 15.0) for last in range(60)]
+    found = [arc(poses, last, 4, 15.0) for last in range(60)]
     assert any(found)
-    assert found == [sequence([move @ T for T in poses], last, 4, 15.0) for last in range(60)]
+    assert found == [arc([move @ T for T in poses], last, 4, 15.0) for last in range(60)]
 
 
 def test_a_turned_camera_sees_its_middle_in_the_same_place() -> None:

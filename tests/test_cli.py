@@ -225,6 +225,21 @@ def test_without_depth_colour_alone_is_used_and_that_is_said(bidnerf: Run, tmp_p
     assert found.err == "t_0000, t_0001: no measured depth; colour only\n"
 
 
+def test_values_that_are_no_depth_are_mentioned_once(
+    bidnerf: Run, shared: Path, data: Path, tmp_path: Path
+) -> None:
+    for file in sorted((data / "depth").glob("t_*.png")):
+        depth = iio.imread(file)
+        depth[0, :3] = 65535
+        iio.imwrite(file, depth)
+    outcome = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
+    assert outcome.status == 0
+    assert outcome.err == (
+        f"bidnerf render: {data}/depth/t_0000.png: depth: counted as not measured: 3 x 65535, here and in the images that"
+        " follow\n"
+    )
+
+
 # Names that do not exist.
 
 
@@ -810,6 +825,23 @@ def test_info_describes_a_map(bidnerf: Run, shared: Path) -> None:
     assert facts["config"]["encoding"]["levels"] == 3
     shown = bidnerf("info", shared / "map").out
     assert all(f"{key}:" in shown for key in facts)
+
+
+def test_render_refuses_names_whose_files_would_collide(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    data = Path(shutil.copytree(shared / "data", tmp_path / "data"))
+    path = data / "transforms.json"
+    described = json.loads(path.read_text())
+    first, second = described["test_filenames"][:2]
+    other = str(Path(first).with_name(f"{Path(first).stem}.depth.png"))
+    (data / second).rename(data / other)
+    path.write_text(path.read_text().replace(second, other))
+    refused = bidnerf("render", shared / "map", data, "--out", tmp_path / "out")
+    assert_refused(refused, 1, "would have the file of the depth of", "--frame")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_argument_with_a_nul_is_wrong_usage(bidnerf: Run) -> None:
+    assert_refused(bidnerf("info", "a\0b"), 2, "NUL")
 
 
 def test_render_writes_the_images_that_were_agreed_on(bidnerf: Run, shared: Path, tmp_path: Path) -> None:

@@ -157,6 +157,7 @@ def test_a_map_without_a_surface_to_bake_is_a_map(
         (["{map}", "--data", "{none}"], 1, "none"),
         (["{map}", "--split", "x", "--data", "{data}"], 1, "no split 'x'"),
         (["{map}", "--frobnicate"], 2, "--frobnicate"),
+        (["{map}", "--rendered-landmarks", "--data", "{data}"], 2, "--rendered-landmarks takes no photos"),
     ],
 )
 def test_mistakes_are_told(
@@ -183,6 +184,47 @@ def test_how_well_a_field_renders_is_measured_on_photos_alone(
     noise = load_map(folder).colour_noise
     assert noise is not None
     assert noise > 0.05  # a ball is not what the photos show
-    bidnerf("bake", folder, *COARSE)
+    bidnerf("bake", folder, "--rendered-landmarks", *COARSE)
     assert load_map(folder).landmarks is not None
     assert load_map(folder).colour_noise == noise
+
+
+@pytest.fixture
+def with_photo_landmarks(shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The map with landmarks of its photos. Its surface is left alone, and what it renders is like photos."""
+    photos = read_views(open_dataset(shared / "data", tiny.BACKGROUND), "train")
+    monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
+    monkeypatch.setattr(module, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
+    assert bidnerf("bake", folder, "--data", shared / "data").status == 0
+    assert load_info(folder).landmark_source == "photos"
+    return folder
+
+
+def test_landmarks_of_photos_are_kept(with_photo_landmarks: Path, bidnerf: Run) -> None:
+    before = load_info(with_photo_landmarks)
+    status, out, err = bidnerf("bake", with_photo_landmarks)
+    assert (status, out, err.count("\n")) == (0, "", 1)
+    assert "landmarks of its photos are kept; --rendered-landmarks" in err
+    assert load_info(with_photo_landmarks) == before
+
+
+def test_landmarks_of_rendered_images_are_replaced_each_time(
+    with_photo_landmarks: Path, bidnerf: Run
+) -> None:
+    photos = load_info(with_photo_landmarks)
+    assert "rendered images" in bidnerf("bake", with_photo_landmarks, "--rendered-landmarks").err
+    first = load_info(with_photo_landmarks)
+    assert (first.landmark_source, first.colour_noise) == ("rendered images", photos.colour_noise)
+    assert first.landmarks != photos.landmarks
+    assert "kept" not in bidnerf("bake", with_photo_landmarks).err
+    assert load_info(with_photo_landmarks).landmarks != first.landmarks
+
+
+def test_damaged_landmarks_of_photos_are_replaced(with_photo_landmarks: Path, bidnerf: Run) -> None:
+    damaged = with_photo_landmarks / str(load_info(with_photo_landmarks).landmarks)
+    damaged.write_bytes(b"")
+    status, _, err = bidnerf("bake", with_photo_landmarks)
+    assert status == 0
+    assert str(damaged) in err
+    assert load_info(with_photo_landmarks).landmark_source == "rendered images"
+    assert load_map(with_photo_landmarks).landmarks is not None

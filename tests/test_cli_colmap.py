@@ -116,6 +116,17 @@ def test_with_a_surface_the_points_take_the_place_of_a_start(
     assert "colour only" not in found.err
 
 
+@pytest.mark.parametrize("method", ["inerf", "inerf-lm"])
+def test_methods_of_colour_alone_refuse_them(method: str, bidnerf: Run, shared: Path, tmp_path: Path) -> None:
+    options = ["--method", method, "--depth-points", shared / "sparse"]
+    place = ["localize", shared / "map", shared / "data", "--frame", "t_0001", "--perturb", 0.1, 5]
+    assert_refused(
+        bidnerf(*place, *options), 1, f"method '{method}' uses colour alone", "auto or bid or bid-lm"
+    )
+    bench = ["evaluate", shared / "map", shared / "data", "--out", tmp_path / "r.jsonl", "--trials", 1]
+    assert_refused_last(bidnerf(*bench, *options), f"method '{method}' uses colour alone")
+
+
 def test_a_bench_takes_them_too(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     out, points = tmp_path / "r.jsonl", ["--depth-points", shared / "sparse"]
     bench = [

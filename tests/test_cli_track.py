@@ -21,7 +21,7 @@ from bidnerf_core.cli.following import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.datasets.trajectories import read_trajectory
 from commands import Run
-from sequences import covered, flight
+from flights import covered, flight
 from textured_field import CAMERA, MapWithLandmarks, textured_map
 
 FRAMES = 6

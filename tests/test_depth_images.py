@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core.depth_images import depth_image, read_depth
-from bidnerf_core.errors import InputError
+from bidnerf_core.depth_images import DepthReader, depth_image, read_depth
+from bidnerf_core.errors import InputError, InputWarning
 
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
@@ -99,3 +100,59 @@ def test_files_of_every_kind_agree(tmp_path: Path) -> None:
     torch.testing.assert_close(
         depth_image(torch.from_numpy(steps), 0.001, "depth").metres, expected
     )  # also as torch's uint16
+
+
+def filled(limit: float, kind: str = "uint16", share: float = 0.3) -> np.ndarray:
+    """Depth from 500 to 3499 steps, with ``limit`` in a share of the pixels."""
+    generator = np.random.default_rng(1)
+    raw = generator.integers(500, 3500, (40, 50)).astype(kind)
+    raw.flat[: round(share * raw.size)] = limit
+    return raw
+
+
+@pytest.mark.parametrize("limit", [4000, 10000, 10500, 4095, 8191, 16383, 32767])
+@pytest.mark.parametrize("share", [0.05, 0.6])
+def test_a_sensors_limit_counts_as_not_measured(limit: int, share: float) -> None:
+    raw = filled(limit, share=share)
+    found = depth_image(raw, 0.001, "depth")
+    assert found.replaced == {f"{limit} (the sensor's limit)": round(share * raw.size)}
+    torch.testing.assert_close(found.metres, torch.from_numpy(np.where(raw == limit, 0, raw * 0.001)).float())
+
+
+def test_a_far_plane_in_floats_counts_as_not_measured() -> None:
+    raw = filled(20000, "float32") / 1000
+    assert depth_image(raw, 1.0, "depth").replaced == {"20 (the sensor's limit)": 600}
+
+
+@pytest.mark.parametrize(
+    ("raw", "why"),
+    [
+        (filled(4237), "no round number"),
+        (filled(3500), "nearer than any sensor's limit"),
+        (filled(10000, share=0.04), "few pixels"),
+        (np.full((40, 50), 10000, np.uint16), "a wall and nothing else"),
+        (
+            np.repeat([1000, 4000], [1200, 800]).reshape(40, 50).astype(np.uint16),
+            "two walls that face the camera",
+        ),
+        (np.arange(2000).reshape(40, 50).astype(np.uint16) * 5, "a largest value that occurs once"),
+    ],
+)
+def test_a_largest_depth_that_is_measured(raw: np.ndarray, why: str) -> None:
+    assert depth_image(raw, 0.001, "depth").replaced == {}, why
+
+
+def test_a_recording_mentions_each_kind_of_value_once(tmp_path: Path) -> None:
+    images = [np.array([[1.0, value]]) for value in (1.0, np.nan, np.nan, 1e10, 65.535)]
+    for number, image in enumerate(images):
+        np.save(tmp_path / f"{number}.npy", image)
+    read = DepthReader(documented=["65.535"])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for number in range(5):
+            assert read(tmp_path / f"{number}.npy", 1.0).metres[0, 0] == 1
+    assert [str(warning.message).partition(": ")[2] for warning in caught] == [
+        "depth: counted as not measured: 1 x NaN, here and in the images that follow",
+        "depth: counted as not measured: 1 x 1e+10 or more, here and in the images that follow",
+    ]
+    assert all(warning.category is InputWarning for warning in caught)

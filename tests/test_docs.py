@@ -186,6 +186,8 @@ def test_other_commands_name_what_exists(page: Path) -> None:
             assert extras(arguments) <= {*PROJECT["optional-dependencies"], "test"}
         elif program == "cp":
             assert (ROOT / arguments[1]).exists()
+        elif program == "python":
+            assert (ROOT / arguments[0]).is_file()
         else:
             assert program in {"bidnerf", *OTHER_PROGRAMS}
 

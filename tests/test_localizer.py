@@ -80,6 +80,13 @@ def test_a_start_of_any_kind_is_the_same_start(start: Any) -> None:
     torch.testing.assert_close(poses(FRAME, start=start)[0], START.matrix(), rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("method", ["inerf", "inerf-lm"])
+def test_methods_of_colour_alone_refuse_depth_rays(method: str) -> None:
+    rays = depth_rays_of([View(FRAME, SE3.identity())])
+    with pytest.raises(InputError, match=f"method '{method}' uses colour alone"):
+        Localizer(MAP, method)(FRAME, START, rays)
+
+
 def test_depth_rays_are_of_the_last_camera() -> None:
     rays = depth_rays_of([View(FRAME, SE3.identity())])
     bare = replace(FRAME, depth=None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.datasets.pose_writing import PosedImage, tum_trajectory, write_pose_transforms, write_tum
+from bidnerf_core.datasets import open_dataset, open_sequence
+from bidnerf_core.datasets.pose_writing import (
+    PosedImage,
+    tum_trajectory,
+    write_pose_transforms,
+    write_poses,
+    write_tum,
+)
+from bidnerf_core.datasets.trajectories import read_trajectory
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.se3 import SE3
@@ -81,3 +90,57 @@ def test_a_mirror_image_has_no_pose(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="mirror image"):
         write_pose_transforms(tmp_path / "transforms.json", [mirrored])
     assert not (tmp_path / "transforms.json").exists()
+
+
+def timed_images(count: int) -> list[PosedImage]:
+    generator = torch.Generator().manual_seed(5)
+    roots = torch.randn((count, 6, 6), generator=generator, dtype=torch.float64)
+    return [
+        replace(image, time=104137.25 + number / 30, covariance=1e-4 * root @ root.mT)
+        for number, (image, root) in enumerate(
+            zip(images([f"f{n}" for n in range(count)]), roots, strict=True)
+        )
+    ]
+
+
+def test_a_trajectory_with_times_is_read_again(tmp_path: Path) -> None:
+    written = timed_images(8)
+    write_poses(tmp_path / "path.tum", written)
+    path = read_trajectory(tmp_path / "path.tum")
+    assert len(path) == 8
+    for place, image in enumerate(written):
+        assert float(path.times[place]) == pytest.approx(image.time, abs=1e-6)
+        found = SE3(path.rotations[place], path.translations[place]).matrix()
+        torch.testing.assert_close(found, image.T_world_camera.matrix(), atol=1e-9, rtol=0)
+
+
+def test_json_has_times_and_covariances(tmp_path: Path) -> None:
+    written = [*timed_images(4), replace(timed_images(2)[0], time=None, covariance=None)]
+    write_poses(tmp_path / "poses.json", written)
+    found = json.loads((tmp_path / "poses.json").read_text())
+    assert [entry["frame"] for entry in found] == [image.name for image in written]
+    for entry, image in zip(found, written, strict=True):
+        assert entry["time"] == image.time
+        np.testing.assert_allclose(entry["T_world_camera"], image.T_world_camera.matrix(), atol=0)
+        if image.covariance is not None:
+            np.testing.assert_allclose(entry["covariance"], image.covariance, atol=0)
+    assert found[-1]["covariance"] is None
+
+
+def test_transforms_with_times_are_a_sequence(tmp_path: Path) -> None:
+    written = timed_images(5)[::-1]
+    for image in written:
+        write_photo(tmp_path / f"{image.name}.png", noise(12, 16), 1)
+    write_poses(tmp_path / "transforms.json", [replace(i, file=tmp_path / f"{i.name}.png") for i in written])
+    sequence = open_sequence(tmp_path)
+    assert [timed.time for timed in sequence] == [image.time for image in written[::-1]]
+    for timed, image in zip(sequence, written[::-1], strict=True):
+        assert timed.truth is not None
+        torch.testing.assert_close(timed.truth.matrix(), image.T_world_camera.matrix(), atol=1e-9, rtol=0)
+
+
+def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"poses\.csv: expected a name that ends with transforms\.json, \.json, \.txt"
+    ):
+        write_poses(tmp_path / "poses.csv", images(["a", "b"]))

@@ -16,7 +16,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Dataset, FileSequence, open_dataset, open_sequence
 from bidnerf_core.datasets.scanner_app import LARGEST_SIDE, RANGE, ScannerAppReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
@@ -325,3 +325,78 @@ def _disagreement(a: View, b: View) -> float:
     off = (measured - there[inside, 2])[measured > 0].abs()
     assert len(off) > 1000
     return float(off.median())
+
+
+def test_the_sequence_has_the_depth_between_photos(scan: Path) -> None:
+    """The third frame has no photo: its depth lies on the wall in the camera of the depth image."""
+    frames = list(open_sequence(scan))
+    assert [timed.frame.name for timed in frames] == ["frame_0", "frame_2", "frame_5", "frame_10", "frame_11"]
+    assert [timed.time for timed in frames] == pytest.approx([100 + n / 6 for n in range(5)])
+    assert [timed.split for timed in frames] == ["test", "train", None, "train", "train"]
+    assert [timed.frame.has_colour for timed in frames] == [True, True, False, True, True]
+    views = every_view(open_dataset(scan))
+    for number, timed in enumerate(frames):
+        assert timed.truth is not None
+        expected = pose_of(number)[:3, 3]
+        np.testing.assert_allclose(timed.truth.translation, expected, atol=1e-12)
+        if timed.frame.has_colour:
+            assert torch.equal(timed.frame.rgb, views[timed.frame.name].frame.rgb)
+    between = frames[2].frame
+    assert (between.intrinsics.width, between.intrinsics.height) == SMALL
+    assert between.depth is not None
+    rays = between.intrinsics.unproject(between.intrinsics.pixel_centres(torch.float64))
+    assert frames[2].truth is not None
+    world = frames[2].truth.apply(rays * between.depth.double()[..., None])
+    on_wall = between.depth > 0
+    assert float(on_wall.float().mean()) > 0.99
+    assert float((world[..., 2][on_wall] - WALL).abs().max()) < 0.002
+
+
+def test_a_phone_without_depth_has_a_sequence_of_photos(scan: Path) -> None:
+    for file in (*scan.glob("depth_*.png"), *scan.glob("conf_*.png")):
+        file.unlink()
+    assert [timed.frame.has_depth for timed in open_sequence(scan)] == [False] * 4
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (
+            lambda scan: (scan / "conf_5.png").unlink(),
+            r"conf_5\.png: no such file, expected it as frame_5\.json is there",
+        ),
+        (lambda scan: (scan / "frame_5.json").unlink(), r"frame_5\.json: no such file"),
+        (
+            lambda scan: iio.imwrite(scan / "depth_5.png", np.ones((48, 48), np.uint16)),
+            r"conf_5\.png: is 64x48, expected 48x48",
+        ),
+        (
+            lambda scan: [
+                iio.imwrite(scan / f"{kind}_5.png", np.ones((48, 48), np.uint8)) for kind in ("depth", "conf")
+            ],
+            r"depth_5\.png: depth is 48x48, its camera's photos are 960x720",
+        ),
+        (
+            lambda scan: (scan / "frame_5.json").write_text(
+                json.dumps(description(2) | {"projectionMatrix": None})
+            ),
+            r"frame_5\.json: no projectionMatrix, expected 16 numbers",
+        ),
+    ],
+)
+def test_broken_depth_between_photos(break_it: Callable[[Path], Any], message: str, scan: Path) -> None:
+    break_it(scan)
+    with pytest.raises(InputError, match=message):
+        list(open_sequence(scan))
+
+
+@pytest.mark.data
+def test_a_recorded_scan_in_the_order_of_time(data_dir: Path) -> None:
+    sequence = open_sequence(data_dir / "iphone_corridor")
+    assert isinstance(sequence, FileSequence)
+    assert len(sequence) == 436
+    times = np.array(sequence.times, dtype=float)
+    assert (np.diff(times) > 0).all()
+    kinds = [timed.frame.has_colour for timed in sequence[:30]]
+    assert kinds == [number % 3 == 0 for number in range(30)]
+    assert all(timed.frame.has_depth for timed in sequence[:30])

@@ -98,18 +98,24 @@ def test_flat_names_set_what_is_nested() -> None:
         ({"shar": 0.1}, "^here: Outer has no setting 'shar', did you mean 'share'[?]$"),
         ({"zzz": 0.1}, "^here: Outer has no setting 'zzz', expected some of share, scale, .*free$"),
         ({"inner": {}}, "^here: Outer has no setting 'inner'"),
-        ({"share": 2.0}, "^here: .*share is 2.0, expected 0 to 1$"),
-        ({"share": "much"}, "^here: .*share: found 'much', expected float$"),
-        ({"rays": 1.5}, "^here: .*rays: found 1.5, expected int$"),
-        ({"rays": 0}, "^here: .*rays is 0, expected 1 to 10,000,000$"),
-        ({"free": 1}, "^here: .*free: found 1, expected bool$"),
-        ({"name": "c"}, "^here: .*name: found 'c', expected 'a' or 'b'$"),
+        ({"share": 2.0}, "^here: share is 2.0, expected 0 to 1$"),
+        ({"share": "much"}, "^here: share: found 'much', expected float$"),
+        ({"rays": 1.5}, "^here: rays: found 1.5, expected int$"),
+        ({"rays": 0}, "^here: rays is 0, expected 1 to 10,000,000$"),
+        ({"free": 1}, "^here: free: found 1, expected bool$"),
+        ({"name": "c"}, "^here: name: found 'c', expected 'a' or 'b'$"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(values: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message) as raised:
         from_flat(Outer, values, "here")
     assert "\n" not in str(raised.value)
+
+
+def test_messages_name_settings_as_users_do_and_not_the_groups_that_hold_them() -> None:
+    for value, message in ((1, "fine_rays is 1, expected 7 to"), ("x", "fine_rays: found 'x', expected int")):
+        with pytest.raises(InputError, match=f"^here: {message}"):
+            settings_of("auto", {"fine_rays": value}, "here")
 
 
 def test_settings_of_earlier_versions_are_renamed() -> None:

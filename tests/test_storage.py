@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import itertools
+import json
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -378,3 +379,49 @@ def test_a_damaged_surface_is_named(content: Any, said: str, tmp_path: Path) -> 
     assert load_map(tmp_path, baked=False).surface is None
     save_surface(tmp_path, load_info(tmp_path), baked.patch())  # which mends it
     assert load_map(tmp_path).surface is not None
+
+
+def _with_weights(folder: Path, name: str, value: Tensor) -> Path:
+    path = folder / save_map(folder, info(complete=True), state()).weights
+    write_file(path, tensors_to_bytes(dict(state().field) | {name: value}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda value: value.int(), "is of int32, expected float32"),
+        (lambda value: torch.full_like(value, torch.nan), "holds NaN"),
+    ],
+    ids=["int", "nan"],
+)
+@pytest.mark.parametrize("name", ["sampler.peak", "colour.0.bias"])
+def test_weights_and_buffers_of_another_kind_are_refused(
+    name: str, change: Callable[[Tensor], Tensor], said: str, tmp_path: Path
+) -> None:
+    path = _with_weights(tmp_path, name, change(state().field[name]))
+    with pytest.raises(InputError, match=said) as told:
+        load_map(tmp_path)
+    assert str(told.value).startswith(f"{path}: tensor {name!r}")
+
+
+@pytest.mark.parametrize(
+    "rows", [((2.0, 0.0, 0.0, 0.0), *torch.eye(4).tolist()[1:]), torch.eye(4).tolist()[:3]]
+)
+def test_cameras_without_a_rigid_pose_are_refused(rows: list[list[float]], tmp_path: Path) -> None:
+    save_map(tmp_path, info(), state())
+    described = json.loads((tmp_path / "map.json").read_text())
+    described["cameras"][1]["T_world_camera"] = list(rows)
+    (tmp_path / "map.json").write_text(json.dumps(described))
+    with pytest.raises(InputError, match=r"map\.json: pose of camera '.+' is not a rigid transform"):
+        load_info(tmp_path)
+
+
+@pytest.mark.parametrize("far", [1e308, 1e16])
+def test_bounds_beyond_single_precision_are_refused(far: float, tmp_path: Path) -> None:
+    save_map(tmp_path, info(), state())
+    described = json.loads((tmp_path / "map.json").read_text())
+    described["bounds"]["far"] = far
+    (tmp_path / "map.json").write_text(json.dumps(described))
+    with pytest.raises(InputError, match=r"bounds: .* m is too large, expected at most 1e\+15 m"):
+        load_info(tmp_path)

@@ -12,7 +12,7 @@ import torch
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.localization.tracker import METHOD
-from sequences import (
+from flights import (
     FRAMES,
     assert_honest,
     assert_right,

@@ -14,36 +14,39 @@ class AdaNerfConfig(Settings):
     """Settings of an AdaNeRF. With the defaults, training takes about ten minutes on one core of a small CPU."""
 
     # The shading network.
-    width: Count = 128  # of the hidden layers
-    layers: Count = 4
-    position_frequencies: Annotated[int, Range(0, 64)] = 8
-    direction_frequencies: Annotated[int, Range(0, 64)] = 2
+    width: Count = 128  # units of a hidden layer of the shading network
+    layers: Count = 4  # hidden layers of the shading network before the density
+    position_frequencies: Annotated[int, Range(0, 64)] = 8  # octaves of sines and cosines of the position
+    direction_frequencies: Annotated[int, Range(0, 64)] = 2  # octaves of sines and cosines of the direction
     # The sampling network, here called the oracle.
-    oracle_width: Count = 256
-    oracle_layers: Count = 3
+    oracle_width: Count = 256  # units of a hidden layer of the oracle, the network that chooses samples
+    oracle_layers: Count = 3  # hidden layers of the oracle
     ray_points: Annotated[int, Range(2, 10**7)] = 16  # points that describe a ray to the oracle
-    ray_frequencies: Annotated[int, Range(0, 64)] = 3  # of the encoding of each of them
+    ray_frequencies: Annotated[int, Range(0, 64)] = 3  # octaves of sines and cosines of each of these points
     # How many samples a ray takes. The last two may be changed in a trained map. Fewer samples are faster, but the holes
     # where bins are missed lead a pose astray long before they are visible.
-    bins: Count = 64  # equal parts of a ray's segment in the scene's box, each with a score
-    threshold: NotNegative = 0.03  # a bin is shaded if its score is above this ...
-    max_samples: Count = 16  # ... and among so many highest scores of its ray
+    bins: Count = 64  # number of equal parts of a ray's segment in the scene's box, each with a score
+    threshold: NotNegative = 0.03  # score above which a bin is shaded
+    max_samples: Count = 16  # largest number of bins shaded along a ray: those of the highest scores
     # Training.
-    steps: Count = 4500
-    dense_part: Annotated[float, Range(0, 1)] = 0.4  # of the steps: all bins are shaded and count
-    soft_part: Annotated[float, Range(0, 1)] = 0.2  # of the steps, next: bins are weighted by their scores
-    samples_per_step: Count = 8192  # it decides the number of rays
-    rays_at_most: Count = 4096  # per step
-    learning_rate: NotNegative = 3e-3
-    depth_weight: NotNegative = 0.1
-    sparsity_weight: NotNegative = 0.01  # of the mean score, once the soft phase is half over
-    # of the oracle's own loss, with measured depth and shaded bins as targets
+    steps: Count = 4500  # steps of the optimizer
+    # fraction of the steps that shade all bins alike, at first
+    dense_part: Annotated[float, Range(0, 1)] = 0.4
+    # fraction of the steps, after these, that weight bins by their scores
+    soft_part: Annotated[float, Range(0, 1)] = 0.2
+    # approximate number of samples shaded a step, which decides the number of rays
+    samples_per_step: Count = 8192
+    rays_at_most: Count = 4096  # largest number of rays a step
+    learning_rate: NotNegative = 3e-3  # initial learning rate
+    depth_weight: NotNegative = 0.1  # weight of the depth term beside the colour term; 0 leaves depth out
+    sparsity_weight: NotNegative = 0.01  # weight of the mean score, once the soft phase is half over
+    # weight of the oracle's own loss, whose targets are measured depth and shaded bins
     oracle_weight: NotNegative = 0.1
-    empty_weight: NotNegative = 0.1  # of the opacity of bins that are known to be empty
-    carve: bool = True  # in training, treat bins as empty where depth and silhouettes leave no matter
-    # cells along the scene's longest side, for ``carve``
+    empty_weight: NotNegative = 0.1  # weight of the opacity of bins that are known to be empty
+    carve: bool = True  # treat bins as empty in training where depth and silhouettes leave no matter
+    # number of cells along the scene's longest side in the grid of empty space
     room_resolution: Annotated[int, Range(2, 1024)] = 64
-    seed: Annotated[int, Range(0)] = 0
+    seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -37,12 +37,13 @@ class HashEncodingConfig(Settings):
     of the encoding by position is continuous.
     """
 
-    levels: Annotated[int, Range(1, 64)] = 16  # of resolution
-    features: Annotated[int, Range(1, 64)] = 2  # of an entry; even numbers are faster
+    levels: Annotated[int, Range(1, 64)] = 16  # number of levels of resolution
+    features: Annotated[int, Range(1, 64)] = 2  # number of features of an entry; even numbers are faster
     log2_table_size: Annotated[int, Range(1, 30)] = 19  # entries of a level's table, as a power of two
     base_resolution: Annotated[float, Range(1, 2**20)] = 16  # cells along a side at the coarsest level
-    finest_resolution: Annotated[float, Range(1, 2**20)] = 512  # and at the finest
-    interpolation: Literal["linear", "smooth"] = "linear"  # between the corners of a cell
+    finest_resolution: Annotated[float, Range(1, 2**20)] = 512  # cells along a side at the finest level
+    # how features are interpolated between the corners of a cell
+    interpolation: Literal["linear", "smooth"] = "linear"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -26,9 +26,10 @@ class FieldConfig(Settings):
     encoding: HashEncodingConfig = field(
         default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=19, finest_resolution=768)
     )
-    width: Count = 64  # of the hidden layers
+    width: Count = 64  # units of a hidden layer
     colour_layers: Count = 2  # hidden layers of the colour network
-    geometry_features: Count = 15  # that the density network passes on to the colour network
+    # number of features that the density network passes on to the colour network
+    geometry_features: Count = 15
     # cells of the occupancy grid along the longest side of the scene
     grid_resolution: Annotated[int, Range(2, 1024)] = 128
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps

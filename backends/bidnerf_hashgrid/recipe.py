@@ -22,13 +22,14 @@ from bidnerf_hashgrid.occupancy import OccupancyGrid
 class HashGridConfig(FieldConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
-    steps: Count = 1600  # of the optimizer
-    samples_per_step: Count = 65536  # it decides the number of rays
-    learning_rate: NotNegative = 1e-2  # of the tables; that of the networks is a quarter of it
-    coarse_every: Annotated[int, Range(0)] = 4  # every so many steps, the coarse field is trained; 0: never
-    depth_weight: NotNegative = 0.1  # of the depth term beside the colour term; 0 leaves depth out
-    seed: Annotated[int, Range(0)] = 0  # of the initial weights and of all random draws
-    rays_at_most: Count = 16384  # a step, even if they take few samples
+    steps: Count = 1600  # steps of the optimizer
+    samples_per_step: Count = 65536  # approximate number of samples a step, which decides the number of rays
+    learning_rate: NotNegative = 1e-2  # learning rate of the tables; the networks have a quarter of it
+    # steps from one update of the coarse field to the next; 0: it is not trained
+    coarse_every: Annotated[int, Range(0)] = 4
+    depth_weight: NotNegative = 0.1  # weight of the depth term beside the colour term; 0 leaves depth out
+    seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
+    rays_at_most: Count = 16384  # largest number of rays a step
     prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
     prune_every: Count = 16  # steps from one update of the occupied cells to the next
     prune_fade: Annotated[float, Range(0, 1)] = 0.95  # factor on a cell's weight when rays visit it

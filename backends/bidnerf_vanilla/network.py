@@ -19,11 +19,11 @@ class NetworkConfig(Settings):
     """Size of one MLP."""
 
     layers: Count = 4  # hidden layers before the density
-    width: Count = 128  # of each; the layer that takes the direction has half of it
+    width: Count = 128  # units of a hidden layer; the layer that takes the direction has half of them
     skip: Annotated[int, Range(0)] = 2  # number of layers before the position is fed in once more; 0: never
-    # octaves of sines and cosines; the first has the scene's longest side as its period
+    # octaves of sines and cosines of the position; the first period is the scene's longest side
     position_frequencies: Annotated[int, Range(0, 64)] = 8
-    direction_frequencies: Annotated[int, Range(0, 64)] = 2
+    direction_frequencies: Annotated[int, Range(0, 64)] = 2  # octaves of sines and cosines of the direction
     include_input: bool = True  # feed positions and directions themselves in, beside their sines
 
 

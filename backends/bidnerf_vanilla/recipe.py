@@ -25,12 +25,13 @@ PROBE = 4096
 class VanillaConfig(FieldConfig):
     """Size and training of the field. With the defaults, training takes about forty minutes on a small CPU."""
 
-    steps: Count = 20000  # of the optimizer
-    samples_per_step: Count = 4096  # of the fine network, approximately; it decides the number of rays
-    rays_at_most: Count = 4096  # a step, even if they take few samples
-    learning_rate: NotNegative = 3e-3
-    depth_weight: NotNegative = 0.1  # of the depth term beside the colour term; 0 leaves depth out
-    seed: Annotated[int, Range(0)] = 0  # of the initial weights and of all random draws
+    steps: Count = 20000  # steps of the optimizer
+    # approximate number of samples of the fine network a step, which decides the number of rays
+    samples_per_step: Count = 4096
+    rays_at_most: Count = 4096  # largest number of rays a step
+    learning_rate: NotNegative = 3e-3  # initial learning rate
+    depth_weight: NotNegative = 0.1  # weight of the depth term beside the colour term; 0 leaves depth out
+    seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
     carve: bool = True  # skip the cells that the views' depth and silhouettes show to be empty
 
     def __post_init__(self) -> None:

@@ -20,7 +20,10 @@ MARGIN = 0.03  # of the box's size, at each end
 def grown(
     lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], at_least: float = 0.0, share: float = MARGIN
 ) -> AxisBox:
-    """Return the box with a margin of ``share`` of its size, and ``at_least`` metres, at each end; a flat box gets some thickness."""
+    """Return the box with a margin of ``share`` of its size at each end, and of ``at_least`` metres where that is more.
+
+    A flat box gets some thickness.
+    """
     size = upper - lower
     margin = torch.maximum(size * share, size.amax() * 0.01).clamp(min=at_least)
     return lower - margin, upper + margin
@@ -42,7 +45,7 @@ def corner(point: Float[Tensor, "3"]) -> Corner:
 def rays_of(
     view: View, wanted: Bool[Tensor, "h w"], share: int
 ) -> tuple[Float[Tensor, "n 3"], tuple[Int[Tensor, "n"], Int[Tensor, "n"]]]:
-    """Return about ``share`` of the wanted pixels, evenly spread: their points at z = 1 (camera frame), and rows and columns."""
+    """Return about ``share`` of the wanted pixels, evenly spread: points at z = 1 (camera frame), rows and columns."""
     rows, columns = wanted.nonzero(as_tuple=True)
     stride = max(1, len(rows) // share)
     rows, columns = rows[::stride], columns[::stride]

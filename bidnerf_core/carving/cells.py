@@ -19,7 +19,7 @@ BLOCK = 8
 BLOCKS_AT_ONCE = 128
 """Blocks that are processed together: few enough to stay in the cache."""
 SENSOR_TOLERANCE = 0.05
-"""Relative error of depth allowed for in training: real sensors err by a few per cent, and a cell emptied by mistake is lost."""
+"""Relative error of depth that training allows for: sensors err by a few per cent, and an emptied cell is lost."""
 
 
 def occupied_voxels(
@@ -72,7 +72,7 @@ class _Blocks:
         self.block_radius = self.cell_radius * BLOCK
 
     def middles(self, T_world_camera: SE3) -> tuple[Float[Tensor, "3 b"], Float[Tensor, "3 c"]]:
-        """Return the centre of each block's first cell (metres, camera frame) and the offset of each cell of a block from there."""
+        """Return the centre of each block's first cell and the offsets of its cells from there (metres, camera frame)."""
         T_camera_world = T_world_camera.to(torch.float64).inverse()  # the world's origin may be far away
         first = T_camera_world.apply(self.lower + self.size / 2)[:, None]
         step = T_camera_world.rotation * self.size

@@ -42,7 +42,7 @@ class FreeSpace:
         return FreeSpace(camera, torch.stack(levels), free.amax().item(), _edges(view.frame.intrinsics))
 
     def may_free(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
-        """Return whether the view sees any of the sphere around each point (camera frame, metres), before its farthest depth."""
+        """Return whether the view sees any of the sphere around each point (camera frame) before its farthest depth."""
         in_sight = (self.edges @ points > -radius).all(dim=0)
         return in_sight & (points[2] > -radius) & (points[2] - radius < self.reach)
 
@@ -60,7 +60,7 @@ class FreeSpace:
         return known & (deepest < least)
 
     def _footprint(self, points: Float[Tensor, "3 n"], radius: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return column, row and radius of each sphere's image in whole pixels; the radius is infinite outside the field of view."""
+        """Return column, row and radius of each sphere's image in whole pixels; out of view, the radius is infinite."""
         camera = self.intrinsics
         inverse = 1 / points[2]
         x, y = points[0] * inverse, points[1] * inverse
@@ -103,7 +103,7 @@ def _shrunk_camera(camera: Intrinsics, factor: int, free: Float[Tensor, "h w"]) 
 
 
 def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:
-    """Return the planes through the smallest upright rectangle at z = 1 that holds the image's border, which distortion bends."""
+    """Return the planes through the smallest upright rectangle at z = 1 that holds the image's (distorted) border."""
     w, h = camera.width, camera.height
     along = torch.linspace(0, 1, 33, dtype=torch.float64)
     still = torch.zeros_like(along)

@@ -80,6 +80,8 @@ def _dispatch(given: list[str]) -> int:
         near = difflib.get_close_matches(given[0], COMMANDS, n=1)
         hint = f", did you mean {near[0]!r}?" if near else ""
         return _failed("bidnerf", f"no command {given[0]!r}{hint}", WRONG_USAGE, f"\n{_usage()}")
+    if any("\0" in word for word in given):
+        return _failed(f"bidnerf {given[0]}", "an argument holds a NUL character, expected text", WRONG_USAGE)
     importlib.import_module(f"bidnerf_core.cli.{given[0]}").run(given[1:])
     return DONE
 

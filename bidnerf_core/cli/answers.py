@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from torch import Tensor
 from bidnerf_core.cli.common import UsageError, print_json, say, show
 from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.queries import Query
-from bidnerf_core.datasets.pose_writing import PosedImage, write_pose_transforms, write_tum
+from bidnerf_core.datasets.pose_writing import POSE_WRITERS, PosedImage
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.trials import plain_localization
@@ -25,11 +24,7 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map
 
 TRANSFORMS = "transforms.json"
-WRITERS: dict[str, Callable[[Path, Sequence[PosedImage]], None]] = {
-    ".txt": write_tum,
-    ".tum": write_tum,
-    TRANSFORMS: write_pose_transforms,
-}
+WRITERS = {ending: write for ending, write in POSE_WRITERS.items() if ending != ".json"}
 """Files of poses alone, by the ending of their names; ``.json`` is the list of what ``--json`` prints."""
 
 

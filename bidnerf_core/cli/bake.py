@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bidnerf_core.cli.common import MapFolder, option, parse, read_views, say
+from bidnerf_core.cli.common import Flag, MapFolder, UsageError, option, parse, read_views, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
@@ -15,7 +15,17 @@ from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import build_landmarks
-from bidnerf_core.storage import Map, cameras_of, load_info, load_map, save_landmarks, save_surface
+from bidnerf_core.storage import (
+    LandmarkSource,
+    Map,
+    MapInfo,
+    cameras_of,
+    load_info,
+    load_landmarks,
+    load_map,
+    save_landmarks,
+    save_surface,
+)
 
 
 def run(arguments: list[str]) -> None:
@@ -33,25 +43,34 @@ def _bake(
             "rendered images only",
         ),
     ] = None,
-    split: Annotated[str, option("NAME", "which of the dataset's splits")] = "train",
+    split: Annotated[str, option("NAME", "split of the dataset")] = "train",
+    rendered_landmarks: Annotated[
+        Flag, option(None, "replace landmarks of photos by landmarks of rendered images", "")
+    ] = False,
     config: BakeConfig = BakeConfig(),
 ) -> None:
     """Find the surface and the landmarks of a map, and store them in the map.
 
     Depth is rendered from where the training images were taken; what several of these views agree on is kept. With
     --data, views with measured depth are taken as they are instead, and landmarks are built from the photos; without it
-    they are built from images that the field renders, which are as sharp as the field.
+    they are built from images that the field renders, which are as sharp as the field. Landmarks of photos are kept
+    unless --data gives new photos or --rendered-landmarks asks for others.
     """
+    if rendered_landmarks and data is not None:
+        raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
     background = load_info(map).bounds.background
     views = [] if data is None else read_views(open_dataset(data, background), split)
-    bake_map(map, views, config)
+    bake_map(map, views, config, rendered_landmarks)
 
 
-def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
+def bake_map(
+    folder: Path, views: Sequence[View], config: BakeConfig, rendered_landmarks: bool = False
+) -> None:
     """Bake the surface and the landmarks of the map in ``folder``.
 
-    Of ``views``, those with measured depth take the place of rendered ones for the surface, and all of them give landmarks;
-    without views, landmarks come from images that the field renders.
+    Views with measured depth take the place of rendered ones for the surface, and all ``views`` give landmarks. Without
+    views, landmarks come from images that the field renders, unless the map has landmarks of photos, which are kept where
+    ``rendered_landmarks`` does not ask for others.
     """
     stored = load_map(folder, baked=False)  # its parts may be damaged, and are to be replaced
     places = [(view.frame.intrinsics, view.T_ref_camera) for view in views]
@@ -61,10 +80,26 @@ def bake_map(folder: Path, views: Sequence[View], config: BakeConfig) -> None:
             f"{folder}: holds no cameras to render it from; give a dataset of its views by --data"
         )
     _bake_surface(folder, stored, views, cameras, config)
+    if not views and not rendered_landmarks and _has_photo_landmarks(folder, stored.info):
+        say(f"{folder}: the landmarks of its photos are kept; --rendered-landmarks replaces them")
+        return
     # Photos alone show how well the field renders; against its own images it has no error.
     noise = colour_noise(stored.field, stored.bounds, views) if views else stored.colour_noise
-    photos = views or rendered_views(stored.field, stored.bounds, cameras)
-    _bake_landmarks(folder, stored, photos, noise)
+    source: LandmarkSource = "photos" if views else "rendered images"
+    images = views or rendered_views(stored.field, stored.bounds, cameras)
+    _bake_landmarks(folder, stored, images, noise, source)
+
+
+def _has_photo_landmarks(folder: Path, info: MapInfo) -> bool:
+    """Return whether the map has landmarks that were built from photos, in a file that is not damaged."""
+    if info.landmarks is None or info.landmark_source == "rendered images":
+        return False
+    try:
+        load_landmarks(folder / info.landmarks)
+    except InputError as error:
+        say(str(error))
+        return False
+    return True
 
 
 def _bake_surface(
@@ -84,7 +119,9 @@ def _bake_surface(
     )
 
 
-def _bake_landmarks(folder: Path, stored: Map, views: Sequence[View], noise: float | None) -> None:
+def _bake_landmarks(
+    folder: Path, stored: Map, views: Sequence[View], noise: float | None, source: LandmarkSource
+) -> None:
     """Build landmarks of the views; a scene without texture has none, and the surface alone then serves."""
     began = time.monotonic()
     try:
@@ -93,8 +130,8 @@ def _bake_landmarks(folder: Path, stored: Map, views: Sequence[View], noise: flo
     except InputError as error:
         say(f"{folder}: no landmarks: {error}")
         return
-    save_landmarks(folder, stored.info, landmarks, noise)
+    save_landmarks(folder, stored.info, landmarks, noise, source)
     say(
-        f"{folder}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(views)} views,"
+        f"{folder}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(views)} {source},"
         f" {time.monotonic() - began:.1f} s"
     )

@@ -79,9 +79,9 @@ def run(arguments: list[str]) -> None:
 def demo(
     backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
     out: Annotated[Path, option("DIR", "folder for the map and the pictures")] = Path("demo-out"),
-    frames: Annotated[int, option("N", "how many unseen frames to localize")] = 4,
+    frames: Annotated[int, option("N", "number of unseen frames to localize")] = 4,
     steps: Annotated[int | None, option("N", "training steps", "what the backend finds quick")] = None,
-    seed: Annotated[int, option("N", "of the views and of the starts")] = 0,
+    seed: Annotated[int, option("N", "seed of the views and of the starts")] = 0,
     overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
 ) -> None:
     """Train a closed-form scene, localize unseen frames in it, draw the result.

@@ -38,6 +38,7 @@ from bidnerf_core.evaluation.bench import (
     shard_of,
 )
 from bidnerf_core.evaluation.cluster import dask_executor
+from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.provenance import command_line, note_run, provenance
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -67,7 +68,7 @@ def run(arguments: list[str]) -> None:
             tuple[str, ...],
             option("SIZE...", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's"),
         ] = (),
-        method: Annotated[str, option("NAME", ", ".join(METHODS))] = "auto",
+        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = "auto",
         trials: Annotated[
             int | None, option("N", "number of trials of each size", "the protocol's, 24 or 25")
         ] = None,
@@ -83,6 +84,15 @@ def run(arguments: list[str]) -> None:
                 "MODEL", "COLMAP sparse model whose points, where frames observe them, are used as depth", ""
             ),
         ] = None,
+        fault: Annotated[
+            Names,
+            option(
+                "NAME:SIZE...",
+                "try every trial with each of these faults of the images; NAME:SIZE,SIZE names several, A:SIZE+B:SIZE both "
+                "at once, none the images as they are; names: " + ", ".join(FAULTS),
+                "none",
+            ),
+        ] = (),
         device: Annotated[str, option("NAME", "device that the field computes on: cpu, cuda ...")] = "cpu",
         workers: Annotated[
             int | None, option("N", "number of processes, of one thread each", "one a core; one on a GPU")
@@ -109,7 +119,7 @@ def run(arguments: list[str]) -> None:
         plan = Plan(
             map, data or _own_data(map), protocol, _sizes(size), method, changed_settings(method, config),
             trials, seed, split, names, images, angle, device, depth,
-            None if depth_points is None else str(depth_points),
+            None if depth_points is None else str(depth_points), _faults(fault),
         )  # fmt: skip
         trials_of_all = planned(plan)
         if repeated := repeated_frames(trials_of_all):
@@ -191,6 +201,12 @@ def _sizes(given: tuple[str, ...]) -> tuple[Size, ...] | None:
         return tuple(tuple(float(number) for number in size.split(":")) for size in given) or None
     except ValueError as error:
         raise UsageError(f"--size is {' '.join(given)}, expected numbers as 0.5, or 0.2:10") from error
+
+
+def _faults(given: Names) -> tuple[str, ...]:
+    """Return the faults to try; images as they are where none is given."""
+    with wrong_usage():
+        return expand(word for group in given for word in group) or (NO_FAULT,)
 
 
 def _own_data(map: str) -> str:

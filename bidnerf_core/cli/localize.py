@@ -34,6 +34,7 @@ from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trials import places_of
 from bidnerf_core.localization import METHODS, Localizer
+from bidnerf_core.localization.methods import require_use_of_depth
 from bidnerf_core.storage import Map, load_map
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
@@ -72,14 +73,15 @@ def run(arguments: list[str]) -> None:
             float | None, one_camera, option("DEG", "horizontal field of view of the upright image", "")
         ] = None,
         depth_unit: Annotated[
-            float | None, option("METRES", "one step of --depth", "0.001 for integers, 1 for floats")
+            float | None,
+            option("METRES", "length of one unit of --depth", "0.001 for integers, 1 for floats"),
         ] = None,
         frame: Annotated[
             Names,
             option("NAME...", "frames of a dataset, together as a rig", "each of the split, on its own"),
         ] = (),
-        split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
-        method: Annotated[str, option("NAME", ", ".join(METHODS))] = "auto",
+        split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = "auto",
         start: Annotated[
             Path | None, one_start, option("POSE.json", "file with a 4x4 T_world_camera to start from", "")
         ] = None,
@@ -112,7 +114,7 @@ def run(arguments: list[str]) -> None:
         draw: Annotated[
             Path | None, option("DIR", "draw each photo beside the map rendered from the pose found", "")
         ] = None,
-        seed: Annotated[int, option("N", "seed of all that is drawn at random")] = 0,
+        seed: Annotated[int, option("N", "seed of every random choice")] = 0,
         json: Annotated[Flag, option(None, "print one JSON object a query, each on a line", "")] = False,
         model_points: SparseChoice = SparseChoice(),
         config: Any = kind(),
@@ -137,6 +139,8 @@ def run(arguments: list[str]) -> None:
             raise UsageError("no QUERY, expected image files, folders of photos, or a folder of a dataset")
         if METHODS[method].needs_start and not begin.given:
             raise InputError(f"method {method!r} needs a start; give one, or take method 'auto'")
+        if depth_points is not None:
+            require_use_of_depth(method)
         output.prepare()
         stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)

@@ -46,8 +46,8 @@ def _render(
     map: MapFolder,
     data: DataFolder,
     out: Annotated[Path, option("DIR", "folder for the images")],
-    split: Annotated[str, option("NAME", "which of the dataset's splits")] = "test",
-    frame: Annotated[Names, option("NAME...", "names of frames", "all of the split")] = (),
+    split: Annotated[str, option("NAME", "split of the dataset")] = "test",
+    frame: Annotated[Names, option("NAME...", "render only these frames", "all of the split")] = (),
     level: Annotated[
         int | None, option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,
@@ -63,6 +63,7 @@ def _render(
         field = stored.field if level is None else _level(stored, level, map)
         names = [name for group in frame for name in group]
         views = read_views(open_dataset(data, stored.bounds.background), split, names or None)
+        _check_file_names([view.frame.name for view in views])
         _render_views(field, stored.bounds, views, out)
 
 
@@ -71,6 +72,15 @@ def _level(stored: Map, number: int, folder: Path) -> RadianceField:
     if not 0 <= number < len(offered):
         raise InputError(f"{folder}: no level {number}, expected 0 to {len(offered) - 1}")
     return offered[number]
+
+
+def _check_file_names(names: Sequence[str]) -> None:
+    """Raise ``InputError`` where the colour image of a frame would have the name of another's depth image."""
+    for name in {f"{name}.depth" for name in names} & set(names):
+        raise InputError(
+            f"frame {name!r} would have the file of the depth of {name.removesuffix('.depth')!r}; render them"
+            " one by one with --frame, into different folders"
+        )
 
 
 def _render_views(field: RadianceField, bounds: SceneBounds, views: Sequence[View], out: Path) -> None:

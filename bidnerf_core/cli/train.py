@@ -78,20 +78,26 @@ def run(arguments: list[str]) -> None:
         data: DataFolder,
         out: Annotated[Path, option("MAP", "folder for the map")],
         backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
-        split: Annotated[str, option("NAME", "which of the dataset's splits to train on")] = "train",
+        split: Annotated[str, option("NAME", "split of the dataset to train on")] = "train",
         background: Annotated[
-            str | None, option("COLOUR", "white or black, under images with alpha", "as the dataset has it")
+            str | None,
+            option("COLOUR", "colour behind images with alpha: white or black", "as the dataset has it"),
         ] = None,
         resume: Annotated[Flag, option(None, "continue the interrupted training in --out", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace the map in --out", "")] = False,
         checkpoint_every: Annotated[
-            float, option("SECONDS", "save so often; at most this much work is lost if the program is killed")
+            float,
+            option(
+                "SECONDS", "time between checkpoints: at most this much work is lost if the program is killed"
+            ),
         ] = CHECKPOINT_SECONDS,
         depth_points: Annotated[
             Path | None,
-            option("MODEL", "COLMAP sparse model: its points are the depth of images that have none", ""),
+            option("MODEL", "COLMAP sparse model whose points give depth to images that have none", ""),
         ] = None,
-        no_bake: Annotated[Flag, option(None, "leave the surface to 'bidnerf bake'", "")] = False,
+        no_bake: Annotated[
+            Flag, option(None, "leave the surface and the landmarks to 'bidnerf bake'", "")
+        ] = False,
         model_points: SparseChoice = SparseChoice(),
         config: Any = kind(),
     ) -> None:

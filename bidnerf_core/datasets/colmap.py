@@ -35,8 +35,8 @@ ALWAYS_FITS = 0.01  # ... but never those that are off by less than this part of
 class SparseChoice:
     """Which points of a COLMAP model are used."""
 
-    points_error: float = 2.0  # pixels: those with a larger mean reprojection error are left out
-    points_views: int = 2  # those that fewer images observe are left out
+    points_error: float = 2.0  # largest mean reprojection error of a point that is used, pixels
+    points_views: int = 2  # least number of images that observe a point that is used
 
     def __post_init__(self) -> None:
         if not self.points_error > 0:

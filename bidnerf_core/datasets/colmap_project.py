@@ -21,10 +21,10 @@ from bidnerf_core.camera_sources import Raster
 from bidnerf_core.datasets.colmap_files import ModelImage, has_posed_images, read_posed_images
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.orientation import UPRIGHT
 from bidnerf_core.photos import natural_order
 from bidnerf_core.se3 import SE3
@@ -75,17 +75,8 @@ class ColmapReader:
         return ColmapDataset(Splits(path, hold_out(_frames(path, model))), background)
 
 
-class ColmapDataset(SplitDataset[ColmapFrame]):
+class ColmapDataset(OpaqueDataset[ColmapFrame]):
     """Views of a COLMAP project; see ``Dataset``."""
-
-    def __init__(self, frames: Splits[ColmapFrame], background: Background | None) -> None:
-        super().__init__(frames)
-        self._background = background_colour("black" if background is None else background)
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """The requested colour, or black: photos have no alpha channel."""
-        return self._background
 
     def _view(self, frame: ColmapFrame, name: str) -> View:
         header = read_header(frame.image)

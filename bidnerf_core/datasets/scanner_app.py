@@ -33,11 +33,11 @@ from bidnerf_core.camera_sources import Raster
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.poses import pose_of_rows
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.depth_images import DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, background_colour, decode, over, read_header, read_image, reduced
+from bidnerf_core.images import Background, decode, over, read_header, read_image, reduced
 from bidnerf_core.orientation import UPRIGHT
 from bidnerf_core.photos import fit_depth
 from bidnerf_core.records import Record, read_record
@@ -101,30 +101,20 @@ class ScannerAppReader:
 
     def open(self, path: Path, background: Background | None) -> Dataset:
         """Read all descriptions. Raises ``InputError`` where one is missing or not usable."""
-        colour = background_colour("black" if background is None else background)
-        return ScannerAppDataset(Splits(path, hold_out(scanner_frames(path))), colour, self.largest)
+        return ScannerAppDataset(Splits(path, hold_out(scanner_frames(path))), background, self.largest)
 
     def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
         """Read all descriptions, those of frames that have depth alone included."""
-        colour = background_colour("black" if background is None else background)
         splits = Splits(path, hold_out(scanner_frames(path)))
-        return ScannerAppDataset(splits, colour, self.largest).sequence(depth_frames(path))
+        return ScannerAppDataset(splits, background, self.largest).sequence(depth_frames(path))
 
 
-class ScannerAppDataset(SplitDataset[ScannerFrame]):
+class ScannerAppDataset(OpaqueDataset[ScannerFrame]):
     """Views of a folder of "3D Scanner App"; see ``Dataset``."""
 
-    def __init__(
-        self, frames: Splits[ScannerFrame], background: tuple[float, float, float], largest: int
-    ) -> None:
-        super().__init__(frames)
-        self._background = background
+    def __init__(self, frames: Splits[ScannerFrame], background: Background | None, largest: int) -> None:
+        super().__init__(frames, background)
         self._largest = largest
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """The requested colour, or black: photos have no alpha channel."""
-        return self._background
 
     def _view(self, frame: ScannerFrame, name: str) -> View:
         return (

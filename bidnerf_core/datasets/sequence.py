@@ -6,7 +6,6 @@ images, and for video files.
 
 from __future__ import annotations
 
-import collections.abc
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -60,8 +59,10 @@ class SequenceEntry:
     read: ReadFrame
 
 
-class FileSequence(collections.abc.Sequence[TimedFrame]):
+class FileSequence:
     """A sequence whose frames are files of their own, so that it can be indexed, sliced and reversed."""
+
+    # It is no subclass of collections.abc.Sequence: checkers of types look at an item of those, and so would read one.
 
     def __init__(self, path: Path, entries: Sequence[SequenceEntry]) -> None:
         self._path, self._entries = path, entries
@@ -89,6 +90,9 @@ class FileSequence(collections.abc.Sequence[TimedFrame]):
 
     def __len__(self) -> int:
         return len(self._entries)
+
+    def __iter__(self) -> Iterator[TimedFrame]:
+        return (self[place] for place in range(len(self)))
 
     @overload
     def __getitem__(self, place: int) -> TimedFrame: ...

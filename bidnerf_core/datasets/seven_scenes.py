@@ -31,12 +31,12 @@ from bidnerf_core.datasets.depth_registration import register_depth
 from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.pose_files import read_pose_matrix
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.files import open_binary
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.photos import natural_order
 from bidnerf_core.se3 import SE3
 
@@ -128,21 +128,15 @@ class SevenScenesReader:
         return SevenScenesDataset(Splits(path, splits), camera, self.register_depth, background)
 
 
-class SevenScenesDataset(SplitDataset[SceneFrame]):
+class SevenScenesDataset(OpaqueDataset[SceneFrame]):
     """Views of a folder of 7-Scenes; see ``Dataset``."""
 
     def __init__(
         self, frames: Splits[SceneFrame], camera: FolderCamera, register: bool, background: Background | None
     ) -> None:
-        super().__init__(frames)
+        super().__init__(frames, background)
         self._camera, self._register = camera, register
-        self._background = background_colour("black" if background is None else background)
         self._read_depth = DepthReader(documented=("65535",))
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """The requested colour, or black: the images have no alpha channel."""
-        return self._background
 
     def _view(self, frame: SceneFrame, name: str) -> View:
         return View(self._frame(frame, name), self._pose(frame))

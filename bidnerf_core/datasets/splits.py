@@ -12,6 +12,7 @@ from bidnerf_core.datasets.dataset import ReadingProgress, positions, unique_nam
 from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, SequenceEntry
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.images import Background, background_colour
 from bidnerf_core.photos import natural_order
 from bidnerf_core.se3 import SE3
 
@@ -142,6 +143,19 @@ class SplitDataset(ABC, Generic[F]):
     @abstractmethod
     def _view(self, frame: F, name: str) -> View:
         """Read the frame's image and depth. Raises ``InputError`` where a file is missing or not usable."""
+
+
+class OpaqueDataset(SplitDataset[F]):
+    """A ``SplitDataset`` of images that have no alpha channel as a rule: the background is black unless it is given."""
+
+    def __init__(self, frames: Splits[F], background: Background | None) -> None:
+        super().__init__(frames)
+        self._background = background_colour("black" if background is None else background)
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The requested colour, or black."""
+        return self._background
 
 
 def hold_out(frames: list[F]) -> dict[str, list[F]]:

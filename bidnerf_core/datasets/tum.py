@@ -29,13 +29,13 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows, require_distinct_times
 from bidnerf_core.datasets.trajectories import LARGEST_GAP, read_trajectory
 from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.se3 import SE3
 
 COLOURS, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
@@ -51,6 +51,14 @@ CAMERAS = {
 SENSOR = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
 
 
+@dataclass(frozen=True)
+class DepthFile:
+    """A depth image of the list."""
+
+    where: str
+    image: Path
+
+
 @dataclass(frozen=True, eq=False)
 class TumFrame:
     """A colour image of the list, with what belongs to it."""
@@ -58,7 +66,7 @@ class TumFrame:
     where: str  # the file and line that lists it
     image: Path
     time: float
-    depth: Path | None
+    depth: DepthFile | None
     truth: SE3 | None  # T_world_camera
 
     @property
@@ -108,19 +116,13 @@ class TumReader:
         return FolderCamera(path, self.camera, published_camera(path), unknown)
 
 
-class TumDataset(SplitDataset[TumFrame]):
+class TumDataset(OpaqueDataset[TumFrame]):
     """Views of a folder of the TUM RGB-D benchmark; see ``Dataset``."""
 
     def __init__(self, frames: Splits[TumFrame], camera: FolderCamera, background: Background | None) -> None:
-        super().__init__(frames)
+        super().__init__(frames, background)
         self._camera = camera
-        self._background = background_colour("black" if background is None else background)
         self._read_depth = DepthReader(documented=("65535",))
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """The requested colour, or black: the images have no alpha channel."""
-        return self._background
 
     def _view(self, frame: TumFrame, name: str) -> View:
         found, truth = self._posed(frame, name)
@@ -128,18 +130,18 @@ class TumDataset(SplitDataset[TumFrame]):
         return View(found, truth)
 
     def _posed(self, frame: TumFrame, name: str) -> tuple[Frame, SE3 | None]:
-        for file in (frame.image, frame.depth):
-            if file is not None and not file.is_file():
-                raise InputError(f"{frame.where}: no image {file}, expected that file")
+        for listed in (frame, frame.depth):
+            if listed is not None and not listed.image.is_file():
+                raise InputError(f"{listed.where}: no image {listed.image}, expected that file")
         header = read_header(frame.image)
         camera = self._camera.at(frame.image, header.width, header.height)
         colour, alpha = read_image(frame.image)
         depth = None
         if frame.depth is not None:
-            depth = self._read_depth(frame.depth, METRES_PER_STEP).metres
+            depth = self._read_depth(frame.depth.image, METRES_PER_STEP).metres
             if depth.shape != colour.shape[:2]:
                 raise InputError(
-                    f"{frame.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
+                    f"{frame.depth.image}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
                     "as its colour image, to which it is registered"
                 )
         return Frame(name, over(colour, alpha, self._background), camera, depth, alpha), frame.truth
@@ -157,12 +159,13 @@ def tum_frames(folder: Path) -> list[TumFrame]:
     depths = _listed(folder / DEPTHS) if (folder / DEPTHS).is_file() else []
     path = read_trajectory(folder / TRUTH) if (folder / TRUTH).is_file() else None
     partners = associate([row.time for row in colours], [row.time for row in depths], LARGEST_DIFFERENCE)
+    files = [DepthFile(row.where, folder / row.words[0]) for row in depths]
     return [
         TumFrame(
             row.where,
             folder / row.words[0],
             row.time,
-            folder / depths[partners[place]].words[0] if place in partners else None,
+            files[partners[place]] if place in partners else None,
             path.at(row.time) if path is not None else None,
         )
         for place, row in enumerate(colours)

@@ -1,7 +1,7 @@
 """Video files as sequences; needs the extra ``video`` (imageio-ffmpeg, which brings ffmpeg along).
 
-Frames are decoded one after the other, each with the time stamp that the file has for it: phones record at a varying rate. A
-rotation that the file asks for is applied, so the camera is that of the upright image. A video does not record its focal
+Frames are decoded one after the other, each with the time stamp that the file has for it, in seconds from its start: phones record at a
+varying rate. A rotation that the file asks for is applied, so the camera is that of the upright image. A video does not record its focal
 length, so the camera has to be given.
 """
 

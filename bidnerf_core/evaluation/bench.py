@@ -16,10 +16,11 @@ import torch
 
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.arcs import arc
 from bidnerf_core.evaluation.closed_form_data import ClosedFormData
+from bidnerf_core.evaluation.faults import NO_FAULT, check_depth
 from bidnerf_core.evaluation.protocols import Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.sequences import sequence
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import (
     input_digests,
@@ -30,7 +31,7 @@ from bidnerf_core.evaluation.trials import (
     trial_views,
 )
 from bidnerf_core.localization import find_method
-from bidnerf_core.localization.methods import RENAMED
+from bidnerf_core.localization.methods import RENAMED, require_use_of_depth
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.settings import to_flat
 
@@ -61,6 +62,7 @@ class Plan:
     device: str = "cpu"
     depth: bool = True  # whether the method gets the measured depth
     depth_points: str | None = None  # see Trial
+    faults: tuple[str, ...] = (NO_FAULT,)  # see Trial; each is tried on the same frames from the same starts
 
 
 def planned(plan: Plan) -> list[Trial]:
@@ -71,6 +73,7 @@ def planned(plan: Plan) -> list[Trial]:
     names = dataset.frame_names(plan.split)
     rigs = _rigs(plan, dataset, names)
     _check_points(plan, rigs)
+    check_depth(plan.faults, plan.depth)
     sizes = protocol.sizes if plan.sizes is None else plan.sizes
     for size in sizes:
         protocol.check_size(size)
@@ -92,7 +95,9 @@ def planned(plan: Plan) -> list[Trial]:
             device=plan.device,
             depth=plan.depth,
             depth_points=plan.depth_points,
+            fault=fault,
         )
+        for fault in plan.faults
         for size in sizes
         for place, seed in cases
     ]
@@ -115,13 +120,13 @@ def left_to_do(trials: Sequence[Trial], file: ResultsFile) -> list[Trial]:
 
 def repeated_frames(trials: Sequence[Trial]) -> str | None:
     """Return a sentence about frames that are tried several times from each size, or none where there are none."""
-    times = Counter((trial.size, trial.frames) for trial in trials)
+    times = Counter((trial.fault, trial.size, trial.frames) for trial in trials)
     if not times or max(times.values()) == 1:
         return None
-    frames = len({frames for _, frames in times})
+    frames = len({frames for _, _, frames in times})
     fewest, most = min(times.values()), max(times.values())
     often = f"{most}" if fewest == most else f"{fewest} to {most}"
-    a_size = " of each size" if len({size for size, _ in times}) > 1 else ""
+    a_size = " of each size" if len({size for _, size, _ in times}) > 1 else ""
     distinct = f"{frames} distinct frame{'s' if frames > 1 else ''}"
     return f"{distinct} of split {trials[0].split!r}, each tried {often} times{a_size} with different seeds"
 
@@ -210,7 +215,7 @@ def _follow_parent() -> None:
 
 
 def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
-    """Raise ``InputError`` where a result of ``file`` was made with other weights, settings or input than its trial has now."""
+    """Raise ``InputError`` where a result of ``file`` had other weights, settings or input than its trial has now."""
     digests: dict[Any, dict[str, Any]] = {}
     for trial in trials:
         known = file.results[key_of(trial)]
@@ -224,7 +229,10 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
         _check_settings(trial, known, f"{file.path}: was made with {{}} {{}}, expected {{}}; {advice}")
         if known.inputs is None:  # an earlier version did not record it
             continue
-        read = trial.frames, trial.depth, trial.depth_points
+        seed = (
+            None if trial.fault == NO_FAULT else trial.seed
+        )  # the images depend on it only where they have faults
+        read = trial.frames, trial.depth, trial.depth_points, trial.fault, seed
         if read not in digests:
             digests[read] = to_plain(input_digests(trial, stored, trial_views(trial, dataset)))
         for name, digest in to_plain(known.inputs).items():
@@ -265,10 +273,11 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
 
 
 def _check_points(plan: Plan, rigs: list[tuple[str, ...]]) -> None:
-    """Raise ``InputError`` where the views of some frame observe no depth points."""
+    """Raise ``InputError`` where the method uses no depth points, or the views of some frame observe none."""
     points = opened_points(plan.depth_points, plan.map)
     if points is None:
         return
+    require_use_of_depth(plan.method)
     blind = [rig[-1] for rig in rigs if not any(len(points.seen(name, plan.split)) for name in rig)]
     if blind:
         listed = ", ".join(blind[:4]) + (", ..." if len(blind) > 4 else "")
@@ -283,6 +292,6 @@ def _found_sequences(
 ) -> Iterator[tuple[str, ...]]:
     poses = [view.T_ref_camera for view in dataset.views(plan.split)]
     for name in kept:
-        places = sequence(poses, names.index(name), plan.images, plan.angle)
+        places = arc(poses, names.index(name), plan.images, plan.angle)
         if places is not None:
             yield tuple(names[place] for place in places)

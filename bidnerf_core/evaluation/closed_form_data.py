@@ -19,7 +19,7 @@ import torch
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import ReadingProgress
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.sequences import turned_about
+from bidnerf_core.evaluation.arcs import turned_about
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.rendering import render_image
@@ -42,7 +42,7 @@ Render = Callable[[SE3, str], Frame]
 
 @dataclass(frozen=True, eq=False)
 class ClosedFormData:
-    """A ``Dataset`` with the one split "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the scene's middle."""
+    """A ``Dataset`` with the one split "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the middle."""
 
     name: str
     poses: tuple[SE3, ...]  # T_world_camera

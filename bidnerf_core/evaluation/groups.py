@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.trial import TrialResult
 
 
@@ -20,16 +21,17 @@ class Situation:
     split: str
     protocol: str
     size: tuple[float, ...] | None
+    fault: str = NO_FAULT
 
     @property
     def start(self) -> str:
-        """Return the start in words."""
+        """Return the start in words, and the faults of the images where they have any."""
+        words = "no start" if self.protocol == "none" else self.protocol
         if self.size is None:
-            return f"{self.protocol}, all sizes"
-        if self.protocol == "none":
-            return "no start"
-        numbers = " : ".join(f"{number:g}" for number in self.size)
-        return f"{self.protocol} {numbers}".rstrip()
+            words += ", all sizes"
+        elif self.protocol != "none":
+            words = f"{words} {' : '.join(f'{number:g}' for number in self.size)}".rstrip()
+        return words if self.fault == NO_FAULT else f"{words}, {self.fault}"
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,9 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
 def situation_of(result: TrialResult) -> Situation:
     """Return the situation that a trial belongs to."""
     trial = result.trial
-    return Situation(trial.map, result.weights, trial.data, trial.split, trial.protocol, trial.size)
+    return Situation(
+        trial.map, result.weights, trial.data, trial.split, trial.protocol, trial.size, trial.fault
+    )
 
 
 def condition_of(result: TrialResult) -> Condition:
@@ -140,8 +144,9 @@ def _together(groups: Sequence[Group]) -> list[Group]:
     ]  # fmt: skip
 
 
-def _family(situation: Situation) -> tuple[str, str, str, str, str]:
-    return situation.map, situation.weights, situation.data, situation.split, situation.protocol
+def _family(situation: Situation) -> tuple[str, ...]:
+    place = situation.map, situation.weights, situation.data, situation.split
+    return *place, situation.protocol, situation.fault
 
 
 def _rank(situation: Situation) -> tuple[bool, tuple[float, ...]]:

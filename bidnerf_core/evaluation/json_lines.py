@@ -164,6 +164,9 @@ class RowStore:
     ) -> None:
         self._file.close()
 
+    def __contains__(self, key: list[Any]) -> bool:
+        return json.dumps(key) in self._rows
+
     def get(self, key: list[Any], make: Callable[[], Any]) -> Any:
         """Return the row of ``key``; if the file does not hold it, compute it with ``make`` and store it."""
         text = json.dumps(key)

@@ -131,8 +131,8 @@ def _notes(groups: Sequence[Group]) -> str:
     pooled = any(g.situation.size is None for g in groups)
     together = " &ldquo;All sizes&rdquo; pools the trials of all sizes." if pooled else ""
     return (
-        '<p class="small">Each cell gives the share of successful trials, their number, and Wilson&rsquo;s 95 % interval. The '
-        "translation error is the distance between the camera centres in the map&rsquo;s units (metres in a room); the "
+        '<p class="small">Each cell gives the share of successful trials, their number, and Wilson&rsquo;s 95 % interval. '
+        "The translation error is the distance between the camera centres in the map&rsquo;s units (metres in a room); the "
         "rotation error is the geodesic angle. A dash marks a criterion that does not apply: a share of the start&rsquo;s "
         "error needs a start. Settings that all conditions of a method share are not part of their names; each line of the "
         f"results holds all of them.{together}</p>"
@@ -158,14 +158,16 @@ def _costs(groups: Sequence[Group], titles: Titles) -> str:
             rows.append(
                 _row([
                     _text(group.label), _number(s.translation, 4), _number(s.rotation_deg, 2, "°"),
-                    _steps(s.criteria[RELATIVE]), _steps(s.criteria[ABSOLUTE]), f"{s.milliseconds_per_step:.1f}", f"{s.seconds:.1f}",
+                    _steps(s.criteria[RELATIVE]), _steps(s.criteria[ABSOLUTE]),
+                    f"{s.milliseconds_per_step:.1f}", f"{s.seconds:.1f}",
                     f"{s.peak_memory_bytes / 2**20:.0f}", str(s.converged_but_wrong), str(s.right_but_not_converged),
                 ])
             )  # fmt: skip
     note = (
-        '<p class="small">Errors, steps and times are medians: final errors and times over all trials, steps to success over '
-        "the trials that succeeded. Memory is the largest peak of any trial&rsquo;s process. &ldquo;Converged&rdquo; is the "
-        "method&rsquo;s own judgement; &ldquo;right&rdquo; means within 5° and 0.05 units.</p>"
+        '<p class="small">Errors, steps and times are medians: final errors and times over all trials, steps to success '
+        "over the trials that succeeded. Memory is the largest peak of any trial&rsquo;s process. "
+        "&ldquo;Converged&rdquo; is the method&rsquo;s own judgement; "
+        "&ldquo;right&rdquo; means within 5° and 0.05 units.</p>"
     )
     return _table(heads, rows) + note
 
@@ -195,10 +197,11 @@ def _tests(groups: Sequence[Group], titles: Titles, criterion: str) -> list[str]
             rows.append(_section(titles[situation], len(heads)))
             rows += [_pair(pair) for pair in pairs]
     note = (
-        f'<p class="small">Success is: {_text(CRITERION_NAMES[criterion])}. Rates are compared with Fisher&rsquo;s exact test, steps '
-        "to success with the Mann-Whitney U test (U of the first group) over the trials that succeeded; &ldquo;all trials&rdquo; "
-        "repeats it over all trials, with a failure slower than every success. All tests are two-sided. The p values are "
-        f"not corrected for the number of pairs, which is {count}; those under 0.05 are bold.</p>"
+        f'<p class="small">Success is: {_text(CRITERION_NAMES[criterion])}. Rates are compared with Fisher&rsquo;s '
+        "exact test, steps to success with the Mann-Whitney U test (U of the first group) over the trials that succeeded; "
+        "&ldquo;all trials&rdquo; repeats it over all trials, with a failure slower than every success. "
+        "All tests are two-sided. The p values are not corrected for the number of pairs, "
+        f"which is {count}; those under 0.05 are bold.</p>"
     )
     return ["<h2>Differences</h2>", _table(heads, rows), note]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from bidnerf_core.errors import InputError
@@ -53,6 +54,14 @@ def new_figure(width: float, height: float) -> Any:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def save_figure(figure: Any, folder: Path, name: str) -> Path:
+    """Save a figure as SVG, whose path is returned, and as PNG beside it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / f"{name}.png", dpi=160)
+    figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+    return folder / f"{name}.svg"
 
 
 def line_look(place: int) -> dict[str, Any]:

@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from bidnerf_core.evaluation.errors import CRITERIA
+from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.groups import Group, situation_titles, situations
 from bidnerf_core.evaluation.plot_style import (
     SHORT_CRITERION_NAMES,
     line_look,
     new_figure,
     require_matplotlib,
+    save_figure,
     styled,
 )
 from bidnerf_core.evaluation.summary import NEVER, applies, steps_of, success_of
@@ -29,12 +31,14 @@ DrawPanel = Callable[[Any, list[Group]], None]
 class Figures:
     """Draws figures of ``groups`` and saves them as PNG and SVG in ``folder``. Raises ``InputError`` without matplotlib.
 
-    ``criterion`` is what counts as success in the figures that show one criterion only.
+    ``criterion`` is what counts as success in the figures that show one criterion only. Figures of steps have panels for
+    images without faults only, unless there are no such trials.
     """
 
     def __init__(self, groups: Sequence[Group], folder: Path, criterion: str) -> None:
         require_matplotlib()
         self.groups, self.folder, self.criterion = list(groups), folder, criterion
+        self.without_faults = [g for g in self.groups if g.situation.fault == NO_FAULT] or self.groups
         self.labels = list(dict.fromkeys(group.label for group in groups))
         self.titles = situation_titles(situations(groups))
 
@@ -55,7 +59,7 @@ class Figures:
                 panel.grid(axis="x")
             axes[0][0].set_yticks(places, [self._line_label(group) for group in shown])
             axes[0][0].set_ylim(max(places) + 0.7, min(places) - 0.7)
-            return self._saved(figure, "rates")
+            return save_figure(figure, self.folder, "rates")
 
     def steps(self) -> Path:
         """Draw box plots of steps to success, with whiskers to 1.5 times the interquartile range and a point a trial."""
@@ -110,7 +114,7 @@ class Figures:
             panel.set_xlim(left=0)
             panel.grid(which="major")
 
-        return self._panels(kind.partition("_")[0], draw, sharey=True, groups=self.groups)
+        return self._panels(kind.partition("_")[0], draw, sharey=True, groups=self.without_faults)
 
     def _panels(
         self,
@@ -121,7 +125,7 @@ class Figures:
         groups: Sequence[Group] | None = None,
     ) -> Path:
         """Draw one panel a situation with a legend below: of ``groups``, by default those that the criterion applies to."""
-        fitting = [group for group in self.groups if applies(self.criterion, group.results)]
+        fitting = [group for group in self.without_faults if applies(self.criterion, group.results)]
         shown = fitting if groups is None else groups
         places = situations(shown)
         columns = max(1, min(COLUMNS, len(places)))
@@ -137,7 +141,7 @@ class Figures:
             for panel in list(axes.flat)[len(places) :]:
                 panel.set_axis_off()
             self._legend(figure, shown)
-            return self._saved(figure, name)
+            return save_figure(figure, self.folder, name)
 
     def _legend(self, figure: Any, groups: Sequence[Group]) -> None:
         from matplotlib.lines import Line2D
@@ -180,13 +184,6 @@ class Figures:
 
     def _line_label(self, group: Group) -> str:
         return f"{self.titles[group.situation]}  ·  {group.label}  (n = {len(group.results)})"
-
-    def _saved(self, figure: Any, name: str) -> Path:
-        """Save a figure as SVG, whose path is returned, and as PNG beside it."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        figure.savefig(self.folder / f"{name}.png", dpi=160)
-        figure.savefig(self.folder / f"{name}.svg", metadata={"Date": None})
-        return self.folder / f"{name}.svg"
 
 
 def _lines(groups: Sequence[Group]) -> list[float]:

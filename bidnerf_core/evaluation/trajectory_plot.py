@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.evaluation.arcs import mean_up
 from bidnerf_core.evaluation.plot_style import new_figure, styled
-from bidnerf_core.evaluation.sequences import mean_up
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
@@ -94,4 +94,4 @@ def _draw_surface(
     near = np.flatnonzero((np.abs(points - middle) <= size).all(-1))
     some = near[:: max(1, -(-len(near) // SURFELS))]
     colours = surface.surfels.rgb[torch.from_numpy(some)].clamp(0, 1).numpy()
-    panel.scatter(*points[some].T, s=1.2, c=0.5 + 0.5 * colours, linewidths=0, rasterized=True)
+    panel.scatter(*points[some].T, s=2, c=0.3 + 0.7 * colours, linewidths=0, rasterized=True)

@@ -34,6 +34,7 @@ class Trial:
     device: str = "cpu"  # where the field computes
     depth: bool = True  # whether the method gets the measured depth
     depth_points: str | None = None  # folder of a COLMAP model whose points the method gets as depth rays
+    fault: str = "none"  # faults of the images and their sizes, as depth-scale:1.02+exposure:0.7
 
     @property
     def frame(self) -> str:

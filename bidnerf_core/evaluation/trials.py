@@ -23,6 +23,7 @@ from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.evaluation.errors import PoseError, pose_error
+from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.evaluation.fingerprint import InputDigests, folder_digest, views_digest
 from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.protocols import find_protocol
@@ -36,7 +37,7 @@ from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
 
 
 def run_trial(trial: Trial) -> TrialResult:
-    """Localize once. Raises ``InputError`` where the trial is impossible: an unknown name, or a method that lacks what it needs."""
+    """Localize once. Raises ``InputError`` for an unknown name, and for a method that lacks what it needs."""
     with one_thread():
         stored, dataset = opened(trial.map, trial.data, trial.device)
         views = trial_views(trial, dataset)
@@ -59,8 +60,11 @@ def _localized(
 
 
 def trial_views(trial: Trial, dataset: Dataset) -> list[View]:
-    """Return the views that the method gets, with T_world_camera, and without depth where the trial withholds it."""
-    views = dataset.views(trial.split, trial.frames)
+    """Return the views that the method gets, with T_world_camera.
+
+    They have the trial's faults, and no depth where the trial withholds it.
+    """
+    views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.split, trial.frames)]
     if trial.depth:
         return views
     return [View(replace(view.frame, depth=None), view.T_ref_camera) for view in views]

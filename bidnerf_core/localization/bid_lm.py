@@ -35,19 +35,20 @@ ExpertRays = Annotated[int, Range(7, 10**7), EXPERT]
 class BidLmStages(Settings):
     """Settings of the stages, from many poses and few rays at the coarsest level to one pose and many rays."""
 
-    search_rays: ExpertRays = 128  # for each of the poses about the start
-    coarse_poses: Poses = 6  # the best of these, which take steps at the coarsest level
-    coarse_steps: ExpertSteps = 4  # that each of them takes
-    coarse_rays: ExpertRays = 128  # for each of them
-    middle_poses: Poses = 2  # the best of these, which take more
-    middle_steps: ExpertSteps = 4  # that each of them takes
-    middle_rays: ExpertRays = 256  # for each of them
-    fine_steps: Steps = 6  # of the best one, in full detail
-    fine_rays: RayCount = 1024  # rendered for each of these steps
-    blur: Annotated[int, Range(1, 10**4), EXPERT] = 8  # colours of coarse steps are means over so many pixels
-    # times that poses are first centred on what was measured
+    search_rays: ExpertRays = 128  # number of rays that rank each of the poses about the start
+    coarse_poses: Poses = 6  # number of best poses that take steps at the coarsest level
+    coarse_steps: ExpertSteps = 4  # steps of each of the coarse poses
+    coarse_rays: ExpertRays = 128  # number of rays for each of the coarse poses
+    middle_poses: Poses = 2  # number of best coarse poses that take further steps
+    middle_steps: ExpertSteps = 4  # steps of each of the middle poses
+    middle_rays: ExpertRays = 256  # number of rays for each of the middle poses
+    fine_steps: Steps = 6  # steps of the best pose, in full detail
+    fine_rays: RayCount = 1024  # number of rays rendered for each of the fine steps
+    # width, in pixels, of the squares that colours are averaged over in coarse steps
+    blur: Annotated[int, Range(1, 10**4), EXPERT] = 8
+    # number of times that poses are first centred on what was measured
     centring: Annotated[int, Range(0, 100), EXPERT] = 2
-    # metres about the depth that fine steps sample; 0: all
+    # half width of the interval about the depth that fine steps sample, metres; 0: all
     depth_window: Annotated[NotNegative, EXPERT] = 0.0
 
 

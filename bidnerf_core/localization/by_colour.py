@@ -30,11 +30,12 @@ from bidnerf_core.settings import EXPERT, Range, Settings
 class ColourRefinementSettings(Settings):
     """Settings of the last steps on colour alone."""
 
-    # of each pose that the search left, coarsest level
+    # steps of each pose that the search left, at the coarsest level
     coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = 4
-    coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256  # for each of them
-    fine_steps: Annotated[int, Range(1, 10**5)] = 8  # of the best one, in full detail
-    fine_rays: Annotated[int, Range(7, 10**7)] = 1024  # rendered for each of these steps
+    # number of rays rendered for each of the coarse steps
+    coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256
+    fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
+    fine_rays: Annotated[int, Range(7, 10**7)] = 1024  # number of rays rendered for each of the fine steps
 
 
 @dataclass(frozen=True)

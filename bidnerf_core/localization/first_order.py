@@ -27,13 +27,13 @@ from bidnerf_core.settings import EXPERT, Above, Count, Settings
 class DescentSettings(Settings):
     """Settings of the rays of a step, and of the frame of updates."""
 
-    rays: Count = 2048  # in all, shared out equally among the views
-    level: int | None = None  # of the field: 0 is the coarsest, None the field itself
+    rays: Count = 2048  # number of rays a step, shared out equally among the views
+    level: int | None = None  # level of the field: 0 is the coarsest, None the field itself
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
     pivot: PivotName = "camera"  # what an update turns about: camera, world, or the middle of the scene
-    # sampled interval over [near, far]; the paper's "wide" is 2
+    # length of the sampled interval, in units of [near, far]; the paper's "wide" is 2
     wide: Annotated[float, Above(0.0, 100.0)] = 1.0
-    renew: Annotated[bool, EXPERT] = True  # draw pixels anew at each step; else once
+    renew: Annotated[bool, EXPERT] = True  # draw pixels anew at each step instead of once
 
 
 def descended(

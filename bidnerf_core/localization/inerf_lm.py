@@ -33,12 +33,12 @@ StepCount = Annotated[int, Range(1, 10**5), EXPERT]
 class ImageSearchSettings(Settings):
     """Settings of the search with small renderings, which become larger as poses become fewer."""
 
-    search_poses: StepCount = 24  # the best of the poses, which take steps on small renderings
-    search_steps: StepCount = 8  # that each of them takes
-    middle_poses: StepCount = 6  # the best of these, which take more on larger ones
-    middle_steps: StepCount = 6  # that each of them takes
-    last_steps: StepCount = 4  # of the best two, on the largest renderings
-    # pixels along the first renderings' longer side; the last have 3 times
+    search_poses: StepCount = 24  # number of best poses that take steps on small renderings
+    search_steps: StepCount = 8  # steps of each of the search poses
+    middle_poses: StepCount = 6  # number of best search poses that take steps on larger renderings
+    middle_steps: StepCount = 6  # steps of each of the middle poses
+    last_steps: StepCount = 4  # steps of the best two poses, on the largest renderings
+    # longer side of the first renderings, pixels; the last ones are 3 times as large
     width: Annotated[int, Range(4, 1000)] = 16
 
     def stages(self) -> tuple[ImageStage, ...]:

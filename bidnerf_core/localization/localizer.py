@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization.methods import METHODS, Method, find_method
+from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.matching import LandmarkMatcher
@@ -74,10 +74,12 @@ class Localizer:
 
         ``query``: a frame, or views with known relative poses (``T_ref_camera`` in any common frame): a rig, or a window of
         a sequence. ``start``: a guess at T_world_camera of the last view, which method ``auto`` does without.
-        ``depth_rays``: distances that another sensor measured, such as a lidar, in the frame of the last camera. Raises
-        ``InputError`` for a query that cannot be localized at all; a pose that is merely doubtful is returned, with an
-        ``outcome`` other than ``CONVERGED``.
+        ``depth_rays``: distances that another sensor measured, such as a lidar, in the frame of the last camera; methods
+        that use colour alone refuse them. Raises ``InputError`` for a query that cannot be localized at all; a pose that is
+        merely doubtful is returned, with an ``outcome`` other than ``CONVERGED``.
         """
+        if depth_rays is not None:
+            require_use_of_depth(self.method)
         problem = rig(
             self.map, _views(query), None if start is None else start_pose(start), depth_rays, self.matcher
         )

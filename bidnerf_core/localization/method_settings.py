@@ -34,12 +34,14 @@ class ColourSettings(Settings):
 class DepthSettings(Settings):
     """Settings of the depth term, which applies where depth was measured."""
 
-    depth_weight: NotNegative = 1.0  # lambda_d, beside the photometric term's 1
+    depth_weight: NotNegative = 1.0  # weight of the depth term; the photometric term has weight 1
     depth_loss: RobustName = "huber"  # robust loss of depth differences
     depth_scale: Positive = 0.1  # depth difference, metres, at which outliers begin
     depth_residual: Annotated[str, OneOf(DEPTH_RESIDUALS), EXPERT] = "distance"  # how depths are compared
-    depth_rays: Annotated[int, Range(0, 10**7), EXPERT] = 512  # drawn from a sensor with rays of its own
-    free_space_weight: Annotated[float, Range(0.0), EXPERT] = 0.0  # of matter in front of what was measured
+    # number of rays drawn from a sensor with rays of its own
+    depth_rays: Annotated[int, Range(0, 10**7), EXPERT] = 512
+    # weight of the term that penalises matter in front of measured depth
+    free_space_weight: Annotated[float, Range(0.0), EXPERT] = 0.0
 
 
 def objective_of(
@@ -68,15 +70,15 @@ def objective_of(
 class AdamSettings(Settings):
     """Settings of Adam's steps and of when they end."""
 
-    max_steps: Count = 200  # at most
-    learning_rate: Annotated[float, Above(0.0, 1e3)] = 0.01  # metres and radians a step, at first
-    decay: Annotated[float, Above(0.0, 1.0)] = 0.8  # factor on the learning rate ...
-    decay_steps: Count = 100  # ... after so many steps
-    # stop once the mean loss of 20 steps is below it (epsilon of Alg. 1); 0: never
+    max_steps: Count = 200  # largest number of steps
+    learning_rate: Annotated[float, Above(0.0, 1e3)] = 0.01  # initial length of a step, metres and radians
+    decay: Annotated[float, Above(0.0, 1.0)] = 0.8  # factor by which the learning rate falls in decay_steps
+    decay_steps: Count = 100  # number of steps in which the learning rate falls by decay
+    # stop once the mean loss of 20 steps is below this (epsilon of Alg. 1); 0: never
     stop_loss: NotNegative = 0.0
-    # stop once the mean length of 20 steps is; 0: never
+    # stop once the mean length of 20 steps is below this (metres, radians); 0: never
     stop_step: Annotated[float, Range(0.0), EXPERT] = 0.0
-    # the last pose, or that after the 20 steps of least mean loss
+    # pose to answer with: the last, or the one after the 20 steps of least mean loss
     answer: Annotated[AnswerName, EXPERT] = "last"
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
 
@@ -85,9 +87,11 @@ class AdamSettings(Settings):
 class SpreadSettings(Settings):
     """Settings of the poses near the start that are tried as well."""
 
-    poses: Annotated[int, Range(1, 10**5)] = 32  # how many, the start among them; 1: the start alone
-    spread_translation: NotNegative = 0.3  # standard deviation along each axis of the camera, metres
-    spread_rotation: NotNegative = 0.12  # standard deviation about each, radians
+    # number of poses tried, the start among them; 1: the start alone
+    poses: Annotated[int, Range(1, 10**5)] = 32
+    # standard deviation of the poses along each axis of the camera, metres
+    spread_translation: NotNegative = 0.3
+    spread_rotation: NotNegative = 0.12  # standard deviation of the poses about each axis, radians
 
 
 @dataclass(frozen=True)
@@ -98,10 +102,12 @@ class RefinementSettings(Settings):
     # what an update turns about: middle of the scene, camera, world
     pivot: Annotated[PivotName, EXPERT] = "scene"
     exposure: bool = False  # estimate a gain and a bias of each colour channel
-    surface_sigma: NotNegative = 0.03  # metres by which the map's surfaces may be off, in coarse steps
-    least_weight: Annotated[float, Range(0.0, 0.999999), EXPERT] = 0.01  # samples below it have no derivative
-    stop_step: Annotated[float, Range(0.0), EXPERT] = 1e-4  # a stage ends at a shorter step (metres, radians)
-    # within the depth window of a stage that has one
+    surface_sigma: NotNegative = 0.03  # uncertainty of the map's surfaces in coarse steps, metres
+    # rendering weight below which a sample has no derivative
+    least_weight: Annotated[float, Range(0.0, 0.999999), EXPERT] = 0.01
+    # length of a step below which a stage ends (metres, radians)
+    stop_step: Annotated[float, Range(0.0), EXPERT] = 1e-4
+    # number of samples within the depth window of a stage that has one
     window_samples: Annotated[int, Range(1, 10**4), EXPERT] = 12
 
 
@@ -109,8 +115,9 @@ class RefinementSettings(Settings):
 class RenderedThresholds(Settings):
     """Thresholds for accepting an answer, measured on fresh rendered rays."""
 
-    converged_inliers: NotNegative = 0.93  # share of the rays that render what was measured, at least
-    converged_step: NotNegative = 0.02  # length of the step that they ask for, at most (metres, radians)
+    # least share of rays that render what was measured, for an accepted answer
+    converged_inliers: NotNegative = 0.93
+    converged_step: NotNegative = 0.02  # largest step that those rays may still ask for (metres, radians)
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,16 @@ from bidnerf_core.settings import from_flat
 
 @dataclass(frozen=True)
 class Method:
-    """A localization method: its function, the frozen dataclass of its settings, and whether it needs a start."""
+    """A localization method: its function and the frozen dataclass of its settings.
+
+    ``needs_start``: whether it needs a guess at the pose. ``uses_depth``: whether it uses measured depth.
+    """
 
     run: Callable[[Problem, Any, int], Localization]
     config_type: type
     summary: str
     needs_start: bool
+    uses_depth: bool = True
 
 
 METHODS = {
@@ -35,12 +39,14 @@ METHODS = {
         False,
     ),
     "bid": Method(bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)", True),
-    "inerf": Method(inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)", True),
+    "inerf": Method(
+        inerf, InerfConfig, "Adam on the colours of one image in full detail (iNeRF)", True, False
+    ),
     "bid-lm": Method(
         bid_lm, BidLmConfig, "second-order steps on colour and depth, from coarse to fine", True
     ),
     "inerf-lm": Method(
-        inerf_lm, InerfLmConfig, "second-order steps on colour alone, from coarse to fine", True
+        inerf_lm, InerfLmConfig, "second-order steps on colour alone, from coarse to fine", True, False
     ),
 }
 
@@ -54,6 +60,13 @@ def find_method(name: str) -> Method:
     if chosen is None:
         raise InputError(f"method {name!r} is unknown, expected one of {', '.join(sorted(METHODS))}")
     return chosen
+
+
+def require_use_of_depth(method: str) -> None:
+    """Raise ``InputError`` for a method that would leave depth points out, where they were given on purpose."""
+    if not find_method(method).uses_depth:
+        others = " or ".join(name for name, other in METHODS.items() if other.uses_depth)
+        raise InputError(f"method {method!r} uses colour alone, got depth points; take method {others}")
 
 
 def settings_of(method: str, values: dict[str, Any], where: str = "config") -> Any:

@@ -30,10 +30,12 @@ WITNESSES = 8
 class BakeConfig(Settings):
     """Settings of baking."""
 
-    rays: Annotated[int, Range(1000, 10**9)] = 300_000  # rendered in all, shared out equally among the views
-    cells: Annotated[int, Range(1000, 10**9)] = 4_000_000  # of the grid, at most
-    opacity: Annotated[float, Above(0, 0.999)] = 0.9  # a ray with a lower opacity meets no surface
-    agreement: Annotated[int, Range(0, WITNESSES)] = 2  # other views in which a point must lie on the surface
+    # number of rays rendered, shared out equally among the views
+    rays: Annotated[int, Range(1000, 10**9)] = 300_000
+    cells: Annotated[int, Range(1000, 10**9)] = 4_000_000  # largest number of cells of the grid
+    opacity: Annotated[float, Above(0, 0.999)] = 0.9  # opacity below which a ray meets no surface
+    # number of other views in which a point must lie on the surface
+    agreement: Annotated[int, Range(0, WITNESSES)] = 2
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ Any detector that turns an image into ``Keypoints``, a learned one included, can
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.settings import Range, Settings
 
 NORM = 512.0
 """Length of a quantised descriptor, as is customary for SIFT: it makes good use of the range of a byte."""
@@ -48,23 +48,16 @@ class Features(Protocol):
 
 
 @dataclass(frozen=True)
-class Sift:
+class Sift(Settings):
     """SIFT (Lowe 2004) by OpenCV, with the root normalisation of Arandjelovic and Zisserman 2012."""
 
-    count: int = 2000  # largest number of keypoints: those of highest contrast are kept
-    contrast: float = 0.01  # least contrast of a keypoint; OpenCV's default of 0.04 leaves few indoors
-
+    # largest number of keypoints: those of highest contrast are kept
+    count: Annotated[int, Range(1, 10**6)] = 2000
+    # least contrast of a keypoint; OpenCV's default of 0.04 leaves few indoors
+    contrast: Annotated[float, Range(0.0, 0.999)] = 0.01
     # Pixels along the longer side above which an image is reduced first: a phone's twelve megapixels hold no more
     # keypoints of the sizes that maps are made of, and take half a minute.
-    largest: int = 800
-
-    def __post_init__(self) -> None:
-        if self.largest < 16:
-            raise InputError(f"largest side of an image is {self.largest} pixels, expected at least 16")
-        if self.count < 1:
-            raise InputError(f"count of keypoints is {self.count}, expected at least 1")
-        if not 0 <= self.contrast < 1:
-            raise InputError(f"contrast of keypoints is {self.contrast}, expected 0 to 1")
+    largest: Annotated[int, Range(16, 10**5)] = 800
 
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         # The precise upscaling maps index x to 2 x: without it all keypoints of the first octave are a quarter of a

@@ -10,16 +10,16 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
 
-EDGE = 0.05
+DEPTH_EDGE = 0.05
 """Largest relative change of the depth around a keypoint; more indicates a depth edge."""
-HEARD = 6
+LEAST_MEASURED = 6
 """Least number of the nine pixels around a keypoint that must have measured depth."""
 DEFAULT_NOISE = 0.01
 """Relative standard deviation of depth that is assumed if it cannot be estimated."""
 ENOUGH_DEPTHS = 30
 """Least number of triangulated observations with depth from which the depth noise is estimated."""
-EDGE_APART = 3.0
-"""A depth farther from the mean of its track than this many standard deviations is an outlier."""
+OUTLIER_DEVIATIONS = 3.0
+"""Distance from the mean of its track, in standard deviations, beyond which a depth is an outlier."""
 
 
 def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
@@ -41,8 +41,8 @@ def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, 
     known = around.isfinite()
     low = torch.where(known, around, torch.inf).amin(1)
     high = torch.where(known, around, 0).amax(1)
-    flat = (known.sum(1) >= HEARD) & (high - low <= EDGE * median)
-    return torch.where(flat, median, 0)
+    smooth = (known.sum(1) >= LEAST_MEASURED) & (high - low <= DEPTH_EDGE * median)
+    return torch.where(smooth, median, 0)
 
 
 def depth_noise(sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]) -> float:
@@ -69,7 +69,7 @@ def placed(
     information = _information(sightings, depth, relative, pixel_noise)
     mean, _ = _weighted(world, information, observations.point)
     off = (world - mean[observations.point])[..., None]
-    agree = (off.mT @ information @ off)[:, 0, 0] <= EDGE_APART**2
+    agree = (off.mT @ information @ off)[:, 0, 0] <= OUTLIER_DEVIATIONS**2
     tracks = torch.bincount(observations.point)
     majority = 2 * torch.bincount(observations.point[agree], minlength=len(tracks)) > tracks
     kept = agree & majority[observations.point]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import radians
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -30,33 +30,26 @@ from bidnerf_core.mapping.triangulation import (
     refined,
 )
 from bidnerf_core.mapping.view_pairs import likely_pairs
+from bidnerf_core.settings import Above, Range, Settings
 
 _Item = TypeVar("_Item")
 Result = TypeVar("Result")
 
 TOLERANCES = (10.0, 4.0, 2.0)
 """Largest reprojection error (pixels) of an observation that stays in its track, round by round."""
-TWO_VIEWS = 1.5
+TWO_VIEW_TOLERANCE = 1.5
 """Largest reprojection error (pixels) in a track of only two images."""
 
 
 @dataclass(frozen=True)
-class LandmarkConfig:
+class LandmarkConfig(Settings):
     """Settings of building landmarks."""
 
-    neighbours: int = 8  # images that each image is matched with
-    parallax: float = 2.0  # degrees between the rays, at least; with less, measured depth places a point
-    singles: bool = (
-        True  # whether keypoints of a single image become landmarks where their depth was measured
-    )
-    most: int = 200_000  # landmarks; 168 bytes each with SIFT
-
-    def __post_init__(self) -> None:
-        for name, least, most in (("neighbours", 1, 1000), ("most", 1, 10**8)):
-            if not least <= getattr(self, name) <= most:
-                raise InputError(f"{name} is {getattr(self, name)}, expected {least} to {most}")
-        if not 0 < self.parallax < 90:
-            raise InputError(f"parallax is {self.parallax} degrees, expected more than 0 and less than 90")
+    neighbours: Annotated[int, Range(1, 1000)] = 8  # number of images that each image is matched with
+    # least angle between the rays of a point, degrees; below it, measured depth places the point
+    parallax: Annotated[float, Above(0.0, 89.0)] = 2.0
+    singles: bool = True  # make landmarks of keypoints in a single image where their depth was measured
+    most: Annotated[int, Range(1, 10**8)] = 200_000  # largest number of landmarks, 168 bytes each with SIFT
 
 
 def build_landmarks(
@@ -132,18 +125,18 @@ def _triangulated(
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
     for tolerance in TOLERANCES:
         points, covariance = refined(observations.sightings, points, tolerance / 2)
-        observations = observations[_believable(observations.sightings, points, tolerance)]
+        observations = observations[_inliers(observations.sightings, points, tolerance)]
     wide = parallax(observations.sightings, points) >= least
     observations, numbers = observations[wide[observations.point]].compacted()
     return observations, points[numbers], covariance[numbers]
 
 
-def _believable(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
+def _inliers(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float) -> Bool[Tensor, "m"]:
     """Return which keypoints fit their points, for points that at least two keypoints fit."""
     fit = fitting(sightings, points, tolerance)
     seen = observations_per_point(sightings[fit], len(points))
     pairs = seen[sightings.point] == 2
-    fit &= ~pairs | fitting(sightings, points, min(tolerance, TWO_VIEWS))
+    fit &= ~pairs | fitting(sightings, points, min(tolerance, TWO_VIEW_TOLERANCE))
     return fit & (observations_per_point(sightings[fit], len(points)) >= 2)[sightings.point]
 
 

@@ -11,7 +11,7 @@ from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.resection import ObservedPoints, resect
 from bidnerf_core.mapping.triangulation import Sightings
 
-SEEN = 20
+LEAST_VISIBLE_POINTS = 20
 """Least number of points from which the pose of an image is estimated."""
 ENOUGH_IMAGES = 8
 """Least number of images from which the 6x6 covariance is estimated."""
@@ -24,18 +24,18 @@ def pose_scatter(
 ) -> Float[Tensor, "6 6"]:
     """Return the covariance of the right updates from given to resected poses; zero if there are too few images.
 
-    ``noise`` is that of the keypoints, pixels. Each image takes part in triangulating the points that it sees and pulls them
-    towards its own error, which is corrected for: if a point has k views, resection shows the factor 1 - 1/k of the pose
+    ``noise`` is that of the keypoints, pixels. Each image takes part in triangulating the points that it sees, which biases
+    them towards its own error. This is corrected for: if a point has k views, resection shows the factor 1 - 1/k of the pose
     variance, whereas the pose of a new image would show 1 + 1/k.
     """
     sightings, image = tracked.sightings, tracked.image
     seen = torch.bincount(sightings.point)[sightings.point].double()
     updates = []
-    for number in (torch.bincount(image) >= SEEN).nonzero()[:, 0].tolist():
-        mine = (image == number).nonzero()[:, 0]
+    for number in (torch.bincount(image) >= LEAST_VISIBLE_POINTS).nonzero()[:, 0].tolist():
+        own = (image == number).nonzero()[:, 0]
         T = tracked.images[number].T_world_camera
-        views = float(seen[mine].mean())
-        found = resect(_seen_by(sightings[mine], positions), T, noise)
+        views = float(seen[own].mean())
+        found = resect(_observed_points(sightings[own], positions), T, noise)
         update = (T.inverse() @ found.T_world_rig).log()
         updates.append(update * ((1 + 1 / views) / (1 - 1 / views)) ** 0.5)
     if len(updates) < ENOUGH_IMAGES:
@@ -43,13 +43,13 @@ def pose_scatter(
     return robust_covariance(torch.stack(updates))
 
 
-def _seen_by(sightings: Sightings, positions: Float[Tensor, "n 3"]) -> ObservedPoints:
+def _observed_points(sightings: Sightings, positions: Float[Tensor, "n 3"]) -> ObservedPoints:
     count = len(sightings)
-    nothing = torch.zeros((count, 3), dtype=torch.float64)
+    zeros = torch.zeros((count, 3), dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
     return ObservedPoints(
-        positions[sightings.point], nothing[:, :2], nothing + torch.tensor([0.0, 0.0, 1.0]),
-        sightings.image, sightings.focal, nothing[:, 0], eye, nothing,
+        positions[sightings.point], zeros[:, :2], zeros + torch.tensor([0.0, 0.0, 1.0]),
+        sightings.image, sightings.focal, zeros[:, 0], eye, zeros,
     )  # fmt: skip
 
 

@@ -29,7 +29,8 @@ def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
     found = {
         "positions": parts.positions, "normals": parts.normals, "rgb": parts.rgb, "rgb_gradient": parts.rgb_gradient,
         "nearest": surface.nearest_in_cell, "keyframes": surface.keyframes,
-        "lower": torch.tensor(surface.grid.lower, dtype=torch.float64), "cell": torch.tensor(surface.cell, dtype=torch.float64),
+        "lower": torch.tensor(surface.grid.lower, dtype=torch.float64),
+        "cell": torch.tensor(surface.cell, dtype=torch.float64),
     }  # fmt: skip
     return {name: found[name].to(kind).contiguous().clone() for name, (_, kind) in SURFACE_KINDS.items()}
 

@@ -13,16 +13,15 @@ from torch import Tensor
 from bidnerf_core.mapping.features import Keypoints, squared_distances
 from bidnerf_core.se3 import SE3
 
-BAND = 2.0
+EPIPOLAR_BAND = 2.0
 """Largest distance (pixels) of a match from the epipolar line."""
 TRACK_RATIO = 0.95
 """Largest ratio of a match's descriptor distance to that of the next best among all keypoints of the image."""
 RATIO_IN_BAND = 0.85
 """Largest ratio of a match's descriptor distance to that of the next best near the epipolar line."""
-TRACK_APART = 4.0
-"""Keypoints closer together than this (pixels) are one: SIFT returns one for each dominant orientation."""
-
-ONE_KEYPOINT = 1e-12
+DUPLICATE_DISTANCE = 4.0
+"""Distance (pixels) below which keypoints are duplicates: SIFT returns one for each dominant orientation."""
+LEAST_BASELINE = 1e-12
 """Distance (metres) between two cameras below which epipolar lines are undefined."""
 
 
@@ -58,7 +57,7 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
     mutual = banded.argmin(dim=0)[partner] == torch.arange(len(partner))
     rows = (mutual & best.isfinite()).nonzero()[:, 0]
     best, partner = best[rows], partner[rows]
-    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < TRACK_APART
+    near = torch.cdist(b.keypoints.pixels[partner], b.keypoints.pixels) < DUPLICATE_DISTANCE
     next_best = distance[rows].masked_fill(near, torch.inf).amin(dim=1)
     next_in_band = banded[rows].masked_fill(near, torch.inf).amin(dim=1)
     good = (best < RATIO_IN_BAND**2 * next_in_band) & (best < TRACK_RATIO**2 * next_best)
@@ -67,7 +66,7 @@ def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:
 
 
 def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
-    """Return whether each keypoint of ``b`` lies within ``BAND`` of the epipolar half-line of each keypoint of ``a``.
+    """Return whether each keypoint of ``b`` lies near the epipolar half-line of each keypoint of ``a``.
 
     The half-line begins at the image of the ray's point at infinity. If the cameras are at the same place, it reduces to
     that point.
@@ -81,8 +80,8 @@ def _on_line(a: PosedKeypoints, b: PosedKeypoints) -> Bool[Tensor, "n m"]:
     forward = step / size.clamp(min=1e-300)
     sideways = torch.stack([-forward[:, 1], forward[:, 0]], dim=-1)
     seen = torch.cat([b.rays[:, :2], torch.ones_like(b.rays[:, :1])], dim=-1).float().mT
-    band = BAND / b.focal
-    if float(torch.linalg.vector_norm(base)) < ONE_KEYPOINT:
+    band = EPIPOLAR_BAND / b.focal
+    if float(torch.linalg.vector_norm(base)) < LEAST_BASELINE:
         return torch.cdist(start.float(), seen[:2].mT) <= band
     across, along = (
         torch.cat([axis, -(axis * start).sum(-1, keepdim=True)], dim=-1).float() @ seen

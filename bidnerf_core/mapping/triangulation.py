@@ -54,7 +54,7 @@ def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
     across = torch.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None]
     matrix = _summed(across, sightings.point, count)
     right = _summed((across @ sightings.centre[..., None])[..., 0], sightings.point, count)
-    return torch.linalg.solve(_held(matrix), right)
+    return torch.linalg.solve(_damped(matrix), right)
 
 
 def refined(
@@ -66,9 +66,9 @@ def refined(
     """
     for _ in range(TRIANGULATION_STEPS):
         matrix, gradient = _normal_equations(sightings, points, scale)
-        points = points - torch.linalg.solve(_held(matrix), gradient)
+        points = points - torch.linalg.solve(_damped(matrix), gradient)
     matrix, _ = _normal_equations(sightings, points, scale)
-    return points, torch.linalg.inv(_held(matrix))
+    return points, torch.linalg.inv(_damped(matrix))
 
 
 def _normal_equations(
@@ -120,7 +120,7 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
     return 1.4826 * float(residual.abs().median())
 
 
-def _held(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
+def _damped(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=1e-30)
     return matrix + DAMPING * size[:, None, None] * torch.eye(3, dtype=matrix.dtype)
 

@@ -107,7 +107,7 @@ def views(scene: ClosedFormScene, intrinsics: Intrinsics, poses: Sequence[SE3]) 
 
 
 def _may_meet(primitive: Primitive, origins: Float[Tensor, "3 #n"], rays: Float[Tensor, "3 n"]) -> Tensor:
-    """Return the indices of the rays that may meet the primitive: from a shared origin, those in the cone around its ball."""
+    """Return the indices of the rays that may meet the primitive: from one origin, those in the cone around its ball."""
     towards = primitive.T_world_shape.translation.to(rays) - origins[:, 0]
     beyond = float(towards @ towards) - (primitive.shape.reach * 1.01 + 1e-3) ** 2
     if origins.shape[1] > 1 or beyond <= 0:

@@ -198,7 +198,7 @@ def _decoration() -> list[Primitive]:
 def _solid(
     shape: Shape, place: Sequence[float], texture: Texture, yaw: float = 0, pitch: float = 0, roll: float = 0
 ) -> Primitive:
-    """Return a shape that is rotated about x (roll), then y (pitch), then z (yaw), in degrees, and moved to ``place`` (metres)."""
+    """Return a shape rotated about x (roll), then y (pitch), then z (yaw), in degrees, and moved to ``place`` (metres)."""
     rotation = torch.eye(3, dtype=torch.float64)
     for axis, angle in enumerate((roll, pitch, yaw)):
         turn = torch.zeros(6, dtype=torch.float64)

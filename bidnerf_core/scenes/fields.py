@@ -69,7 +69,7 @@ class HomogeneousBall:
         return FieldValues(density, positions.new_tensor(self.rgb).expand(positions.shape))
 
     def chord(self, rays: Rays) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
-        """Return the distances (metres) at which each ray enters and leaves the ball in [near, far]; equal where it misses."""
+        """Return the distances (metres) at which each ray enters and leaves the ball in [near, far]; equal if it misses."""
         origins, directions = torch.broadcast_tensors(rays.origins, rays.directions)
         starts = (origins - origins.new_tensor(self.centre)).reshape(-1, 3).T
         enter, leave = Sphere(self.radius).interval(starts, directions.reshape(-1, 3).T)

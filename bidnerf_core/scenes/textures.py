@@ -27,8 +27,8 @@ DRIFT = ((2.3, 1.1, -1.7), (-1.3, 2.1, 1.9), (1.6, -1.9, 2.2))
 class Waves:
     """Two colours mixed by the product of plane waves (radians per metre), with a slow drift of the hue.
 
-    One wave gives stripes, three give a chequered solid. The drift makes a pattern's periods differ, so that a pose cannot be
-    off by one of them.
+    One wave gives stripes, three give a chequered solid. The drift makes a pattern's periods differ, so that a pose cannot
+    be off by one of them.
     """
 
     first: Colour

@@ -22,7 +22,7 @@ def look_at(
     target: Sequence[float] | Float[Tensor, "3"],
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> SE3:
-    """Return ``T_world_camera`` (float64) of a camera at ``eye`` that has ``target`` in the middle of its image and ``up`` upwards."""
+    """Return ``T_world_camera`` (float64) of a camera at ``eye`` that looks at ``target`` with ``up`` upwards."""
     position = torch.as_tensor(eye, dtype=torch.float64)
     forward = torch.as_tensor(target, dtype=torch.float64) - position
     if not torch.linalg.vector_norm(forward) > 0:
@@ -59,7 +59,7 @@ def orbit(
 
 
 def look_around(bounds: SceneBounds, count: int, seed: int = 0, spread: float = 0.5) -> list[SE3]:
-    """Return poses (``T_world_camera``) inside a room, at head height, facing all compass directions, tilted up or down a little.
+    """Return poses (``T_world_camera``) in a room, at head height, in all compass directions, tilted up or down a little.
 
     Each camera is about ``spread`` of the way from the middle of the room to the wall behind it, to see much of the room.
     """

@@ -79,7 +79,7 @@ DETACHED = "expected one: query must not detach positions or run under no_grad"
 def agreement(
     ask: Asked, moved: Callable[[float], Tensor], speed: Float[Tensor, "n 3"], dtype: torch.dtype
 ) -> Float[Tensor, ""]:
-    """Return the fraction of values whose derivative along a curve is that of finite differences, at the best of several steps.
+    """Return the fraction of values whose derivative along a curve agrees with finite differences at the best step size.
 
     ``moved(t)`` are the points at ``t`` on their curves, ``speed`` (n 3) is its derivative at 0.
     """

@@ -16,7 +16,7 @@ BACKGROUND = (0.1, 0.5, 0.9)
 
 
 def check_intervals(field: RadianceField) -> None:
-    """Check that valid samples are sorted, disjoint and within [near, far], and that rays that miss have none; also for no rays."""
+    """Check that valid samples are sorted, disjoint and in [near, far], and that rays that miss have none; also no rays."""
     for of, rays in awkward_rays().items():
         for jitter, how in ((None, ""), (_generator(), " with jitter")):
             _check_order(field, rays, sample(field, rays, of + how, jitter), of + how)

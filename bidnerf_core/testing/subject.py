@@ -54,7 +54,7 @@ class Subject:
             return self._backend().build(self._config() if config is None else config, BOUNDS)
 
     def _trained(self) -> Any:
-        """Return a field that was trained on RGB-D views and is frozen like that of a loaded map; one for each test class."""
+        """Return a field trained on RGB-D views and frozen like that of a loaded map; one for each test class."""
         kept = type(self).__dict__.get("_kept")
         if kept is None:
             kept = self._build()

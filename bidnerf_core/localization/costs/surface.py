@@ -247,7 +247,8 @@ def _distance_terms(
 
 
 def _colour_terms(
-    error: Float[Tensor, "h p 3"], derivative: Float[Tensor, "h p 3 3"], weight: Tensor, found: Correspondences, cloud: PointCloud
+    error: Float[Tensor, "h p 3"], derivative: Float[Tensor, "h p 3 3"], weight: Tensor,
+    found: Correspondences, cloud: PointCloud,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return the gradient and the Hessian of half the weighted squares of three residuals a point."""
     count = len(cloud)

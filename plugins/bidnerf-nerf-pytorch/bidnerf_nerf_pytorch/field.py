@@ -18,7 +18,7 @@ from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 class FieldConfig(NetworkConfig):
     """Architecture of both networks, and the number of their samples."""
 
-    coarse_samples: Count = 64  # a ray
+    coarse_samples: Count = 64  # samples of the coarse network along a ray
     fine_samples: Count = 64  # further samples of the fine network, placed by the coarse one
 
 

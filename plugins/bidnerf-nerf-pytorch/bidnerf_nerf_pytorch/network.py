@@ -16,13 +16,16 @@ from bidnerf_core.settings import Count, Range, Settings
 class NetworkConfig(Settings):
     """Architecture of one network."""
 
-    layers: Count = 4  # before the density
-    width: Annotated[int, Range(2, 10**7)] = 128  # of each; the layer that takes the direction has half of it
+    layers: Count = 4  # hidden layers before the density
+    # units of a hidden layer; the layer that takes the direction has half of them
+    width: Annotated[int, Range(2, 10**7)] = 128
     skips: tuple[int, ...] = ()  # number of layers before each one that takes the position once more
+    # number of frequencies of the position's sines and cosines
     position_frequencies: Annotated[int, Range(0, 64)] = 10
     position_input: bool = True  # feed the position itself in, beside its sines
+    # number of frequencies of the direction's sines and cosines
     direction_frequencies: Annotated[int, Range(0, 64)] = 4
-    direction_input: bool = True
+    direction_input: bool = True  # feed the direction itself in, beside its sines
     octaves: bool = True  # frequencies 1, 2, 4 ... 2^(n-1); otherwise n in equal steps between the same ends
     view_dependent: bool = True  # whether colour depends on the direction
 

@@ -23,11 +23,11 @@ class TemplateConfig:
     """Each field is an option of ``bidnerf train`` and is stored with the map, so it must be what JSON can hold."""
 
     resolution: int = 96  # grid points along each axis of the scene's box
-    samples: int = 96  # a ray
-    steps: int = 1500  # of the optimizer
-    rays_per_step: int = 2048
-    learning_rate: float = 0.1
-    depth_weight: float = 0.1  # of the depth term beside the colour term
+    samples: int = 96  # samples along a ray
+    steps: int = 1500  # steps of the optimizer
+    rays_per_step: int = 2048  # number of rays a step
+    learning_rate: float = 0.1  # initial learning rate
+    depth_weight: float = 0.1  # weight of the depth term beside the colour term
 
 
 class TemplateField(nn.Module):

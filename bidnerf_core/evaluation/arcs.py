@@ -1,4 +1,4 @@
-"""Sequences of images around an object: frames of a split that are a given angle apart (BID-NeRF, Table 2)."""
+"""Arcs of images around an object: frames of a split that are a given angle apart (BID-NeRF, Table 2)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bidnerf_core.se3 import SE3
 def turned_about(
     T_world_camera: SE3, middle: Float[Tensor, "3"], up: Float[Tensor, "3"], angle_deg: float
 ) -> SE3:
-    """Return the camera's pose after a rotation of camera and all about the axis ``up`` through ``middle`` (metres, world)."""
+    """Return the camera's pose after a rotation about the axis ``up`` through ``middle`` (metres, world)."""
     phi = math.radians(angle_deg) * torch.nn.functional.normalize(up, dim=0)
     turn = SE3.exp(torch.cat([torch.zeros_like(phi), phi]))
     moved = T_world_camera.translation - middle
@@ -23,7 +23,7 @@ def turned_about(
 
 
 def seen_middle(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
-    """Return the point nearest to all optical axes (least squares; metres, world), which cameras around an object look at."""
+    """Return the point nearest to all optical axes in least squares (metres, world): what cameras around it look at."""
     eye = torch.eye(3, dtype=torch.float64)
     across = [eye - torch.outer(T.rotation[:, 2], T.rotation[:, 2]) for T in poses]
     normal = torch.stack(across).sum(0) + 1e-9 * eye  # parallel axes have no such point, and any one does
@@ -38,7 +38,7 @@ def mean_up(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
     return torch.nn.functional.normalize(mean if mean.norm() > 1e-3 else -poses[0].rotation[:, 1], dim=0)
 
 
-def sequence(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
+def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
     """Return the indices of ``count`` frames that end with ``last`` and lie ``angle_deg`` apart about their common middle.
 
     At each step about the vertical axis, the frame with the nearest direction from the middle is chosen. Both senses of

@@ -1,0 +1,286 @@
+r"""How right and how honest localization is on images with faults.
+
+    python benchmarks/faults.py MAP:DATA [MAP:DATA ...] [--faults FAULT ...] [--foreign DATA ...] [--frames 20] [--rgb | --rgbd]
+
+Each fault is applied to test frames, which method ``auto`` localizes without a start. ``docs/faults.md`` lists the faults; they
+are given as to ``bidnerf evaluate --fault``, and by default all are tried at the sizes of the catalogue. ``--foreign`` takes
+queries from other datasets: no answer to them is right. Frames whose index in the test split is 1 modulo 5 are for tuning and
+left out; ``--tuning-frames`` takes those only.
+
+Every answer is kept as a row of ``NAME.rows.jsonl`` beside the record, with all its numbers and the errors, so that an
+interrupted run goes on where it stopped and other programs can learn from them. A row is known by the contents of its map,
+its query and the settings, not by the program's version: remove the file, or take another ``--name``, to measure a change of
+the program. Results: how many of n answers are right (within 5 degrees and 0.05 units), strictly right (1 degree, 0.02),
+converged, silent (converged and wrong), and right but rejected; how many of the converged lie inside the bound that their
+covariance puts at 95 %; and the median CPU time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from scipy.stats import chi2
+
+from bidnerf_core import Localization, Localizer, Map, load_map
+from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.bench import local_processes
+from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error, success_rate
+from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand, faulty, find_fault, parse_faults
+from bidnerf_core.evaluation.fingerprint import views_digest
+from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.evaluation.trials import parse_settings
+from bidnerf_core.frames import View
+from bidnerf_core.serialization import to_plain
+
+RESULTS = Path(__file__).resolve().parent / "results"
+FOREIGN = "another-scene"
+BOUND = float(chi2.ppf(0.95, 6))
+"""Normalised squared error below which nineteen of twenty errors lie, where the covariance is right."""
+
+
+@dataclass(frozen=True)
+class Query:
+    """One image to localize: a frame of a dataset with a fault."""
+
+    map: str
+    data: str  # folder that the frame is from
+    frame: str
+    depth: bool
+    fault: str
+    foreign: bool
+    config: str  # JSON of the settings that differ from the defaults
+    seed: int = 0
+
+    @property
+    def cell(self) -> tuple[str, str, str]:
+        """The scene, RGB or RGB-D, and the fault, by which answers are counted."""
+        fault = f"{FOREIGN}:{Path(self.data).name}" if self.foreign else self.fault
+        return Path(self.map).name, "RGB-D" if self.depth else "RGB", fault
+
+    def view(self) -> View:
+        """Return the faulty image, with its true pose (of another scene's image: a pose in that scene)."""
+        dataset = dataset_of(self.data, map_of(self.map).bounds.background)
+        view = faulty(dataset.views("test", [self.frame])[0], self.fault, self.seed)
+        return view if self.depth else View(replace(view.frame, depth=None), view.T_ref_camera)
+
+    def key(self) -> list[Any]:
+        """Return what the answer depends on, by content."""
+        info = map_of(self.map).info
+        baked = [info.weights, str(info.landmarks), str(info.surface)]
+        return [*self.cell, self.frame, self.seed, self.config, *baked, views_digest([self.view()])]
+
+
+@lru_cache(maxsize=2)
+def map_of(folder: str) -> Map:
+    """Return a map, which is read once while its cells are measured."""
+    return load_map(Path(folder))
+
+
+@lru_cache(maxsize=8)
+def dataset_of(folder: str, background: tuple[float, float, float]) -> Dataset:
+    """Return a dataset, which is opened once."""
+    return open_dataset(Path(folder), background)
+
+
+@lru_cache(maxsize=2)
+def localizer_of(map: str, config: str) -> Localizer:
+    """Return the localizer of a map, which is made once while its cells are measured."""
+    return Localizer(map_of(map), "auto", parse_settings("auto", config))
+
+
+def answer(query: Query) -> dict[str, Any]:
+    """Localize one image; return everything that the answer holds, and its errors where there is a true pose."""
+    torch.set_num_threads(1)
+    localizer, view = localizer_of(query.map, query.config), query.view()
+    began = time.process_time()
+    found = localizer(view.frame, seed=query.seed)
+    seconds = time.process_time() - began
+    scene, mode, fault = query.cell
+    row = {"scene": scene, "mode": mode, "fault": fault, "frame": query.frame, "cpu_seconds": seconds}
+    return row | found.plain() | diagnostics_of(found) | errors_of(found, None if query.foreign else view)
+
+
+def diagnostics_of(found: Localization) -> dict[str, Any]:
+    """Return what an answer says about itself beside its pose, where it does."""
+    names = ("confidence", "diagnostics")
+    return {name: to_plain(getattr(found, name)) for name in names if getattr(found, name, None) is not None}
+
+
+def errors_of(found: Localization, view: View | None) -> dict[str, Any]:
+    """Return the errors of an answer; none where the query shows another scene, or the answer is not finite."""
+    names = ("translation", "rotation_deg", "normalized_error_squared")
+    if view is None or not bool(found.T_world_camera.matrix().isfinite().all()):
+        return dict.fromkeys(names)
+    error = pose_error(found.T_world_camera, view.T_ref_camera)
+    squared = None
+    if found.covariance is not None:
+        value = float(normalized_error_squared(found.T_world_camera, view.T_ref_camera, found.covariance))
+        squared = value if 0 <= value < float("inf") else None
+    return dict(zip(names, (float(error.translation), float(error.rotation_deg), squared), strict=True))
+
+
+def within(row: dict[str, Any], metres: float, degrees: float) -> bool:
+    """Return whether an answer is that near to the true pose."""
+    return row["translation"] is not None and row["translation"] < metres and row["rotation_deg"] < degrees
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the counts of one cell, with Wilson intervals of the shares of right and of silent answers."""
+    right = [within(row, 0.05, 5) for row in rows]
+    accepted = [row["converged"] for row in rows]
+    pairs = list(zip(accepted, right, strict=True))
+    known = [row["normalized_error_squared"] for row in rows if row["converged"]]
+    covered = [value for value in known if value is not None]
+    silent = sum(said and not good for said, good in pairs)
+    return {
+        "n": len(rows),
+        "right": sum(right),
+        "strict": sum(within(row, 0.02, 1) for row in rows),
+        "converged": sum(accepted),
+        "silent": silent,
+        "right_but_rejected": sum(good and not said for said, good in pairs),
+        "inside_95_of_converged": [sum(value <= BOUND for value in covered), len(covered)],
+        "median_cpu_seconds": statistics.median(row["cpu_seconds"] for row in rows),
+        "right_rate": asdict(success_rate(sum(right), len(rows))),
+        "silent_rate": asdict(success_rate(silent, len(rows))),
+    }
+
+
+def line(name: str, s: dict[str, Any]) -> str:
+    """Return a cell's counts as a line of the table."""
+    inside, known = s["inside_95_of_converged"]
+    return (
+        f"{name:52} n {s['n']:4}  right {s['right']:4}  strict {s['strict']:4}  converged {s['converged']:4}"
+        f"  silent {s['silent']:4}  rejected {s['right_but_rejected']:4}  inside {inside}/{known}"
+        f"  {s['median_cpu_seconds']:.2f} s"
+    )
+
+
+def queries(given: argparse.Namespace) -> Iterator[Query]:
+    """Yield all queries, cell by cell."""
+    for pair in given.scenes:
+        map, data = pair.split(":", 1)
+        for depth in given.modes:
+            for fault in given.faults:
+                for_depth = any(find_fault(part.name).needs_depth for part in parse_faults(fault))
+                if depth or not for_depth:
+                    yield from frames_of(given, map, data, depth, fault, False)
+            for other in given.foreign:
+                if Path(other).resolve() != Path(data).resolve():
+                    yield from frames_of(given, map, other, depth, NO_FAULT, True)
+
+
+def frames_of(
+    given: argparse.Namespace, map: str, data: str, depth: bool, fault: str, foreign: bool
+) -> Iterator[Query]:
+    """Yield queries of one cell: evenly spaced frames of those for tuning or of those for reports; none without depth."""
+    dataset = dataset_of(data, map_of(map).bounds.background)
+    names = [n for i, n in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == given.tuning_frames]
+    if depth and not any(view.frame.has_depth for view in dataset.views("test", names[:1])):
+        return
+    count = min(given.frames or len(names), len(names))
+    for place in range(count):
+        name = names[place * len(names) // count]
+        yield Query(map, data, name, depth, fault, foreign, given.config, given.seed)
+
+
+def answered(
+    asked: Iterator[Query], store: RowStore, executor: Executor, jobs: int
+) -> Iterator[tuple[Query, dict[str, Any]]]:
+    """Yield all queries with their rows, in order; ``jobs`` of them are under way at once."""
+    waiting: deque[tuple[Query, list[Any], Future[dict[str, Any]] | None]] = deque()
+
+    def first() -> tuple[Query, dict[str, Any]]:
+        query, key, future = waiting.popleft()
+        return query, store.get(key, lambda: future.result() if future else answer(query))
+
+    for query in asked:
+        key = query.key()
+        waiting.append((query, key, None if key in store else executor.submit(answer, query)))
+        if len(waiting) >= jobs:
+            yield first()
+    while waiting:
+        yield first()
+
+
+def measured(given: argparse.Namespace, store: RowStore, executor: Executor) -> dict[str, Any]:
+    """Return the summaries of all cells by scene and mode, and print each when it is complete."""
+    cells: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    last: tuple[str, str, str] | None = None
+    for query, row in answered(queries(given), store, executor, given.jobs):
+        if last is not None and query.cell != last:
+            print(line(" ".join(last), summary(cells[last])), flush=True)
+        last = query.cell
+        cells.setdefault(last, []).append(row)
+    if last is None:
+        raise InputError("no query, expected frames with what the faults change")
+    print(line(" ".join(last), summary(cells[last])))
+    results: dict[str, Any] = {}
+    for (scene, mode, fault), rows in cells.items():
+        results.setdefault(scene, {}).setdefault(mode, {})[fault] = summary(rows)
+    everything = summary([row for rows in cells.values() for row in rows])
+    print(line("all", everything))
+    return {"cells": results, "all": everything}
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="+", metavar="MAP:DATA")
+    parser.add_argument(
+        "--faults", nargs="*", metavar="FAULT", help="NAME:SIZE,SIZE... or none (default: all)"
+    )
+    parser.add_argument(
+        "--foreign",
+        nargs="*",
+        default=[],
+        metavar="DATA",
+        help="datasets of other scenes to take queries from",
+    )
+    parser.add_argument("--frames", type=int, help="frames of each cell, evenly spaced (default: all)")
+    parser.add_argument("--tuning-frames", action="store_true")
+    mode = parser.add_mutually_exclusive_group()
+    mode.add_argument(
+        "--rgb", dest="modes", action="store_const", const=(False,), help="only without measured depth"
+    )
+    mode.add_argument(
+        "--rgbd", dest="modes", action="store_const", const=(True,), help="only with measured depth"
+    )
+    parser.add_argument(
+        "--config", default="{}", help="JSON of settings of auto that differ from its defaults"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes, of one thread each")
+    parser.add_argument("--name", default="faults", help="of the record")
+    parser.set_defaults(modes=(False, True))
+    given = parser.parse_args()
+    usual = [NO_FAULT, *(f"{name}:{size:g}" for name, fault in FAULTS.items() for size in fault.sizes)]
+    given.faults = expand(usual if given.faults is None else given.faults)
+    given.config = json.dumps(json.loads(given.config), sort_keys=True)
+    return given
+
+
+def main() -> None:
+    given = arguments()
+    torch.set_num_threads(1)
+    with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store, local_processes(given.jobs) as executor:
+        results = measured(given, store, executor)
+    print(write_record(RESULTS / f"{given.name}.json", results, given.seed))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""Faults of sensors and scenes: named, seeded changes of an image, by which a localizer's honesty is measured."""
+
+from bidnerf_core.evaluation.faults.catalogue import FAULTS, find_fault
+from bidnerf_core.evaluation.faults.composition import (
+    NO_FAULT,
+    AppliedFault,
+    check_depth,
+    expand,
+    faulty,
+    parse_faults,
+)
+from bidnerf_core.evaluation.faults.fault import Fault
+
+__all__ = [
+    "FAULTS",
+    "NO_FAULT",
+    "AppliedFault",
+    "Fault",
+    "check_depth",
+    "expand",
+    "faulty",
+    "find_fault",
+    "parse_faults",
+]

@@ -1,0 +1,60 @@
+"""Faults of the calibration and of the shutter: the stated intrinsics do not describe the image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.evaluation.faults.fault import random_direction
+from bidnerf_core.evaluation.faults.warp import nearest, warped
+from bidnerf_core.evaluation.protocols import random_units
+from bidnerf_core.frames import Frame
+from bidnerf_core.se3 import SE3
+
+
+def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
+    """State ``factor`` times the true focal lengths; the image stays as it is."""
+    camera = frame.intrinsics
+    return replace(frame, intrinsics=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
+
+
+def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> Frame:
+    """State a principal point that is ``pixels`` away from the true one, in a random direction."""
+    camera, (across, down) = frame.intrinsics, random_direction(generator)
+    wrong = replace(camera, cx=camera.cx + pixels * across, cy=camera.cy + pixels * down)
+    return replace(frame, intrinsics=wrong)
+
+
+def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
+    """Take the image through a lens whose first radial coefficient is larger by ``k1``, which the intrinsics do not state."""
+    camera = frame.intrinsics
+    own = camera.distortion or (0.0, 0.0, 0.0, 0.0)
+    lens = replace(camera, distortion=(own[0] + k1, *own[1:]))
+    return warped(frame, camera.project(_rays(lens)))
+
+
+def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame:
+    """Expose the rows one after the other while the camera turns by ``degrees`` about a random axis through its centre.
+
+    The middle row is exposed at the frame's pose. A camera that only turns sees the same points, so no depth is needed.
+    """
+    camera, height = frame.intrinsics, frame.intrinsics.height
+    axis = random_units(1, generator)[0] * math.radians(degrees)
+    moments = (torch.arange(height, dtype=torch.float64) + 0.5) / height - 0.5
+    turns = torch.cat([torch.zeros((height, 3), dtype=torch.float64), moments[:, None] * axis], dim=-1)
+    seen = _rays(camera) @ SE3.exp(turns).rotation.mT  # T_middle_row: from the row's camera to the middle one
+    pixels = camera.project(seen)
+    turned = warped(frame, pixels.nan_to_num(-1.0))
+    if frame.depth is None:
+        return turned
+    # A point at planar z in the frame lies on the row's ray (x, y, 1) at z over the z of that ray in the frame's camera.
+    return replace(turned, depth=(nearest(frame.depth, pixels.nan_to_num(-1.0)) / seen[..., 2]).float())
+
+
+def _rays(camera: Intrinsics) -> Float[Tensor, "h w 3"]:
+    return camera.unproject(camera.pixel_centres(torch.float64))

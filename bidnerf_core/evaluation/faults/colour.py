@@ -1,0 +1,69 @@
+"""Faults of exposure, optics and compression. They act on the stored values, which are in [0, 1]."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from kornia.color import rgb_to_grayscale
+from kornia.filters import gaussian_blur2d
+from PIL import Image
+from torch import Generator, Tensor
+
+from bidnerf_core.frames import Frame
+
+KERNEL_REACH = 3.0
+"""Radius of a blurring kernel in standard deviations."""
+
+
+def exposure(frame: Frame, factor: float, generator: Generator) -> Frame:
+    """Multiply all values by ``factor``; what would be brighter than white is white."""
+    return _recoloured(frame, frame.rgb * factor)
+
+
+def white_balance(frame: Frame, factor: float, generator: Generator) -> Frame:
+    """Multiply red by ``factor`` and divide blue by it: more than 1 is too warm, less is too cold."""
+    return _recoloured(frame, frame.rgb * frame.rgb.new_tensor([factor, 1.0, 1 / factor]))
+
+
+def blur(frame: Frame, pixels: float, generator: Generator) -> Frame:
+    """Blur the colours with a Gaussian whose standard deviation is ``pixels``. Depth stays sharp."""
+    if pixels == 0:
+        return frame
+    size = 2 * max(1, round(KERNEL_REACH * pixels)) + 1
+    smallest = min(frame.rgb.shape[:2])
+    size = min(
+        size, smallest - 1 + smallest % 2
+    )  # reflection at the border cannot reach farther than the image
+    images = frame.rgb.permute(2, 0, 1)[None]
+    return _recoloured(frame, gaussian_blur2d(images, (size, size), (pixels, pixels))[0].permute(1, 2, 0))
+
+
+def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
+    """Compress the colours as JPEG of a quality from 1 to 100 and decode them."""
+    file = io.BytesIO()
+    Image.fromarray((frame.rgb * 255).round().to(torch.uint8).numpy()).save(
+        file, "JPEG", quality=int(quality)
+    )
+    return _recoloured(frame, torch.from_numpy(np.array(Image.open(file))).to(frame.rgb) / 255)
+
+
+def grey(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Replace ``share`` of the colours' saturation: 1 leaves their brightness only."""
+    brightness = rgb_to_grayscale(frame.rgb.permute(2, 0, 1)).permute(1, 2, 0)
+    return _recoloured(frame, frame.rgb + share * (brightness - frame.rgb))
+
+
+def vignetting(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Darken the image with the square of the distance from its centre, the corners by ``share``."""
+    camera = frame.intrinsics
+    middle = frame.rgb.new_tensor([camera.width / 2, camera.height / 2])
+    radius = (camera.pixel_centres() - middle).norm(dim=-1, keepdim=True) / middle.norm()
+    return _recoloured(frame, frame.rgb * (1 - share * radius.square()))
+
+
+def _recoloured(frame: Frame, rgb: Float[Tensor, "h w 3"]) -> Frame:
+    return replace(frame, rgb=rgb.clamp(0, 1))

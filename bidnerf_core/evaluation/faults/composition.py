@@ -1,0 +1,113 @@
+"""Faults as text, alone or composed, and their application to views."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.faults.catalogue import find_fault
+from bidnerf_core.frames import View
+
+NO_FAULT = "none"
+"""Stands for a view as it is."""
+EXAMPLE = "expected NAME:SIZE as depth-scale:1.02"
+
+
+@dataclass(frozen=True)
+class AppliedFault:
+    """A fault by name, with its size. Raises ``InputError`` for an unknown name and a size out of range."""
+
+    name: str
+    size: float
+
+    def __post_init__(self) -> None:
+        allowed = find_fault(self.name).allowed
+        if self.size not in allowed:
+            raise InputError(f"fault {self.name}: size is {self.size:.12g}, expected {allowed}")
+
+    def __str__(self) -> str:
+        return f"{self.name}:{self.size:.12g}"
+
+    def __call__(self, view: View, seed: int) -> View:
+        """Return the view with this fault. Raises ``InputError`` where it is one of depth and none was measured."""
+        fault = find_fault(self.name)
+        generator = torch.Generator().manual_seed(_stream(seed, view.frame.name, self.name))
+        T_ref_camera = view.T_ref_camera
+        if fault.T_true_faulty is not None and self.size != fault.neutral:
+            T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
+        return View(fault.change(view.frame, self.size, generator), T_ref_camera)
+
+
+def expand(words: Iterable[str]) -> tuple[str, ...]:
+    """Return every fault that the words of a command name, in a canonical form.
+
+    A word is ``none``, ``NAME:SIZE``, ``NAME:SIZE,SIZE...`` for several faults, or faults of one size each joined by
+    ``+``, which are applied together, from left to right. A fault that is there or not needs no size. Raises
+    ``InputError`` for anything else, and for a fault that is named twice.
+    """
+    found: list[str] = []
+    for word in words:
+        name, colon, sizes = word.partition(":")
+        parts = [name + colon + size for size in sizes.split(",")] if "+" not in word else [word]
+        found += ["+".join(map(str, parse_faults(part))) or NO_FAULT for part in parts]
+    twice = next((fault for place, fault in enumerate(found) if fault in found[:place]), None)
+    if twice is not None:
+        raise InputError(f"fault {twice} is given twice, expected different ones")
+    return tuple(found)
+
+
+def parse_faults(text: str) -> tuple[AppliedFault, ...]:
+    """Return the faults of a text as ``depth-scale:1.02+exposure:0.7``; none for ``NO_FAULT``."""
+    if text == NO_FAULT:
+        return ()
+    faults = tuple(_parsed(part) for part in text.split("+"))
+    names = [fault.name for fault in faults]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"fault {text} has {twice} twice, expected each once")
+    return faults
+
+
+def faulty(view: View, faults: str | Sequence[AppliedFault], seed: int) -> View:
+    """Return the view with all faults, the first first.
+
+    ``T_ref_camera`` is the true pose of the faulty image. The same seed, frame and fault give the same result, whatever
+    other faults there are.
+    """
+    for fault in parse_faults(faults) if isinstance(faults, str) else faults:
+        view = fault(view, seed)
+    return view
+
+
+def check_depth(faults: Iterable[str], depth: bool) -> None:
+    """Raise ``InputError`` for an unknown fault, and, where ``depth`` is withheld, for one of the depth."""
+    for part in (part for text in faults for part in parse_faults(text)):
+        if find_fault(part.name).needs_depth and not depth:
+            raise InputError(f"fault {part} changes the measured depth, which the method does not get")
+
+
+def _parsed(text: str) -> AppliedFault:
+    name, colon, size = text.partition(":")
+    fault = find_fault(name)
+    if not size:
+        if fault.is_switch and not colon:
+            return AppliedFault(name, 1.0)
+        raise InputError(f"fault {name} has no size, {EXAMPLE}; its unit is: {fault.unit}")
+    try:
+        number = float(size)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"fault {name}: size is {size!r}, expected {fault.allowed}")
+    return AppliedFault(name, number)
+
+
+def _stream(seed: int, frame: str, fault: str) -> int:
+    """Return the seed of the random choices of one fault on one frame."""
+    text = f"{seed}\n{frame}\n{fault}".encode(errors="surrogatepass")
+    return int.from_bytes(hashlib.blake2b(text, digest_size=7).digest(), "big")

@@ -1,0 +1,79 @@
+"""A fault: a seeded change of a frame, whose size is one number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Generator, Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame
+from bidnerf_core.se3 import SE3
+from bidnerf_core.settings import Range
+
+Change: TypeAlias = Callable[[Frame, float, Generator], Frame]
+"""Returns the frame with a fault of the given size; every random choice is drawn from the generator."""
+
+
+class WholeNumbers(Range):
+    """The whole numbers from ``least`` to ``most``."""
+
+    def __contains__(self, value: float) -> bool:
+        return super().__contains__(value) and float(value).is_integer()
+
+    def __str__(self) -> str:
+        return f"a whole number, {super().__str__()}"
+
+
+SHARE = Range(0.0, 1.0)
+SWITCH = WholeNumbers(0, 1)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A kind of fault. Its random choices depend on the seed and the frame, not on the size, so sizes are comparable."""
+
+    summary: str
+    unit: str  # of the size, in words
+    allowed: Range
+    neutral: float | None  # the size that leaves the frame as it is; none where no size does
+    sizes: tuple[float, ...]  # those worth measuring
+    change: Change
+    needs_depth: bool = False
+    T_true_faulty: SE3 | None = None
+    """Pose of the faulty camera in the true camera's frame, at any size but the neutral one; none where they coincide."""
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether the fault is either there (size 1) or not (size 0)."""
+        return self.allowed is SWITCH
+
+
+def measured_depth(frame: Frame) -> Float[Tensor, "h w"]:
+    """Return the measured depth (planar z, metres). Raises ``InputError`` where nothing was measured."""
+    if frame.depth is None or not frame.has_depth:
+        raise InputError(f"frame {frame.name} has no measured depth that a fault of depth could change")
+    return frame.depth
+
+
+def random_direction(generator: Generator) -> tuple[float, float]:
+    """Return a unit vector of the image plane, uniformly distributed."""
+    angle = 2 * math.pi * uniform(generator)
+    return math.cos(angle), math.sin(angle)
+
+
+def uniform(generator: Generator, low: float = 0.0, high: float = 1.0) -> float:
+    """Return a number that is uniformly distributed between two limits."""
+    return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
+
+
+def random_pixel(mask: Bool[Tensor, "h w"], generator: Generator) -> tuple[int, int]:
+    """Return the row and the column of a random pixel of ``mask``, which marks one at least."""
+    places = mask.nonzero()
+    row, column = places[int(torch.randint(len(places), (), generator=generator))].tolist()
+    return row, column

@@ -1,0 +1,135 @@
+"""Faults of the scene: things in front of it, things that moved, came or went since it was mapped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_dilation
+from torch import Generator, Tensor
+
+from bidnerf_core.evaluation.faults.blob import blob, smooth_noise, texture
+from bidnerf_core.evaluation.faults.fault import measured_depth, random_direction, random_pixel, uniform
+from bidnerf_core.evaluation.faults.warp import reflected, warped
+from bidnerf_core.frames import Frame
+
+NEAREST_QUANTILE = 0.02
+"""Quantile of the measured depth that counts as the nearest part of the scene."""
+OCCLUDER_DEPTH = (0.4, 0.8)
+"""Limits of the depth of an occluder, over that of the nearest part of the scene."""
+RELIEF = 0.05
+"""Standard deviation of an occluder's depth over its mean."""
+TRAVEL, APPROACH = (0.15, 0.3), (0.85, 0.98)
+"""How far a thing moves across the image (over its smaller side), and by which factor towards the camera."""
+ADDED_HEIGHT = (0.02, 0.1)
+"""How far an added thing rises from the surface towards the camera, over the depth."""
+RIM = 3
+"""Width in pixels of the surroundings by which a hole is filled."""
+
+
+def occluder(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Put a textured thing in front of ``share`` of the image. Where depth was measured, its own depth is."""
+    mask, colours = _textured_blob(frame, share, generator)
+    if frame.depth is None or not frame.has_depth:
+        return _pasted(frame, mask, colours, frame.depth)
+    near = float(np.quantile(frame.depth[frame.depth > 0].numpy(), NEAREST_QUANTILE))
+    relief = 1 + RELIEF * _bounded_noise(frame, 3, generator)
+    return _pasted(frame, mask, colours, uniform(generator, *OCCLUDER_DEPTH) * near * relief)
+
+
+def unmeasured_occluder(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Put a textured thing in front of ``share`` of the image, too near for its depth to be measured."""
+    mask, colours = _textured_blob(frame, share, generator)
+    depth = None if frame.depth is None else torch.zeros_like(frame.depth)
+    return _pasted(frame, mask, colours, depth)
+
+
+def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Show a piece of the scene at another place of the image as well, where it covers ``share`` of it, a little nearer.
+
+    Its features match those of the map, and agree with each other on a wrong pose.
+    """
+    height, width = frame.rgb.shape[:2]
+    mask = blob(height, width, share, generator)
+    travel = uniform(generator, *TRAVEL) * min(height, width)
+    move = torch.tensor(random_direction(generator)) * travel
+    elsewhere = warped(frame, reflected(frame.intrinsics.pixel_centres() - move, width, height))
+    depth = None if elsewhere.depth is None else elsewhere.depth * uniform(generator, *APPROACH)
+    return _pasted(frame, mask, elsewhere.rgb, depth, elsewhere.alpha)
+
+
+def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Put a textured thing onto ``share`` of the measured surface, from which it rises a little."""
+    mask = _surface_piece(frame, share, generator)
+    rise = uniform(generator, *ADDED_HEIGHT) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
+    colours = texture(frame.intrinsics.height, frame.intrinsics.width, generator)
+    return _pasted(frame, mask, colours, measured_depth(frame) * (1 - rise))
+
+
+def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Remove ``share`` of the measured surface in one piece. The background takes its place, or what lies around it.
+
+    Where the frame has alpha and the piece reaches the edge of the scene, its background is seen; otherwise the colours
+    around are continued, at the depth of the farthest surface around.
+    """
+    mask = _surface_piece(frame, share, generator)
+    rim = torch.from_numpy(binary_dilation(mask.numpy(), iterations=RIM)) & ~mask
+    if not mask.any() or not rim.any():
+        return frame
+    depth = measured_depth(frame)
+    empty = None if frame.alpha is None else rim & (frame.alpha < 0.5)
+    if empty is not None and empty.any():
+        background = frame.rgb[empty].median(dim=0).values.expand_as(frame.rgb)
+        return _pasted(frame, mask, background, torch.zeros_like(depth), torch.zeros_like(depth))
+    return _pasted(frame, mask, _inpainted(frame.rgb, mask), depth[rim].max().expand_as(depth))
+
+
+def _textured_blob(
+    frame: Frame, share: float, generator: Generator
+) -> tuple[Bool[Tensor, "h w"], Float[Tensor, "h w 3"]]:
+    height, width = frame.rgb.shape[:2]
+    return blob(height, width, share, generator), texture(height, width, generator)
+
+
+def _surface_piece(frame: Frame, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
+    """Mark ``share`` of the measured pixels: those whose points are nearest to a random one of them."""
+    depth = measured_depth(frame)
+    points = frame.intrinsics.unproject(frame.intrinsics.pixel_centres()) * depth[..., None]
+    row, column = random_pixel(depth > 0, generator)
+    distance = (points - points[row, column]).norm(dim=-1)
+    order = distance.masked_fill(depth <= 0, torch.inf).flatten().argsort()
+    mask = torch.zeros(depth.numel(), dtype=torch.bool)
+    mask[order[: round(share * int((depth > 0).sum()))]] = True
+    return mask.reshape(depth.shape)
+
+
+def _bounded_noise(frame: Frame, cells: int, generator: Generator) -> Float[Tensor, "h w"]:
+    camera = frame.intrinsics
+    return smooth_noise(camera.height, camera.width, cells, cells, generator).clamp(-2, 2)
+
+
+def _pasted(
+    frame: Frame,
+    mask: Bool[Tensor, "h w"],
+    rgb: Float[Tensor, "h w 3"],
+    depth: Float[Tensor, "h w"] | None,
+    alpha: Float[Tensor, "h w"] | None = None,
+) -> Frame:
+    """Return the frame with other colours, depth and alpha (1 by default) inside of ``mask``."""
+    pasted = replace(frame, rgb=torch.where(mask[..., None], rgb, frame.rgb))
+    if frame.depth is not None and depth is not None:
+        pasted = replace(pasted, depth=torch.where(mask, depth.to(frame.depth), frame.depth))
+    if frame.alpha is not None:
+        cover = torch.ones_like(frame.alpha) if alpha is None else alpha
+        pasted = replace(pasted, alpha=torch.where(mask, cover, frame.alpha))
+    return pasted
+
+
+def _inpainted(rgb: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+    """Continue the colours around ``mask`` into it (Telea 2004)."""
+    bytes_ = (rgb * 255).round().to(torch.uint8).contiguous().numpy()
+    filled = cv2.inpaint(bytes_, mask.to(torch.uint8).numpy(), RIM, cv2.INPAINT_TELEA)
+    return torch.from_numpy(filled).to(rgb) / 255

@@ -1,0 +1,62 @@
+"""Help pages: every option of every command is described, and no description is a fragment."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import tyro
+
+from bidnerf_core.cli import COMMANDS, common, main
+from bidnerf_core.localization.methods import METHODS
+
+CHOICES = {
+    "train": [["--backend", name] for name in ("adanerf", "hashgrid", "vanilla")],
+    "localize": [["--method", name] for name in METHODS],
+    "evaluate": [["--method", name] for name in METHODS],
+    "compare": [["--method", name] for name in METHODS],
+}
+"""Options on which other options depend."""
+NO_BEGINNING = {
+    "about", "among", "and", "as", "at", "between", "by", "for", "from", "in", "of", "on", "or", "over", "per", "than",
+    "that", "to", "which", "with", "within", "without", "...",
+}  # fmt: skip
+"""Words with which a description does not begin: it would go on with the option's name."""
+UNDESCRIBED = {"--points", "--hypotheses", "--rounds", "--refine-steps", "--refine-rays", "--fused-rays"}
+
+
+class Shown(Exception):
+    """Ends a command once its options are known."""
+
+
+def options_of(words: list[str], monkeypatch: pytest.MonkeyPatch) -> list[argparse.Action]:
+    """Return the options of a command, as its parser describes them."""
+    found: list[argparse.Action] = []
+
+    def keep(command: str, function: Callable[..., Any], arguments: list[str]) -> None:
+        parser = tyro.extras.get_parser(function, config=(tyro.conf.OmitArgPrefixes,))
+        found.extend(action for action in parser._actions if action.dest != "help")
+        raise Shown
+
+    monkeypatch.setattr(common, "_called", keep)
+    with pytest.raises(Shown):
+        main([*words, "--help-all"])
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:get_parser:DeprecationWarning")
+@pytest.mark.parametrize(
+    "words", [[c, *choice] for c in COMMANDS for choice in CHOICES.get(c, [[]])], ids=" ".join
+)
+def test_every_option_has_a_help_text(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    options = options_of(words, monkeypatch)
+    assert options
+    for action in options:
+        name = action.option_strings[0] if action.option_strings else action.dest
+        text = (action.help or "").split("(default")[0].strip()
+        if name in UNDESCRIBED:
+            continue
+        assert len(text.split()) > 1, f"{name}: {action.help!r}"
+        assert text.split()[0].lower() not in NO_BEGINNING, f"{name}: {text!r}"

@@ -1,0 +1,130 @@
+"""Videos: what was encoded comes back in its order with its times, and files that break off are named."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.datasets import FrameSequence, TimedFrame, open_sequence
+from bidnerf_core.errors import InputError
+
+WIDTH, HEIGHT, COUNT, RATE = 64, 48, 20, 25
+FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
+
+
+def ffmpeg(*arguments: str) -> None:
+    subprocess.run([FFMPEG, "-loglevel", "error", "-y", *arguments], check=True)
+
+
+def grey(frame: TimedFrame) -> float:
+    return float(frame.frame.rgb[:, : WIDTH // 2].mean()) * 255
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twenty frames that become lighter by 12 each, with noise on the right that does not compress."""
+    path = tmp_path_factory.mktemp("video") / "clip.mp4"
+    generator = np.random.default_rng(0)
+    writer = imageio_ffmpeg.write_frames(str(path), (WIDTH, HEIGHT), fps=RATE)
+    writer.send(None)
+    for number in range(COUNT):
+        image = np.full((HEIGHT, WIDTH, 3), 12 * number, np.uint8)
+        image[:, WIDTH // 2 :] = generator.integers(0, 255, (HEIGHT, WIDTH // 2, 3))
+        writer.send(image)
+    writer.close()
+    return path
+
+
+def test_frames_come_in_order_with_their_times(clip: Path) -> None:
+    sequence = open_sequence(clip, hfov=60)
+    assert isinstance(sequence, FrameSequence)
+    assert len(sequence) == COUNT
+    for _ in range(2):  # an iteration starts anew
+        frames = list(sequence)
+        assert [timed.time for timed in frames] == pytest.approx([n / RATE for n in range(COUNT)])
+        assert [grey(timed) for timed in frames] == pytest.approx([12 * n for n in range(COUNT)], abs=4)
+    assert frames[3].frame.name == "000003"
+    assert frames[3].truth is None
+    assert frames[3].frame.intrinsics == Intrinsics.from_hfov(60, WIDTH, HEIGHT)
+
+
+def test_an_iteration_may_end_early(clip: Path) -> None:
+    for timed in open_sequence(clip, focal=50):
+        assert timed.time == 0
+        break
+
+
+def test_times_of_a_varying_rate(clip: Path, tmp_path: Path) -> None:
+    """Every third frame is dropped and the others keep their times, which count from the first of them."""
+    varying = tmp_path / "varying.mkv"
+    ffmpeg("-i", str(clip), "-vf", "select=mod(n\\,3)", "-fps_mode", "passthrough", str(varying))
+    times = [timed.time for timed in open_sequence(varying, focal=50)]
+    assert times == pytest.approx([(n - 1) / RATE for n in range(COUNT) if n % 3], abs=0.0011)
+
+
+def test_frames_that_were_cut_off_are_not_shown(clip: Path, tmp_path: Path) -> None:
+    trimmed = tmp_path / "trimmed.mp4"
+    ffmpeg("-ss", "0.4", "-i", str(clip), "-c", "copy", str(trimmed))
+    sequence = open_sequence(trimmed, focal=50)
+    frames = list(sequence)
+    assert len(frames) == len(sequence) == COUNT - 10
+    assert grey(frames[0]) == pytest.approx(120, abs=4)
+
+
+def test_a_rotated_video_is_upright(clip: Path, tmp_path: Path) -> None:
+    rotated = tmp_path / "rotated.mp4"
+    ffmpeg("-display_rotation", "90", "-i", str(clip), "-c", "copy", str(rotated))
+    frame = next(iter(open_sequence(rotated, hfov=60))).frame
+    assert frame.rgb.shape == (WIDTH, HEIGHT, 3)
+    assert (frame.intrinsics.width, frame.intrinsics.height) == (HEIGHT, WIDTH)
+
+
+def test_a_camera_of_another_size_is_scaled(clip: Path) -> None:
+    full = Intrinsics(1000.0, 1000.0, 640.0, 480.0, 1280, 960)
+    assert next(iter(open_sequence(clip, camera=full))).frame.intrinsics == full.resized(WIDTH, HEIGHT)
+    with pytest.raises(InputError, match=r"clip\.mp4: image is 64x48, its camera is for 100x100"):
+        next(iter(open_sequence(clip, camera=Intrinsics(50, 50, 50, 50, 100, 100))))
+
+
+def test_no_camera_is_an_error(clip: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"does not record its focal length, expected a camera: --camera FILE"
+    ):
+        open_sequence(clip)
+
+
+def test_a_video_that_breaks_off(clip: Path, tmp_path: Path) -> None:
+    """The index is at the beginning, so the file opens; the frames before the break are given."""
+    whole = tmp_path / "whole.mp4"
+    ffmpeg("-i", str(clip), "-c", "copy", "-movflags", "+faststart", str(whole))
+    broken = tmp_path / "broken.mp4"
+    content = whole.read_bytes()
+    broken.write_bytes(content[: len(content) // 2])
+    found = list[TimedFrame]()
+    message = r"broken\.mp4: breaks off at frame \d+ \(.*\), expected a whole video file"
+    with pytest.raises(InputError, match=message):
+        found.extend(open_sequence(broken, focal=50))
+    assert 0 < len(found) < COUNT
+
+
+@pytest.mark.parametrize("content", [b"", b"no video", b"#EXTM3U\nhttp://127.0.0.1:9/clip.ts\n"])
+def test_files_that_are_no_video(content: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "clip.mp4"
+    file.write_bytes(content)
+    with pytest.raises(
+        InputError, match=r"clip\.mp4: not readable as a video \(.*\), expected a video file"
+    ) as caught:
+        open_sequence(file, focal=50)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_extra_is_named(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(InputError, match=r"needs the extra 'video' \(pip install 'bidnerf\[video\]'\)"):
+        open_sequence(clip, focal=50)
