@@ -12,9 +12,9 @@ from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.localization.landmark_trial import build_tried_landmarks
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
-from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.storage import (
     LandmarkSource,
     Map,
@@ -126,7 +126,7 @@ def _bake_landmarks(
     began = time.monotonic()
     try:
         with counted("landmarks", "steps") as report:
-            landmarks = build_landmarks(views, progress=report, report=say)
+            landmarks = build_tried_landmarks(views, progress=report, report=say)
     except InputError as error:
         say(f"{folder}: no landmarks: {error}")
         return

@@ -41,6 +41,8 @@ def describe(folder: Path) -> dict[str, Any]:
         "levels": len(levels(stored.field)),
         "parameters": parameters,
         "surfels": 0 if stored.surface is None else len(stored.surface.surfels),
+        "landmarks": 0 if stored.landmarks is None else len(stored.landmarks),
+        "trial": None if stored.landmarks is None else to_plain(stored.landmarks.trial),
         "bytes": sum(file.stat().st_size for file in folder.iterdir() if file.is_file()),
         "bounds": to_plain(info.bounds),
         "config": info.config,

@@ -64,6 +64,41 @@ def build_landmarks(
     ``progress`` is called with the number of images and image pairs done and their total, and ``report`` with a sentence if
     landmarks had to be dropped. Raises ``InputError`` if no landmark was found.
     """
+    return tracked_views(views, features, config, progress).landmarks(config, report)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedViews:
+    """The keypoints of posed images, joined into tracks, with the depth that was measured at each keypoint."""
+
+    observations: TrackedKeypoints
+    depth: Float[Tensor, "k"]  # metres, of all keypoints by number; 0 where none was measured
+
+    def landmarks(
+        self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None
+    ) -> LandmarkMap:
+        """Return the landmarks that the tracks give. Raises ``InputError`` if there are none."""
+        found = _located(self.observations, self.depth, config)
+        if not len(found):
+            images = len(self.observations.images)
+            raise InputError(
+                f"no landmark found in {images} images: expected texture that several images show from different places"
+            )
+        return _bounded(found, config.most, report)
+
+    def without(self, images: Sequence[int]) -> TrackedViews:
+        """Return the tracks without the keypoints of some images."""
+        left = ~torch.isin(self.observations.image, torch.tensor(images))
+        return replace(self, observations=self.observations[left])
+
+
+def tracked_views(
+    views: Sequence[View],
+    features: Features = SIFT,
+    config: LandmarkConfig = LandmarkConfig(),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TrackedViews:
+    """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks."""
     if not views:
         raise InputError("nothing to build landmarks from: expected at least one view")
     pairs = likely_pairs(views, config.neighbours).tolist() if len(views) > 1 else []
@@ -73,16 +108,8 @@ def build_landmarks(
     label = joined_tracks(
         [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)], [len(p.keypoints) for p in images]
     )
-    observations = TrackedKeypoints(images, label, torch.arange(len(label)))
-    depth = torch.cat(
-        [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
-    )
-    found = _located(observations, depth, config)
-    if not len(found):
-        raise InputError(
-            f"no landmark found in {len(views)} images: expected texture that several images show from different places"
-        )
-    return _bounded(found, config.most, report)
+    depth = [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
+    return TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), torch.cat(depth))
 
 
 def _detected(view: View, features: Features) -> PosedKeypoints:
@@ -106,9 +133,8 @@ def _located(
         pose_covariance=pose_scatter(kept, positions, pixel_noise),
     )
     relative = depth_noise(sightings, positions, depth[kept.number])
-    left = torch.ones_like(tracked).index_fill_(0, kept.number, False)
-    left &= tracked | config.singles
-    rest, positions, covariance = placed(observations[left], depth[left], relative, pixel_noise)
+    left = observations[~torch.isin(observations.number, kept.number) & (tracked | config.singles)]
+    rest, positions, covariance = placed(left, depth[left.number], relative, pixel_noise)
     return concatenated([triangulated, fused_landmarks(rest, positions, covariance, pixel_noise)])
 
 

@@ -12,14 +12,25 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization.search.chance import log10_nfa
-from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, query_image
-from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches
-from bidnerf_core.localization.search.landmarks import LOOSE, THRESHOLD, LandmarkPose
+from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
+from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches, projected_landmarks
+from bidnerf_core.localization.search.guided_refinement import RADII, matches_by_chance, usual_distance
+from bidnerf_core.localization.search.landmark_evidence import (
+    cell_numbers,
+    depth_scale,
+    median_distance,
+    probability_within,
+    share_of_cells,
+)
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmark_query import LandmarkQuery, pixel_threshold
 from bidnerf_core.localization.search.matching import EXACT, LandmarkMatcher
+from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
-from bidnerf_core.mapping.features import Features, paired_squared_distances
+from bidnerf_core.mapping.features import Features
 from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.resection import FIXED, GIVEN, NOMINAL, resect
 from bidnerf_core.se3 import SE3
 
 NEARBY = EXACT
@@ -28,10 +39,8 @@ WIDE = 2.0
 """Multiple of the radius of guided matching from which on keypoints are compared with all landmarks in view. Guided matching
 compares a keypoint with the few landmarks that project nearest to it, which suits predictions that are off by little.
 """
-CELLS = 8
-"""Cells along each axis of the grid over which the matches of an image should spread."""
 LEAST_CHANCE = 0.5
-"""Least number of matches by chance that is assumed, since it is estimated from a single count."""
+"""Least number of matches by chance that is assumed, since it is estimated from few counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +51,8 @@ class Evidence:
     agreeing: int
     log10_nfa: float
     chance: float
+    visible: int
+    keypoints: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +63,7 @@ class Recognized:
     found: PointFit
     evidence: Evidence
     usual_distance: float  # largest squared descriptor distance at which a match was allowed
+    miscalibration: Miscalibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,48 +81,40 @@ class LandmarkDetector:
         ``most_distance`` is the largest squared distance between the descriptors of a match, ``noise`` a first guess at that
         of keypoints (pixels). Returns None if too few match.
         """
-        image = query_image(frame, SE3.identity(), self.features)
         number = self._near(frame.intrinsics, T_world_camera)
-        near, threshold = self.landmarks[number], pixel_threshold(frame.intrinsics)
-        tight = 1.5 * threshold
-        seen = self._seen(frame, image, near, T_world_camera, radius, most_distance, noise)
+        image = query_image(frame, SE3.identity(), self.features)
+        query = LandmarkQuery([image], self.landmarks[number], FIXED)
+        tight = RADII[-1] * query.threshold
+        seen = self._seen(frame, query, T_world_camera, radius, most_distance, noise)
         surprise = 0.0
         if seen is not None and (radius > tight or math.isinf(most_distance)):
             if radius > WIDE * tight:
-                within = min(0.5, (threshold / radius) ** 2)
-                surprise = log10_nfa(len(seen[0]), seen[1].within(threshold), within)
+                within = min(0.5, (query.threshold / radius) ** 2)
+                surprise = log10_nfa(len(seen[0]), seen[1].within(query.threshold), within)
             T, noise = seen[1].T_world_camera, seen[1].fit.noise
             most_distance = seen[2] if math.isinf(most_distance) else most_distance
-            seen = self._seen(frame, image, near, T, tight, most_distance, noise)
+            seen = self._seen(frame, query, T, tight, most_distance, noise)
         if seen is None:
             return None
         points, found, _ = seen
-        evidence = self._evidence(image, near, found, tight, most_distance)
+        evidence = _guided_evidence(query, found, tight, most_distance)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
-        followed = replace(points, landmark=number[points.landmark])
-        return Recognized(followed, found, evidence, most_distance)
+        points = replace(points, landmark=number[points.landmark])
+        return Recognized(points, found, evidence, most_distance, self._miscalibration(found))
 
     def _seen(
-        self,
-        frame: Frame,
-        image: QueryImage,
-        near: LandmarkMap,
-        T_world_camera: SE3,
-        radius: float,
-        most_distance: float,
-        noise: float,
+        self, frame: Frame, query: LandmarkQuery, T: SE3, radius: float, most_distance: float, noise: float
     ) -> tuple[FollowedPoints, PointFit, float] | None:
         """Return the matches within a radius, the pose that they determine, and the usual distance of its inliers."""
-        threshold = pixel_threshold(frame.intrinsics)
-        if radius > WIDE * 1.5 * threshold:
-            matches = _matches_within([image], near, T_world_camera, radius)
+        if radius > WIDE * RADII[-1] * query.threshold:
+            matches = _matches_within(query, T, radius)
         else:
-            matches = guided_matches([image], near, T_world_camera, radius, most_distance)
-        points = _points(near, image, matches)
-        found = fit_pose(points.observed(frame), T_world_camera, noise, threshold)
+            matches = guided_matches(query.images, query.landmarks, T, radius, most_distance)
+        points = FollowedPoints.of_landmarks(query.landmarks, matches.landmark, query.pixels(matches))
+        found = fit_pose(points.observed(frame), T, noise, query.threshold, self.landmarks.correlation)
         if found is None or not bool(found.inliers.any()):
             return None
-        return points, found, _usual_distance(image, near, matches[found.inliers])
+        return points, found, usual_distance(query, matches[found.inliers])
 
     def _near(self, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "n"]:
         """Return the numbers of landmarks in view that most images of the map saw, from about this direction."""
@@ -127,20 +131,23 @@ class LandmarkDetector:
             return index
         return index[landmarks.views[index].argsort(descending=True, stable=True)[:NEARBY].sort().values]
 
-    def _evidence(
-        self, image: QueryImage, near: LandmarkMap, found: PointFit, radius: float, most: float
-    ) -> Evidence:
-        """Compare the number of matches with that around a shifted projection, where all of them are due to chance."""
-        agreeing, keypoints = int(found.inliers.sum()), len(image.keypoints)
-        shift = (4 * radius, 0.0) if agreeing % 2 else (0.0, 4 * radius)
-        chance = len(guided_matches([image], near, found.T_world_camera, radius, most, 1.0, shift))
-        probability = min(0.5, max(LEAST_CHANCE, chance) / max(1, keypoints))
-        return Evidence(keypoints, agreeing, log10_nfa(keypoints, agreeing, probability), chance)
+    def _miscalibration(self, found: PointFit) -> Miscalibration:
+        """Judge the given intrinsics by those that fit the landmarks best."""
+        free = resect(
+            found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL,
+            correlation=self.landmarks.correlation,
+        )  # fmt: skip
+        return Miscalibration.of(free, self.landmarks)
 
 
-def pixel_threshold(camera: Intrinsics) -> float:
-    """Return the largest reprojection error (pixels) of an observation that agrees with a pose."""
-    return max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))
+def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float, most: float) -> Evidence:
+    """Compare the number of matches with that around shifted projections, where all of them are due to chance."""
+    agreeing, keypoints = int(found.inliers.sum()), len(query.images[0].keypoints)
+    projections = projected_landmarks(query.images, query.landmarks, found.T_world_camera, GIVEN, radius)
+    chance = matches_by_chance(projections, radius, most)
+    probability = min(0.5, max(LEAST_CHANCE, chance) / max(1, keypoints))
+    nfa = log10_nfa(keypoints, agreeing, probability)
+    return Evidence(keypoints, agreeing, nfa, chance, sum(map(len, projections)), keypoints)
 
 
 def flow_evidence(found: PointFit, camera: Intrinsics) -> Evidence:
@@ -149,50 +156,54 @@ def flow_evidence(found: PointFit, camera: Intrinsics) -> Evidence:
     Each is one match, which would fall anywhere in the image if the flow were wrong.
     """
     threshold, count = pixel_threshold(camera), len(found.inliers)
-    probability = min(0.5, math.pi * threshold**2 / (camera.width * camera.height))
     agreeing = found.within(threshold)
-    return Evidence(count, agreeing, log10_nfa(count, agreeing, probability), 0.0)
+    nfa = log10_nfa(count, agreeing, probability_within(threshold, camera))
+    return Evidence(count, agreeing, nfa, 0.0, count, count)
 
 
 def landmark_pose(
-    points: FollowedPoints, found: PointFit, evidence: Evidence, landmarks: LandmarkMap, camera: Intrinsics
+    points: FollowedPoints,
+    found: PointFit,
+    evidence: Evidence,
+    landmarks: LandmarkMap,
+    miscalibration: Miscalibration,
+    camera: Intrinsics,
 ) -> LandmarkPose:
     """Return a pose by landmarks in the form that ``landmark_verdict`` judges."""
-    T, data, count = found.T_world_camera, found.data, len(points)
-    every = torch.arange(count)
-    known = data.depth > 0
-    ratio = data.in_camera(T)[known, 2] / data.depth[known]
+    fit, data, every = found.fit, found.data, torch.arange(len(points))
     return LandmarkPose(
-        T_world_camera=T,
-        covariance=found.fit.covariance[:6, :6],
-        map_covariance=found.fit.covariance[:6, :6] + landmarks.pose_covariance,
-        noise=found.fit.noise,
-        correspondences=LandmarkMatches(torch.zeros_like(every), every, points.landmark, torch.zeros(count)),
-        residuals=data.residuals(T),
-        normalized_residuals=data.normalized_residuals(T, found.fit.noise),
+        T_world_camera=fit.T_world_rig,
+        covariance=fit.covariance + landmarks.pose_covariance,
+        noise=fit.noise,
+        correspondences=LandmarkMatches(
+            torch.zeros_like(every), every, points.landmark, torch.zeros(len(every))
+        ),
+        residuals=data.residuals(fit.T_world_rig),
+        normalized_residuals=data.normalized_residuals(fit.T_world_rig, fit.noise),
         pixels=points.pixels,
         matches=evidence.matches,
         agreeing=evidence.agreeing,
         log10_nfa=evidence.log10_nfa,
         chance=evidence.chance,
-        spread=len(cells_of(points.pixels[found.inliers], camera).unique()) / CELLS**2,
-        focal_factor=1.0,
-        depth_scale=float(ratio.median()) if len(ratio) >= 6 else None,
+        visible=evidence.visible,
+        keypoints=evidence.keypoints,
+        spread=share_of_cells(points.pixels[found.inliers], camera),
+        noise_ratio=fit.noise / landmarks.noise,
+        distance=median_distance(data, fit.T_world_rig),
+        calibration=GIVEN,
+        calibration_deviations=fit.calibration_deviations,
+        slope=fit.slope,
+        miscalibration=miscalibration,
+        calibration_scatter=landmarks.calibration_scatter,
+        depth_scale=depth_scale(data, fit.T_world_rig),
     )
 
 
-def cells_of(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
-    """Return the number of the cell of a grid over the image in which each pixel lies."""
-    size = torch.tensor([camera.width, camera.height])
-    column, row = (pixels / size * CELLS).long().clamp(0, CELLS - 1).unbind(-1)
-    return row * CELLS + column
-
-
 def well_spread(pixels: Float[Tensor, "m 2"], camera: Intrinsics, most: int) -> Int[Tensor, "k"]:
-    """Return up to ``most`` indices, from all cells of the grid in turn; the pixels come best first."""
+    """Return up to ``most`` indices, from all cells of a grid over the image in turn; the pixels come best first."""
     if len(pixels) <= most:
         return torch.arange(len(pixels))
-    cell = cells_of(pixels, camera)
+    cell = cell_numbers(pixels, camera)
     order = cell.argsort(stable=True)
     first = torch.searchsorted(cell[order], cell[order])
     rank = torch.empty_like(cell)
@@ -200,23 +211,10 @@ def well_spread(pixels: Float[Tensor, "m 2"], camera: Intrinsics, most: int) -> 
     return rank.argsort(stable=True)[:most].sort().values
 
 
-def _points(near: LandmarkMap, image: QueryImage, matches: LandmarkMatches) -> FollowedPoints:
-    return FollowedPoints.of_landmarks(near, matches.landmark, image.keypoints.pixels[matches.keypoint])
-
-
-def _matches_within(
-    images: list[QueryImage], near: LandmarkMap, T_world_camera: SE3, radius: float
-) -> LandmarkMatches:
+def _matches_within(query: LandmarkQuery, T_world_camera: SE3, radius: float) -> LandmarkMatches:
     """Return the matches by descriptors, least ambiguous first, whose landmarks project within ``radius`` pixels."""
-    (image,) = images
-    matches = unguided_matches(images, LandmarkMatcher(near))
-    local = T_world_camera.inverse().to(torch.float32).apply(near.positions[matches.landmark])
-    off = (local[:, :2] / local[:, 2:] - image.rays[matches.keypoint, :2]) * image.focal
-    return matches[(local[:, 2] > 0) & (off.square().sum(-1) <= radius**2)]
-
-
-def _usual_distance(image: QueryImage, near: LandmarkMap, matches: LandmarkMatches) -> float:
-    distance = paired_squared_distances(
-        image.keypoints.descriptors, near.descriptors, matches.keypoint, matches.landmark
-    )
-    return LOOSE**2 * float(distance.quantile(0.9))
+    (image,) = query.images
+    matches = unguided_matches(query.images, LandmarkMatcher(query.landmarks), len(image.keypoints))
+    return matches[
+        torch.linalg.vector_norm(query.observed(matches).residuals(T_world_camera), dim=-1) <= radius
+    ]

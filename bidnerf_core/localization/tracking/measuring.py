@@ -13,13 +13,15 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
-from bidnerf_core.localization.by_landmarks import DEPTH_SCALE_PRIOR, FOCAL_PRIOR, INFLATION
+from bidnerf_core.localization.by_landmarks import shrunk_depth_scale
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import INDEPENDENT
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.localization.search.landmarks import FocalCheck, LandmarkPose
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmark_query import pixel_threshold
+from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.tracking.alignment import (
     CloudInCamera,
     aligned,
@@ -32,7 +34,6 @@ from bidnerf_core.localization.tracking.detection import (
     LandmarkDetector,
     flow_evidence,
     landmark_pose,
-    pixel_threshold,
     well_spread,
 )
 from bidnerf_core.localization.tracking.flow import Grey, flow
@@ -87,15 +88,23 @@ class ByLandmarks:
     detector: LandmarkDetector
     config: TrackerConfig
 
+    @property
+    def correlation(self) -> float:
+        """The number of landmarks in an image that count as one measurement."""
+        return self.detector.landmarks.correlation
+
     def __call__(
         self, frame: Frame, image: Grey, state: TrackerState, points: FollowedPoints, predicted: Motion
     ) -> Measurement | None:
         """Return the pose by landmarks, fused with measured depth; None if too few are seen for any pose."""
         threshold = pixel_threshold(frame.intrinsics)
-        found = fit_pose(points.observed(frame), predicted.T_world_camera, state.noise, threshold)
+        found = fit_pose(
+            points.observed(frame), predicted.T_world_camera, state.noise, threshold, self.correlation
+        )
         judged = None
         if found is not None:
-            judged = self._judged(frame, points, found, flow_evidence(found, frame.intrinsics))
+            evidence = flow_evidence(found, frame.intrinsics)
+            judged = self._judged(frame, points, found, evidence, state.miscalibration)
         state = replace(state, age=state.age + 1)
         if judged is None or self._wants_more(state, points, judged):
             fresh = self._recognized(frame, state, predicted, judged)
@@ -106,9 +115,16 @@ class ByLandmarks:
         return self._fused(frame, state, points[found.inliers], *judged)
 
     def _judged(
-        self, frame: Frame, points: FollowedPoints, found: PointFit, evidence: Evidence
+        self,
+        frame: Frame,
+        points: FollowedPoints,
+        found: PointFit,
+        evidence: Evidence,
+        miscalibration: Miscalibration,
     ) -> tuple[LandmarkPose, Verdict]:
-        pose = landmark_pose(points, found, evidence, self.detector.landmarks, frame.intrinsics)
+        pose = landmark_pose(
+            points, found, evidence, self.detector.landmarks, miscalibration, frame.intrinsics
+        )
         return pose, landmark_verdict(pose)
 
     def _wants_more(
@@ -138,25 +154,27 @@ class ByLandmarks:
         seen = self.detector(frame, T, radius, state.usual_distance, state.noise)
         if seen is None:
             return None
-        pose, verdict = self._judged(frame, seen.points, seen.found, seen.evidence)
+        pose, verdict = self._judged(frame, seen.points, seen.found, seen.evidence, seen.miscalibration)
         if not verdict.accepted:
             return pose, verdict, seen.points, seen.found, state
         some = well_spread(seen.points.pixels[seen.found.inliers], camera, self.config.points)
         kept = torch.zeros(len(seen.points), dtype=torch.bool)
         kept[seen.found.inliers.nonzero()[:, 0][some]] = True
-        slope = FocalCheck.of(seen.found.data, seen.found.fit).slope
-        state = replace(state, sought=len(some), age=0, usual_distance=seen.usual_distance, focal_slope=slope)
+        state = replace(
+            state,
+            sought=len(some),
+            age=0,
+            usual_distance=seen.usual_distance,
+            miscalibration=seen.miscalibration,
+        )
         return pose, verdict, seen.points, replace(seen.found, inliers=kept), state
 
     def _fused(
         self, frame: Frame, state: TrackerState, kept: FollowedPoints, found: LandmarkPose, verdict: Verdict
     ) -> Measurement:
         state = replace(state, points=kept, noise=found.noise)
-        noise = INFLATION * found.covariance
-        slope = state.focal_slope
-        bias = INFLATION * self.detector.landmarks.pose_covariance + FOCAL_PRIOR**2 * torch.outer(
-            slope, slope
-        )
+        noise = found.covariance - self.detector.landmarks.pose_covariance
+        bias = found.full_covariance - noise
         T, surface = found.T_world_camera, self.map.surface
         if not verdict.accepted or surface is None or not frame.has_depth:
             return Measurement(PoseEstimate(T, noise, bias), verdict, found.noise, state)
@@ -171,11 +189,8 @@ class ByLandmarks:
         return Measurement(pose, verdict, found.noise, replace(state, window=kept_clouds))
 
     def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:
-        scale = 1.0
-        if found.depth_scale is not None:
-            weight = DEPTH_SCALE_PRIOR**2 / (DEPTH_SCALE_PRIOR**2 + 0.01**2)
-            scale = 1 + weight * (found.depth_scale - 1)
-        return measured_cloud(frame, self.config.depth_points, scale, Generator().manual_seed(seed))
+        generator = Generator().manual_seed(seed)
+        return measured_cloud(frame, self.config.depth_points, shrunk_depth_scale(found), generator)
 
 
 def search_radius(predicted: Motion, camera: Intrinsics) -> float:

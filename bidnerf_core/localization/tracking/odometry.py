@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization.tracking.detection import flow_evidence, pixel_threshold
+from bidnerf_core.localization.search.landmark_query import pixel_threshold
+from bidnerf_core.localization.tracking.detection import flow_evidence
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, fit_pose
@@ -22,8 +23,8 @@ CERTAIN = -6.0
 """Largest logarithm of the number of such agreements expected by chance."""
 REPLENISHED = 0.5
 """Share of the corners left at which new ones are taken."""
-INFLATION = 4.0
-"""Factor on the covariance of a motion, since the errors of neighbouring depths are correlated."""
+CORRELATION = 4.0
+"""Number of corners that count as one, since the errors of neighbouring depths are correlated."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,13 @@ class Odometry:
         ``start`` is the predicted pose, at which the fit begins.
         """
         threshold = pixel_threshold(frame.intrinsics)
-        found = fit_pose(points.observed(frame), start, threshold / 2, threshold)
+        found = fit_pose(points.observed(frame), start, threshold / 2, threshold, CORRELATION)
         if found is None:
             return None
         evidence = flow_evidence(found, frame.intrinsics)
         if evidence.agreeing < max(LEAST_CORNERS, LEAST_SHARE * len(points)) or evidence.log10_nfa > CERTAIN:
             return None
-        relative = INFLATION * found.fit.covariance[:6, :6]
+        relative = found.fit.covariance
         if not bool(relative.isfinite().all()):
             return None
         return motion.moved(found.T_world_camera, relative, seconds), points[found.inliers]

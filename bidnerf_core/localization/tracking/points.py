@@ -103,28 +103,26 @@ class PointFit:
         return int((off <= threshold).sum())
 
 
-def fit_pose(data: ObservedPoints, start: SE3, noise: float, threshold: float) -> PointFit | None:
+def fit_pose(
+    data: ObservedPoints, start: SE3, noise: float, threshold: float, correlation: float = 1.0
+) -> PointFit | None:
     """Return the pose that the points in one camera determine, from a start; None if they are too few.
 
-    ``noise`` (pixels) is a first guess at that of the observations. Where most points do not agree with the robust fit, a
+    ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. Where most points do not agree with the robust fit, a
     consensus of samples within ``threshold`` pixels replaces the start.
     """
     if len(data) < LEAST_POINTS:
         return None
-    found = _fitted(data, _nearby(data, start, threshold), noise)
+    fit = resect(data, _nearby(data, start, threshold), noise, correlation=correlation)
+    found = PointFit(fit, data, _inliers(data, fit))
     if found.share >= MAJORITY and found.fit.noise <= threshold:
         return found
     consensus = sample_consensus(data, torch.zeros(len(data), dtype=torch.long), threshold, seed=0)
     if consensus is None or int(consensus.inliers.sum()) < LEAST_POINTS:
         return found
-    better = resect(data[consensus.inliers], consensus.T_world_rig, threshold / 2)
+    better = resect(data[consensus.inliers], consensus.T_world_rig, threshold / 2, correlation=correlation)
     other = PointFit(better, data, _inliers(data, better))
     return other if other.within(threshold) > found.within(threshold) else found
-
-
-def _fitted(data: ObservedPoints, start: SE3, noise: float) -> PointFit:
-    fit = resect(data, start, noise)
-    return PointFit(fit, data, _inliers(data, fit))
 
 
 def _inliers(data: ObservedPoints, fit: ReprojectionFit) -> Bool[Tensor, "m"]:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
@@ -16,6 +15,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.files import write_file
 from bidnerf_core.localization.costs.surface import PointCloud
+from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.tracking.alignment import CloudInCamera
 from bidnerf_core.localization.tracking.clock import Clock
 from bidnerf_core.localization.tracking.flow import Grey
@@ -40,7 +40,7 @@ class TrackerState:
     sought: int = 0  # number of points when they were last sought
     age: int = 0  # frames since then
     usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
-    focal_slope: Float[Tensor, "6"] = field(default_factory=lambda: torch.zeros(6, dtype=torch.float64))
+    miscalibration: Miscalibration = field(default_factory=Miscalibration.unknown)
     noise: float = 1.0  # pixels: of the points in the last image
     window: tuple[CloudInCamera, ...] = ()
 
@@ -59,7 +59,9 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
         "reach": None if state.motion is None else state.motion.reach,
     }  # fmt: skip
     tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
-    tensors["focal_slope"] = state.focal_slope
+    tensors |= {
+        f"miscalibration.{f.name}": getattr(state.miscalibration, f.name) for f in fields(Miscalibration)
+    }
     if state.image is not None:
         tensors["image"] = torch.from_numpy(state.image)
     if state.motion is not None:
@@ -117,10 +119,11 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
     )
     points = FollowedPoints(*(tensors[f"points.{f.name}"] for f in fields(FollowedPoints)))
     usual = numbers["usual_distance"]
+    miscalibration = Miscalibration(*(tensors[f"miscalibration.{f.name}"] for f in fields(Miscalibration)))
     return TrackerState(
         Clock(numbers["now"], numbers["interval"]), motion, numbers["frames"], numbers["lost"], points,
         tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
-        float("inf") if usual is None else usual, tensors["focal_slope"], numbers["noise"], window,
+        float("inf") if usual is None else usual, miscalibration, numbers["noise"], window,
     )  # fmt: skip
 
 
