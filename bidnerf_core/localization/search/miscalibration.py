@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import CALIBRATED, CalibrationPrior, ReprojectionFit
+from bidnerf_core.mapping.resection import CALIBRATED, Calibration, CalibrationPrior, ReprojectionFit
 
 MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
 """Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
@@ -42,6 +42,11 @@ class Miscalibration:
         log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
         log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES))
         return Miscalibration(value, free.calibration_deviations, log_odds.sigmoid())
+
+    @property
+    def calibration(self) -> Calibration:
+        """The correction that fits best."""
+        return Calibration(*self.apparent.tolist())
 
     @property
     def deviations(self) -> Float[Tensor, "4"]:

@@ -14,13 +14,21 @@ from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_dia
 from bidnerf_core.localization.by_landmarks import SURFACE_MEASUREMENTS, FusedTerm
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.covariance import FINEST, INDEPENDENT, LEAST_VARIANCE, surface_covariance
+from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE, surface_covariance
 from bidnerf_core.localization.normal_equations import Sum
 from bidnerf_core.localization.search.by_points import JUDGED
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.localization.tracking.motion import PoseEstimate
+from bidnerf_core.localization.tracking.single_pose import retracted
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
+SURFACE_BIAS = 0.5
+"""Share of the variance of a pose by depth that consecutive frames share."""
+DEPTH_MEASUREMENTS = 3.0
+"""Number of independent measurements that a frame's points count as beside landmarks: fewer than ``INDEPENDENT``, which is
+optimistic for hand-held sensors.
+"""
 SETTLED = 1e-4
 """Length of a step (metres and radians) at which the alignment has ended."""
 
@@ -53,31 +61,36 @@ def joined(now: CloudInCamera, before: Sequence[CloudInCamera]) -> PointCloud:
 
 
 def fused_with_surface(
-    T_world_camera: SE3,
-    covariances: Sequence[Float[Tensor, "6 6"]],
-    surface: SurfaceMap,
-    cloud: PointCloud,
-    steps: int,
-    views: int = 1,
-) -> tuple[SE3, list[Float[Tensor, "6 6"]]]:
-    """Fuse a pose with measured points on the surface.
+    pose: PoseEstimate, surface: SurfaceMap, cloud: PointCloud, steps: int, views: int = 1
+) -> PoseEstimate:
+    """Fuse a pose with measured points on the surface, which count as ``DEPTH_MEASUREMENTS`` a view.
 
-    The first of ``covariances`` is that of the pose (right update). Returns the fused pose, and what each of the covariances
-    becomes with the information of the points, which count as ``INDEPENDENT`` measurements a view.
+    A share ``SURFACE_BIAS`` of the variance that the points contribute is bias, as in ``aligned``.
     """
     about = cloud.pivot
     cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
-    variance = max(float(cost.residual_variance(T_world_camera[None])[0]), LEAST_VARIANCE)
-    term = FusedTerm(cost, variance, SURFACE_MEASUREMENTS * views)
-    prior = GaussianPrior(T_world_camera, covariances[0], about)
-    done = descend(Sum((prior, term.scaled)), T_world_camera[None], steps, about.moved, stop=SETTLED)
-    T = done.T[0].normalized()
-    # The descent ended with the equations of both; what the prior contributed is known.
-    information = done.equations.hessian[0] - prior(T[None]).hessian[0]
-    information = information * (INDEPENDENT / SURFACE_MEASUREMENTS)
-    to_pivot = torch.linalg.inv(about.update_at_camera(T))
-    at_camera = to_pivot.T @ information @ to_pivot
-    return T, [torch.linalg.inv(torch.linalg.inv(c) + at_camera) for c in covariances]
+    variance = max(float(cost.residual_variance(pose.T_world_camera[None])[0]), LEAST_VARIANCE)
+    weight = DEPTH_MEASUREMENTS * views / variance
+    at_camera = about.update_at_camera(pose.T_world_camera)
+    prior = at_camera.T @ torch.linalg.inv(pose.covariance) @ at_camera
+    T, moved = pose.T_world_camera, torch.zeros(6, dtype=torch.float64)
+    for _ in range(steps):
+        here = cost(T[None])
+        hessian, gradient = weight * here.hessian[0], weight * here.gradient[0]
+        # The steps are so short that they add up; the prior pulls back by all of them.
+        step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)
+        T, moved = retracted(T, at_camera @ step), moved + step
+        if float(torch.linalg.vector_norm(step)) < SETTLED:
+            break
+    to_pivot = torch.linalg.inv(at_camera)
+    information = to_pivot.T @ hessian @ to_pivot
+    fused = torch.linalg.inv(torch.linalg.inv(pose.covariance) + information)
+    kept, by_points = torch.eye(6).double() - fused @ information, fused @ information @ fused
+    return PoseEstimate(
+        T.normalized(),
+        kept @ pose.noise @ kept.T + (1 - SURFACE_BIAS) * by_points,
+        kept @ pose.bias @ kept.T + SURFACE_BIAS * by_points,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
 from bidnerf_core.mapping.features import Features
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import FIXED, GIVEN, NOMINAL, resect
+from bidnerf_core.mapping.resection import FIXED, GIVEN, NOMINAL, Calibration, resect
 from bidnerf_core.se3 import SE3
 
 NEARBY = EXACT
@@ -74,12 +74,18 @@ class LandmarkDetector:
     features: Features
 
     def __call__(
-        self, frame: Frame, T_world_camera: SE3, radius: float, most_distance: float, noise: float
+        self,
+        frame: Frame,
+        T_world_camera: SE3,
+        radius: float,
+        most_distance: float,
+        noise: float,
+        apparent: Calibration = GIVEN,
     ) -> Recognized | None:
         """Match keypoints with landmarks that project within ``radius`` pixels of them, and fit the pose to the matches.
 
         ``most_distance`` is the largest squared distance between the descriptors of a match, ``noise`` a first guess at that
-        of keypoints (pixels). Returns None if too few match.
+        of keypoints (pixels), ``apparent`` one at the intrinsics that fit best. Returns None if too few match.
         """
         number = self._near(frame.intrinsics, T_world_camera)
         image = query_image(frame, SE3.identity(), self.features)
@@ -100,7 +106,7 @@ class LandmarkDetector:
         evidence = _guided_evidence(query, found, tight, most_distance)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
         points = replace(points, landmark=number[points.landmark])
-        return Recognized(points, found, evidence, most_distance, self._miscalibration(found))
+        return Recognized(points, found, evidence, most_distance, self._miscalibration(found, apparent))
 
     def _seen(
         self, frame: Frame, query: LandmarkQuery, T: SE3, radius: float, most_distance: float, noise: float
@@ -131,11 +137,11 @@ class LandmarkDetector:
             return index
         return index[landmarks.views[index].argsort(descending=True, stable=True)[:NEARBY].sort().values]
 
-    def _miscalibration(self, found: PointFit) -> Miscalibration:
+    def _miscalibration(self, found: PointFit, apparent: Calibration) -> Miscalibration:
         """Judge the given intrinsics by those that fit the landmarks best."""
         free = resect(
-            found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL,
-            correlation=self.landmarks.correlation,
+            found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL, apparent,
+            self.landmarks.correlation,
         )  # fmt: skip
         return Miscalibration.of(free, self.landmarks)
 

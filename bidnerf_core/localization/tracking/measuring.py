@@ -23,6 +23,7 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import pixel_threshold
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.tracking.alignment import (
+    SURFACE_BIAS,
     CloudInCamera,
     aligned,
     fused_with_surface,
@@ -50,8 +51,6 @@ SIGMAS = 3.0
 """The radius in standard deviations of the prediction."""
 ENOUGH = 40
 """The number of followed landmarks that agree from which on no new ones are sought."""
-SURFACE_BIAS = 0.5
-"""Share of the variance of a pose by depth that consecutive frames share."""
 DETERMINED = 0.02, math.radians(3)
 """Largest standard deviation of an accepted pose by depth or colour: shares of the scene's extent, and radians."""
 
@@ -151,7 +150,9 @@ class ByLandmarks:
             radius = max(least, search_radius(predicted, camera))
             if radius > most:
                 return None
-        seen = self.detector(frame, T, radius, state.usual_distance, state.noise)
+        seen = self.detector(
+            frame, T, radius, state.usual_distance, state.noise, state.miscalibration.calibration
+        )
         if seen is None:
             return None
         pose, verdict = self._judged(frame, seen.points, seen.found, seen.evidence, seen.miscalibration)
@@ -175,17 +176,14 @@ class ByLandmarks:
         state = replace(state, points=kept, noise=found.noise)
         noise = found.covariance - self.detector.landmarks.pose_covariance
         bias = found.full_covariance - noise
-        T, surface = found.T_world_camera, self.map.surface
+        pose, surface = PoseEstimate(found.T_world_camera, noise, bias), self.map.surface
         if not verdict.accepted or surface is None or not frame.has_depth:
-            return Measurement(PoseEstimate(T, noise, bias), verdict, found.noise, state)
-        here = CloudInCamera(self._cloud(frame, found, state.frames), T)
+            return Measurement(pose, verdict, found.noise, state)
+        here = CloudInCamera(self._cloud(frame, found, state.frames), found.T_world_camera)
         cloud = joined(here, state.window)
-        T, (_, noise) = fused_with_surface(
-            T, (noise + bias, noise), surface, cloud, self.config.depth_steps, 1 + len(state.window)
-        )
+        pose = fused_with_surface(pose, surface, cloud, self.config.depth_steps, 1 + len(state.window))
         kept_clouds = (*state.window, here)[-(self.config.window - 1) :] if self.config.window > 1 else ()
         verdict = replace(verdict, reason=f"{verdict.reason}, fused with depth")
-        pose = PoseEstimate(T, noise, bias)
         return Measurement(pose, verdict, found.noise, replace(state, window=kept_clouds))
 
     def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.localization.tracking.single_pose import retracted, update_between
 from bidnerf_core.se3 import SE3
 
 SPEED, TURN_RATE = 1.0, 1.0
@@ -72,7 +73,7 @@ class Motion:
         """
         motion = self.at_rest() if abs(seconds) > GAP else self
         step = motion.velocity * seconds
-        T = motion.T_world_camera.retract(step)
+        T = retracted(motion.T_world_camera, step)
         back = _adjoint_of_inverse(step)
         transition = torch.eye(12, dtype=torch.float64)
         transition[:6, :6] = back
@@ -89,7 +90,7 @@ class Motion:
 
         The bias of the measurement and that of the state are taken as fully correlated, so that fusing does not reduce it.
         """
-        off = (self.T_world_camera.inverse() @ measured.T_world_camera).log()
+        off = update_between(self.T_world_camera, measured.T_world_camera)
         innovation = self.noise[:6, :6] + measured.noise
         gain = torch.linalg.solve(innovation, self.noise[:6]).T
         delta = gain @ off
@@ -98,7 +99,7 @@ class Motion:
         noise = kept @ self.noise @ kept.T + gain @ measured.noise @ gain.T  # Joseph's form stays positive
         shared = kept[:6, :6] @ _root(self.bias) + gain[:6] @ _root(measured.bias)
         return Motion(
-            self.T_world_camera.retract(delta[:6]).normalized(),
+            retracted(self.T_world_camera, delta[:6]).normalized(),
             self.velocity + delta[6:],
             _symmetric(noise),
             shared @ shared.T,
@@ -110,7 +111,7 @@ class Motion:
 
         ``relative`` is the covariance of that motion, a right update of the new pose.
         """
-        step = (self.T_world_camera.inverse() @ T_world_camera).log()
+        step = update_between(self.T_world_camera, T_world_camera)
         back = _adjoint_of_inverse(step)
         seconds = max(abs(seconds), LEAST_SECONDS) * (-1 if seconds < 0 else 1)
         noise = torch.zeros((12, 12), dtype=torch.float64)
@@ -124,7 +125,7 @@ class Motion:
 
     def distance(self, measured: PoseEstimate) -> float:
         """Return the squared Mahalanobis distance of a measured pose from this one; 6 on average."""
-        off = (self.T_world_camera.inverse() @ measured.T_world_camera).log()
+        off = update_between(self.T_world_camera, measured.T_world_camera)
         spread = self.noise[:6, :6] + measured.noise
         return float(off @ torch.linalg.solve(spread, off))
 
@@ -146,7 +147,7 @@ def _scaled(translation: float, rotation: float) -> Float[Tensor, "6 6"]:
 
 
 def _adjoint_of_inverse(step: Float[Tensor, "6"]) -> Float[Tensor, "6 6"]:
-    return SE3.exp(-step).adjoint()
+    return retracted(SE3.identity(), -step).adjoint()
 
 
 def _symmetric(matrix: Tensor) -> Tensor:
