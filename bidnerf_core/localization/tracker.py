@@ -38,8 +38,6 @@ METHOD = "track"
 """The method that poses of a tracker name."""
 START = 0.03, 0.1
 """Standard deviations of a start whose uncertainty is not given: shares of the scene's extent, and radians."""
-UNFORESEEN = 60.0
-"""Squared Mahalanobis distance of an accepted pose from the prediction beyond which the prediction is dropped."""
 VELOCITY_KEPT = 0.6
 """Share of the velocity that is kept with each lost frame."""
 NOTHING_SEEN = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
@@ -195,10 +193,7 @@ class Tracker:
         motion = replace(
             predicted, reach=self._reach(frame, measured.state.points, measured.pose.T_world_camera)
         )
-        if predicted.distance(measured.pose) > UNFORESEEN:
-            motion = Motion.at(measured.pose, motion.reach)
-        else:
-            motion = motion.corrected(measured.pose)
+        motion = motion.updated(measured.pose)
         state = replace(measured.state, motion=motion, lost=0)
         if self._by_landmarks is None:
             corners = self._odometry.replenished(frame, image, state.points, motion.T_world_camera)

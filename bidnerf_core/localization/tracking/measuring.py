@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
 from bidnerf_core.localization.by_landmarks import shrunk_depth_scale
 from bidnerf_core.localization.costs.surface import PointCloud
@@ -51,6 +51,8 @@ SIGMAS = 3.0
 """The radius in standard deviations of the prediction."""
 ENOUGH = 40
 """The number of followed landmarks that agree from which on no new ones are sought."""
+SINGLE = LandmarkThresholds(precision=math.inf)
+"""Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
 DETERMINED = 0.02, math.radians(3)
 """Largest standard deviation of an accepted pose by depth or colour: shares of the scene's extent, and radians."""
 
@@ -111,7 +113,9 @@ class ByLandmarks:
                 judged, points, found, state = fresh[:2], fresh[2], fresh[3], fresh[4]
         if judged is None or found is None:
             return None
-        return self._fused(frame, state, points[found.inliers], *judged)
+        measured = self._fused(frame, state, points[found.inliers], *judged)
+        covariance = predicted.updated(measured.pose).covariance
+        return replace(measured, verdict=precise(measured.verdict, covariance, judged[0].distance))
 
     def _judged(
         self,
@@ -124,14 +128,16 @@ class ByLandmarks:
         pose = landmark_pose(
             points, found, evidence, self.detector.landmarks, miscalibration, frame.intrinsics
         )
-        return pose, landmark_verdict(pose)
+        return pose, landmark_verdict(pose, SINGLE)
 
     def _wants_more(
         self, state: TrackerState, points: FollowedPoints, judged: tuple[LandmarkPose, Verdict]
     ) -> bool:
         left = judged[0].inliers
         few = left < max(ENOUGH, self.config.refresh_share * state.sought)
-        return few or state.age >= self.config.refresh_frames or not judged[1].accepted
+        pose, verdict = judged
+        few |= pose.position_deviation > LandmarkThresholds().precision * pose.distance
+        return few or state.age >= self.config.refresh_frames or not verdict.accepted
 
     def _recognized(
         self,
@@ -174,7 +180,8 @@ class ByLandmarks:
         self, frame: Frame, state: TrackerState, kept: FollowedPoints, found: LandmarkPose, verdict: Verdict
     ) -> Measurement:
         state = replace(state, points=kept, noise=found.noise)
-        noise = found.covariance - self.detector.landmarks.pose_covariance
+        # Errors that the landmarks of an image have in common are those of the next image, too.
+        noise = (found.covariance - self.detector.landmarks.pose_covariance) / self.correlation
         bias = found.full_covariance - noise
         pose, surface = PoseEstimate(found.T_world_camera, noise, bias), self.map.surface
         if not verdict.accepted or surface is None or not frame.has_depth:
@@ -237,6 +244,15 @@ def by_colour(
         answer.refined.T.normalized(), (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance
     )
     return Measurement(pose, answer.verdict, answer.refined.loss, state)
+
+
+def precise(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
+    """Return the verdict, or that the position is too uncertain for the ``distance`` (metres) of what is in view."""
+    deviation = float(torch.linalg.eigvalsh(covariance[:3, :3])[-1].clamp(min=0).sqrt())
+    if not verdict.accepted or deviation <= LandmarkThresholds().precision * distance:
+        return verdict
+    why = f"but the position is uncertain by {deviation / distance:.1%} of the distance"
+    return Verdict(Outcome.IMPRECISE, f"{verdict.reason}, {why}")
 
 
 def determined(verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float) -> Verdict:

@@ -26,6 +26,8 @@ that is moved briskly.
 """
 GAP = 0.6
 """Seconds without a frame after which the velocity is no longer used."""
+UNFORESEEN = 60.0
+"""Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is dropped."""
 LEAST_SECONDS = 1e-3
 """Least time between two frames for which noise of the motion is added; frames may be repeated or lack distinct times."""
 
@@ -105,6 +107,12 @@ class Motion:
             shared @ shared.T,
             self.reach,
         )
+
+    def updated(self, measured: PoseEstimate) -> Motion:
+        """Return the state after fusing it with a measured pose, or at that pose alone if no prediction could foresee it."""
+        if self.distance(measured) > UNFORESEEN:
+            return Motion.at(measured, self.reach)
+        return self.corrected(measured)
 
     def moved(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
         """Return the state after a motion that the images themselves gave, ``seconds`` later.
