@@ -9,6 +9,7 @@ from torch import Tensor
 from bidnerf_core import SE3, InputError
 from bidnerf_core.localization.tracking.clock import Clock
 from bidnerf_core.localization.tracking.motion import GAP, Motion, PoseEstimate, pixel_radius
+from bidnerf_core.localization.tracking.single_pose import retracted, update_between
 
 VELOCITY = torch.tensor([0.3, -0.1, 0.2, 0.2, 0.4, -0.1], dtype=torch.float64)
 
@@ -70,10 +71,10 @@ def test_fusing_equals_the_product_of_gaussians() -> None:
 
 
 def test_bias_does_not_average_out() -> None:
-    """A thousand frames of one map are no more accurate than the map."""
+    """Hundreds of frames of one map are no more accurate than the map."""
     bias = covariance(2e-3, 1)
     motion = Motion.at(PoseEstimate(SE3.identity(), covariance(1e-3), bias), 1.0)
-    for _ in range(1000):
+    for _ in range(200):
         motion = motion.predicted(1e-3).corrected(PoseEstimate(SE3.identity(), covariance(1e-3), bias))
     assert torch.allclose(motion.bias, bias, rtol=1e-6, atol=1e-12)
     least = torch.linalg.eigvalsh(motion.covariance - 0.999 * bias)[0]
@@ -119,3 +120,22 @@ def test_the_clock_fills_in_missing_times() -> None:
     assert seconds == pytest.approx(-0.05)
     with pytest.raises(InputError, match="time"):
         clock.step(float("nan"))
+
+
+def test_an_unforeseen_pose_restarts_the_motion() -> None:
+    motion = Motion.at(measured(path(0.0)), 1.0).moved(path(0.1), covariance(1e-3), 0.1).predicted(0.1)
+    near, far = measured(path(0.2)), measured(path(0.2).retract(torch.full((6,), 0.8).double()))
+    assert torch.equal(motion.updated(near).velocity, motion.corrected(near).velocity)
+    assert torch.equal(motion.updated(far).T_world_camera.matrix(), far.T_world_camera.matrix())
+    assert not motion.updated(far).velocity.any()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.1, 3.1])
+def test_maps_of_single_poses_equal_those_of_batches(angle: float) -> None:
+    generator = torch.Generator().manual_seed(1)
+    tangent = torch.randn(6, generator=generator, dtype=torch.float64)
+    tangent[3:] *= angle / tangent[3:].norm()
+    T = path(1.5)
+    moved = retracted(T, tangent)
+    assert torch.allclose(moved.matrix(), T.retract(tangent).matrix(), atol=1e-12)
+    assert torch.allclose(update_between(T, moved), tangent, atol=1e-9)
