@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
+import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import BinaryIO, TypeVar, cast
 
 from safetensors import SafetensorError
 from safetensors.torch import load as tensors_from_bytes
@@ -12,17 +15,43 @@ from torch import Tensor, nn
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField
+from bidnerf_core.files import open_binary
 
 Part = TypeVar("Part")
+EXPECTED = "a safetensors file"
+LARGEST_HEADER = 16 * 2**20
+"""Bytes; a tensor takes about a hundred of them."""
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a file. Raises ``InputError`` where it is none, or has not the length that its header says."""
+    if not os.path.lexists(path):
+        raise InputError(f"{path}: no such file, but map.json names it; the map is incomplete")
     try:
-        return tensors_from_bytes(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file, but map.json names it; the map is incomplete") from error
-    except SafetensorError as error:
-        raise InputError(f"{path}: not readable ({error}), expected a safetensors file") from error
+        with open_binary(path, EXPECTED) as file:
+            _check_length(path, file)
+            return tensors_from_bytes(file.read())
+    except (SafetensorError, KeyError, ValueError, RuntimeError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not readable ({error}), expected {EXPECTED}") from error
+
+
+def _check_length(path: Path, file: BinaryIO) -> None:
+    """Compare the length of a file with what its header says, before memory is taken for the tensors."""
+    size = os.fstat(file.fileno()).st_size
+    length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
+    if not length <= min(size - 8, LARGEST_HEADER):
+        raise InputError(f"{path}: not readable (its header is cut off), expected {EXPECTED}")
+    try:
+        header = json.loads(file.read(length))
+        ends = [part["data_offsets"][1] for name, part in header.items() if name != "__metadata__"]
+        described = 8 + length + max(ends, default=0)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path}: not readable (its header is damaged), expected {EXPECTED}") from error
+    if described != size:
+        raise InputError(f"{path}: has {size} bytes, its header describes {described}; expected {EXPECTED}")
+    file.seek(0)
 
 
 def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) -> Part:

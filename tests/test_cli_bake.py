@@ -16,8 +16,9 @@ from bidnerf_core.cli import bake as module
 from bidnerf_core.cli import main
 from bidnerf_core.cli.common import read_views
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.mapping.capture_report import CaptureReport, CoverageRecord
 from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.storage import Map, load_info, load_map
+from bidnerf_core.storage import Map, load_info, load_map, save_capture
 from commands import Run
 from tiny import backends_listed_once  # noqa: F401
 
@@ -228,3 +229,38 @@ def test_damaged_landmarks_of_photos_are_replaced(with_photo_landmarks: Path, bi
     assert str(damaged) in err
     assert load_info(with_photo_landmarks).landmark_source == "rendered images"
     assert load_map(with_photo_landmarks).landmarks is not None
+
+
+def test_photos_leave_a_record_that_info_shows_and_draws(
+    shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
+    assert json.loads(bidnerf("info", folder, "--json")[1])["capture"] is None
+    status, _, err = bidnerf("info", folder, "--draw", folder / "capture.png")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "no record of its photos" in err
+    status, _, err = bidnerf("bake", folder, "--data", shared / "data")
+    assert status == 0
+    lines = [line for line in err.splitlines() if "24 photos, " in line]
+    assert len(lines) == 1
+    facts = json.loads(bidnerf("info", folder, "--json")[1])
+    assert len(facts["capture"]["photos"]) == 24
+    status, out, _ = bidnerf("info", folder, "--draw", folder / "capture.png")
+    assert (status, lines[0] in out) == (0, True)
+    assert (folder / "capture.png").read_bytes().startswith(b"\x89PNG")
+    status, _, err = bidnerf("info", folder, "--draw", folder / "capture.jpg")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "PNG" in err
+
+
+@pytest.mark.parametrize("content", ["", "{}", '{"photos": 3}'])
+def test_a_damaged_record_of_photos_is_named_in_a_line(folder: Path, content: str, bidnerf: Run) -> None:
+    save_capture(folder, load_info(folder), CaptureReport((), CoverageRecord()))
+    assert bidnerf("info", folder).status == 0
+    file = folder / str(load_info(folder).capture)
+    file.write_text(content)
+    status, _, err = bidnerf("info", folder)
+    assert (status, err.count("\n")) == (1, 1)
+    assert file.name in err
+    file.unlink()
+    assert "missing" in bidnerf("info", folder).err

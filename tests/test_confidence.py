@@ -23,7 +23,7 @@ FINE = Verdict(Outcome.CONVERGED, "fine")
 
 
 @pytest.fixture(scope="module")
-def benchmark() -> ModuleType:
+def learning() -> ModuleType:
     path = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
     spec = importlib.util.spec_from_file_location("confidence_benchmark", path)
     assert spec is not None
@@ -75,17 +75,17 @@ def test_probability_is_the_logistic_function() -> None:
     assert model.probability({"a": 1e6, "b": 0.0}) == 1.0
 
 
-def test_the_fit_recovers_probabilities(benchmark: ModuleType) -> None:
-    """Examples drawn from a known model are predicted about as well as by the model itself."""
+def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:
+    """Examples drawn from a known model give its probabilities back, but for what the ridge shrinks."""
     random = np.random.default_rng(0)
     true = confidence.LogisticModel(("a", "b"), (2.0, -1.0), 0.3)
     given = []
     for number in range(4000):
         features = dict(zip("ab", random.normal(size=2).tolist(), strict=True))
         right = bool(random.random() < true.probability(features))
-        given.append(benchmark.Example("landmarks", features, right, str(number % 2), str(number % 4)))
-    found = benchmark.fitted(given)
+        given.append(learning.Example("landmarks", features, right, str(number % 2), str(number % 4)))
+    found = learning.fitted(given, ridge=1e-5)
     for values in ({"a": 1.0, "b": 0.0}, {"a": -1.0, "b": 1.0}):
         assert found.probability(values) == pytest.approx(true.probability(values), abs=0.06)
-    said = benchmark.tested(given)["all"]
-    assert said["expected_calibration_error"] < 0.06
+    said = learning.cross_validated(given, by_fault=True)["all"]
+    assert said["expected_calibration_error"] < 0.1

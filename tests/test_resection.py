@@ -10,16 +10,9 @@ import torch
 from scipy.optimize import approx_fprime
 
 from bidnerf_core import SE3, Intrinsics
-from bidnerf_core.mapping.resection import (
-    FIXED,
-    GIVEN,
-    NOMINAL,
-    Calibration,
-    ObservedPoints,
-    _Residuals,
-    _State,
-    resect,
-)
+from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.resection import _Residuals, _State, resect
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
 FOCAL = 400.0

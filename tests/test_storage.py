@@ -23,6 +23,7 @@ from bidnerf_core import storage
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.files import write_file
+from bidnerf_core.map_cameras import stored_cameras
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
 from bidnerf_core.registry import load_backend
 from bidnerf_core.scenes.fields import HomogeneousBall
@@ -34,7 +35,6 @@ from bidnerf_core.storage import (
     load_state,
     save_map,
     save_surface,
-    stored_cameras,
 )
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend

@@ -23,6 +23,7 @@ from bidnerf_core.cli.common import (
     require,
     require_different,
     say,
+    show,
     wrong_usage,
 )
 from bidnerf_core.cli.trial_progress import TrialProgress
@@ -142,7 +143,7 @@ def _evaluate(trials: list[Trial], out: Path, workers: int | None, dask: str | N
                 note_run(out, provenance(command, what))
                 _run(todo, file, executor, at_once)
         file.put_in_order(trials)
-    print(f"{len(trials)} trials in {out}; 'bidnerf report {out}' shows them")
+    show(f"{len(trials)} trials in {out}; 'bidnerf report {out}' shows them")
 
 
 def _note_unchecked(trials: list[Trial], file: ResultsFile, out: Path) -> None:

@@ -30,10 +30,11 @@ from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.images import background_colour
+from bidnerf_core.map_cameras import stored_cameras
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
+from bidnerf_core.storage import MapInfo, build_field, load_info, load_state
 from bidnerf_core.training import TrainingStopped
 
 

@@ -34,7 +34,7 @@ from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
+from bidnerf_core.files import read_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.photos import natural_order
@@ -181,8 +181,7 @@ def _splits(path: Path) -> dict[str, list[SceneFrame]]:
 
 def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
     """Return the numbers of the sequences that a split file lists. Raises ``InputError``."""
-    with open_binary(file, "a list of sequences") as opened:
-        lines = opened.read().decode("utf-8-sig", "replace").split("\n")
+    lines = read_file(file, "a list of sequences").decode("utf-8-sig", "replace").split("\n")
     numbers = list[int]()
     for number, line in enumerate(map(str.strip, lines), start=1):
         if not line:

@@ -53,7 +53,17 @@ def build_tried_landmarks(
 
     The trial sets ``correlation``, ``calibration_scatter`` and ``trial`` of the landmarks.
     """
-    tracked = tracked_views(views, features, config, progress)
+    return tried_landmarks(tracked_views(views, features, config, progress), views, features, config, report)
+
+
+def tried_landmarks(
+    tracked: TrackedViews,
+    views: Sequence[View],
+    features: Features = SIFT,
+    config: LandmarkConfig = DEFAULTS,
+    report: Callable[[str], None] = lambda sentence: None,
+) -> LandmarkMap:
+    """Return the landmarks of ``views`` whose keypoints are already matched, after a trial of them."""
     landmarks = tracked.landmarks(config, report)
     held_out = _held_out(len(views))
     answers = _answers(tracked, views, held_out, features, config)

@@ -86,6 +86,12 @@ class TrackedViews:
             )
         return _bounded(found, config.most, report)
 
+    def triangulated(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
+        """Return the keypoints that agree on a triangulated point, and those points (metres, world)."""
+        tracked = torch.bincount(self.observations.point)[self.observations.point] > 1
+        kept, positions, _ = _triangulated(self.observations[tracked], radians(config.parallax))
+        return kept, positions
+
     def without(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks without the keypoints of some images."""
         left = ~torch.isin(self.observations.image, torch.tensor(images))

@@ -8,7 +8,7 @@ are small and the steps many, so everything is NumPy; the general solver on batc
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -16,7 +16,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.mapping.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
+from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 Array = np.ndarray
@@ -33,112 +34,6 @@ SCALE = 2.0
 """Scale of the Cauchy loss: the residual, in standard deviations, whose weight is one half."""
 BEHIND = 30.0
 """Residual of a point behind the camera, in standard deviations; its weight is 0."""
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedPoints:
-    """Points of the world and their observations by the cameras of a rig. Float64."""
-
-    points: Float[Tensor, "m 3"]  # metres, world
-    deviations: Float[Tensor, "m 2"]  # metres, of the points, across and along ``directions``
-    directions: Float[Tensor, "m 3"]  # unit, world
-    image: Float[Tensor, "m 2"]  # observed, on the plane z = 1 of the camera
-    focal: Float[Tensor, "m"]  # pixels
-    depth: Float[Tensor, "m"]  # metres, 0 where none was measured
-    rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
-    translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def __getitem__(self, index: Tensor) -> ObservedPoints:
-        return ObservedPoints(*(getattr(self, name)[index] for name in (f.name for f in fields(self))))
-
-    def corrected(self, calibration: Calibration) -> ObservedPoints:
-        """Return the same pixels as observations of cameras whose calibration is corrected."""
-        undistorted = calibration.undistorted(self.image, self.focal)
-        return replace(self, image=undistorted, focal=self.focal * calibration.focal_factor)
-
-    def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
-        """Return each point in the frame of the camera that observed it."""
-        rig = T_world_rig.inverse().apply(self.points)
-        return (self.rotation @ rig[..., None])[..., 0] + self.translation
-
-    def residuals(self, T_world_rig: SE3) -> Float[Tensor, "m 2"]:
-        """Return projection minus observation, pixels; infinite for points behind the camera."""
-        local = self.in_camera(T_world_rig)
-        z = local[:, 2:]
-        off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
-        return torch.where(z > 0, off, torch.inf)
-
-    def normalized_residuals(self, T_world_rig: SE3, noise: float) -> Float[Tensor, "m 2"]:
-        """Return the residuals in standard deviations, which combine the keypoints' ``noise`` (pixels) with the points'."""
-        deviation = np.sqrt(noise**2 + _point_variance(self, T_world_rig))
-        return self.residuals(T_world_rig) / torch.from_numpy(deviation)[:, None]
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """A correction of given intrinsics: what is estimated of the camera along with its pose."""
-
-    log_focal: float = 0.0  # logarithm of the true over the given focal length
-    shift_u: float = 0.0  # of the principal point, as a share of the given focal length
-    shift_v: float = 0.0
-    radial: float = 0.0  # first coefficient of radial distortion, added to the given distortion
-
-    @property
-    def focal_factor(self) -> float:
-        """True over given focal length."""
-        return math.exp(self.log_focal)
-
-    def applied(self, given: Intrinsics) -> Intrinsics:
-        """Return the corrected intrinsics."""
-        k1, *others = given.distortion or (0.0, 0.0, 0.0, 0.0)
-        factor = self.focal_factor
-        return replace(
-            given, fx=given.fx * factor, fy=given.fy * factor, cx=given.cx + self.shift_u * given.fx,
-            cy=given.cy + self.shift_v * given.fy, distortion=(k1 + self.radial, *others),
-        )  # fmt: skip
-
-    def pixels(self, flat: Float[Tensor, "m 2"], focal: float) -> Float[Tensor, "m 2"]:
-        """Return where points on the plane z = 1 appear, in pixels from the given principal point, by the given focal length."""
-        bent = flat * (1 + self.radial * flat.square().sum(-1, keepdim=True))
-        shift = torch.tensor([self.shift_u, self.shift_v], dtype=flat.dtype)
-        return (bent * self.focal_factor + shift) * focal
-
-    def undistorted(self, image: Float[Tensor, "m 2"], focal: Float[Tensor, "m"]) -> Float[Tensor, "m 2"]:
-        """Return corrected observations on the plane z = 1, for observations made with the given intrinsics."""
-        seen = (image - torch.tensor([self.shift_u, self.shift_v], dtype=image.dtype)) / self.focal_factor
-        flat = seen
-        for _ in range(8):  # fixed-point iteration as in OpenCV's undistortPoints
-            flat = seen / (1 + self.radial * flat.square().sum(-1, keepdim=True))
-        return flat
-
-
-GIVEN = Calibration()
-"""Intrinsics as they are given."""
-
-
-@dataclass(frozen=True)
-class CalibrationPrior:
-    """Standard deviations of given intrinsics, in the units of ``Calibration``; a parameter with 0 is not estimated."""
-
-    log_focal: float = 0.0
-    shift: float = 0.0
-    radial: float = 0.0
-
-    @property
-    def deviations(self) -> Float[Tensor, "4"]:
-        """The standard deviations in the order of the fields of ``Calibration``."""
-        return torch.tensor([self.log_focal, self.shift, self.shift, self.radial], dtype=torch.float64)
-
-
-FIXED = CalibrationPrior()
-"""Intrinsics that are not estimated."""
-CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002)
-"""Intrinsics from a good calibration."""
-NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
-"""Intrinsics from EXIF or a field of view, without distortion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +179,7 @@ class _Residuals:
         self._rotation, self._translation = data.rotation.numpy(), data.translation.numpy()
         self._focal = data.focal.numpy()[:, None]
         self._observed = data.image.numpy() * self._focal
-        self._variance = _point_variance(data, start)  # it hardly changes on the way
+        self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
 
     def __call__(self, state: _State, noise: float, free: Array) -> _System:
         rig = (self._points - state.position) @ state.rotation
@@ -336,26 +231,6 @@ class _Residuals:
             flat * (flat**2).sum(1, keepdims=True) * scale,
         ]
         return np.concatenate([by_pose, np.stack([by_calibration[i] for i in free], axis=-1)], axis=-1)
-
-
-def _point_variance(data: ObservedPoints, T: SE3) -> Array:
-    """Return the variance (square pixels) that the points' own errors add to each residual, averaged over both axes.
-
-    Along the axis perpendicular to both the line of sight and ``directions``, this is the point's variance across. Along the
-    other axis it is a mixture of the variances across and along, by the squared cosine and sine of the angle between the
-    line of sight and ``directions``.
-    """
-    rig = T.inverse().apply(data.points)
-    local = (data.rotation @ rig[..., None])[..., 0] + data.translation
-    centres = T.apply(-(data.rotation.mT @ data.translation[..., None])[..., 0])
-    sight = data.points - centres
-    cosine = (sight * data.directions).sum(-1) / torch.linalg.vector_norm(sight, dim=-1).clamp(min=1e-12)
-    across, along = data.deviations.square().unbind(-1)
-    seen = cosine.square().clamp(max=1)
-    metres = (across * (1 + seen) + along * (1 - seen)) / 2
-    z = torch.where(local[:, 2] > 1e-9, local[:, 2], 1)
-    variance: Array = (metres * (data.focal / z).square()).numpy()
-    return variance
 
 
 def _spread(residual: Array, unknowns: int) -> float:

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
+from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import GIVEN, Calibration
 from bidnerf_core.se3 import SE3
 
 CANDIDATES = 6

@@ -19,16 +19,10 @@ from bidnerf_core.localization.search.guided import (
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.search.ransac import Hypothesis
+from bidnerf_core.mapping.calibration import GIVEN, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.features import NORM
-from bidnerf_core.mapping.resection import (
-    GIVEN,
-    NOMINAL,
-    Calibration,
-    CalibrationPrior,
-    ObservedPoints,
-    ReprojectionFit,
-    resect,
-)
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.resection import ReprojectionFit, resect
 from bidnerf_core.se3 import SE3
 
 RADII = (3.0, 1.5)

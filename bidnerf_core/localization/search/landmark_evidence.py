@@ -14,7 +14,7 @@ from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import GuidedPose
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.mapping.resection import ObservedPoints
+from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 LEAST_DEPTHS = 6

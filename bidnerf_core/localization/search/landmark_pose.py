@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
-from bidnerf_core.mapping.resection import Calibration
+from bidnerf_core.mapping.calibration import Calibration
 from bidnerf_core.se3 import SE3
 
 

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
+from bidnerf_core.mapping.calibration import CalibrationPrior
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import CalibrationPrior, ObservedPoints
+from bidnerf_core.mapping.observed_points import ObservedPoints
 
 THRESHOLD = 0.005
 """Largest reprojection error of an inlier, as a share of the image's diagonal; never less than 2 pixels."""

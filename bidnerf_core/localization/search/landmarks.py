@@ -16,8 +16,8 @@ from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
 from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.localization.search.unguided import unguided_matches
+from bidnerf_core.mapping.calibration import FIXED, NOMINAL, CalibrationPrior
 from bidnerf_core.mapping.features import SIFT, Features
-from bidnerf_core.mapping.resection import FIXED, NOMINAL, CalibrationPrior
 from bidnerf_core.se3 import SE3
 
 STRONGEST = 700

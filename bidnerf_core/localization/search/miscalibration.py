@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.mapping.calibration import CALIBRATED, Calibration, CalibrationPrior
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import CALIBRATED, Calibration, CalibrationPrior, ReprojectionFit
+from bidnerf_core.mapping.resection import ReprojectionFit
 
 MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
 """Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""

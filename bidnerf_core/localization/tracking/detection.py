@@ -28,9 +28,10 @@ from bidnerf_core.localization.search.matching import EXACT, LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
+from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
 from bidnerf_core.mapping.features import Features
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import FIXED, GIVEN, NOMINAL, Calibration, resect
+from bidnerf_core.mapping.resection import resect
 from bidnerf_core.se3 import SE3
 
 NEARBY = EXACT

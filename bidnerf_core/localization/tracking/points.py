@@ -15,7 +15,8 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import ObservedPoints, ReprojectionFit, resect
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.resection import ReprojectionFit, resect
 from bidnerf_core.se3 import SE3
 
 LEAST_POINTS = 6
