@@ -29,6 +29,8 @@ DEPTH_MEASUREMENTS = 3.0
 """Number of independent measurements that a frame's points count as beside landmarks: fewer than ``INDEPENDENT``, which is
 optimistic for hand-held sensors.
 """
+ALIGNMENT_STEPS = 8
+"""Largest number of steps of an alignment without landmarks, at each of its scales."""
 SETTLED = 1e-4
 """Length of a step (metres and radians) at which the alignment has ended."""
 
@@ -108,7 +110,6 @@ def aligned(
     predicted: SE3,
     covariance: Float[Tensor, "6 6"],
     spread: float,
-    steps: int,
     views: int = 1,
 ) -> Alignment:
     """Align measured points with the surface from a predicted pose; ``spread`` (metres) is how far off they may be.
@@ -121,7 +122,11 @@ def aligned(
         cost = SurfaceCost(surface, cloud, PointScales(distance))
         variance = max(float(cost.residual_variance(T[None])[0]), LEAST_VARIANCE)
         term = FusedTerm(cost, variance, SURFACE_MEASUREMENTS * views)
-        T = descend(Sum((prior, term.scaled)), T[None], steps, about.moved, stop=SETTLED).T[0].normalized()
+        T = (
+            descend(Sum((prior, term.scaled)), T[None], ALIGNMENT_STEPS, about.moved, stop=SETTLED)
+            .T[0]
+            .normalized()
+        )
     judge = SurfaceCost(surface, cloud, PointScales(JUDGED * surface.extent))
     found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, views)
     return Alignment(T, found, surface_diagnostics(judge, T, torch.inf))

@@ -219,7 +219,7 @@ def by_surface(
     off = math.sqrt(float(translation.mean() + rotation.mean() * predicted.reach**2))
     found = aligned(
         surface, joined(here, state.window), predicted.T_world_camera, predicted.covariance,
-        2 * off, config.depth_steps, views,
+        2 * off, views,
     )  # fmt: skip
     here = replace(here, T_world_camera=found.T_world_camera)
     window = (*state.window, here)[-(config.window - 1) :] if config.window > 1 else ()

@@ -20,7 +20,7 @@ class TrackerConfig(Settings):
         0.5  # of the points left at which new ones are sought
     )
     refresh_frames: Annotated[int, Range(1, 10**6), EXPERT] = 20  # after which new ones are sought anyway
-    depth_steps: Annotated[int, Range(1, 100), EXPERT] = 1  # second-order steps on measured depth
+    depth_steps: Annotated[int, Range(1, 100), EXPERT] = 1  # second-order steps on depth beside landmarks
     patience: Annotated[int, Range(1, 10**6), EXPERT] = (
         3  # lost frames that are all searched; then every second
     )
