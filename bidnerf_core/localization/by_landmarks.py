@@ -110,14 +110,14 @@ def fused_answer(
 
 def _from(problem: Problem, found: LandmarkPose) -> Problem:
     """Return the problem from the pose found, with measured depth on the map's scale."""
-    scale, views = _depth_scale(found), []
+    scale, views = shrunk_depth_scale(found), []
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
         views.append(replace(view, frame=replace(view.frame, depth=depth)))
     return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 
-def _depth_scale(found: LandmarkPose) -> float:
+def shrunk_depth_scale(found: LandmarkPose) -> float:
     """Return the factor on measured depth that landmarks give, shrunk towards 1 by the prior; 1 if they give none."""
     if found.depth_scale is None:
         return 1.0

@@ -65,7 +65,7 @@ class Sift(Settings):
         sift = cv2.SIFT.create(
             nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True
         )
-        grey, scale = _reduced(_grey(rgb), self.largest)
+        grey, scale = _reduced(grey_image(rgb), self.largest)
         found, descriptors = sift.detectAndCompute(grey, None)
         if descriptors is None or not len(found):
             return Keypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros((0, 128), dtype=torch.uint8))
@@ -110,7 +110,7 @@ def paired_squared_distances(
     return (a[rows].float() - b[columns].float()).square_().sum(-1)
 
 
-def _grey(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
+def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
     clean = rgb.detach().cpu().float().nan_to_num(0.0).clamp(0, 1)
     return cv2.cvtColor((clean * 255).round().to(torch.uint8).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
 

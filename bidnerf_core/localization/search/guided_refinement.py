@@ -57,13 +57,18 @@ class GuidedPose:
 
 def refined(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -> GuidedPose:
     """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change."""
-    most = LOOSE**2 * float(query.squared_distances(inliers).quantile(0.9))
+    most = usual_distance(query, inliers)
     start = Calibration(log_focal=math.log(first.focal_factor))
     correlation = query.landmarks.correlation
     fit = resect(
         query.observed(inliers), first.T_world_rig, query.threshold / 2, query.prior, start, correlation
     )
     return _settled(query, fit, inliers, most)
+
+
+def usual_distance(query: LandmarkQuery, inliers: LandmarkMatches) -> float:
+    """Return the largest squared descriptor distance of a guided match, from those of the first inliers."""
+    return LOOSE**2 * float(query.squared_distances(inliers).quantile(0.9))
 
 
 def confirmed(query: LandmarkQuery, T_world_rig: SE3) -> GuidedPose | None:
@@ -90,7 +95,7 @@ def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches,
         fit, found = _guided(query, prior, free, found, most, RADII[1:])
     radius = RADII[-1] * query.threshold
     projections = projected_landmarks(query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius)
-    visible, chance = sum(map(len, projections)), _by_chance(projections, radius, most)
+    visible, chance = sum(map(len, projections)), matches_by_chance(projections, radius, most)
     return GuidedPose(fit, prior, found, visible, chance, wrong)
 
 
@@ -140,10 +145,10 @@ def agreement(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
     radius = RADII[0] * query.threshold
     projections = projected_landmarks(query.images, query.landmarks, T_world_rig, GIVEN, radius)
     matches = sum(len(found.matches(radius, MOST_DISTANCE)) for found in projections)
-    return sum(map(len, projections)), matches, _by_chance(projections, radius, MOST_DISTANCE)
+    return sum(map(len, projections)), matches, matches_by_chance(projections, radius, MOST_DISTANCE)
 
 
-def _by_chance(projections: Sequence[ProjectedLandmarks], radius: float, most: float) -> float:
+def matches_by_chance(projections: Sequence[ProjectedLandmarks], radius: float, most: float) -> float:
     """Return the number of guided matches expected by chance: the mean over shifts of all keypoints."""
     away = 4 * radius
     shifts = ((away, away), (-away, -away))

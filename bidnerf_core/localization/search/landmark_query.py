@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
 from bidnerf_core.mapping.calibration import CalibrationPrior
 from bidnerf_core.mapping.features import paired_squared_distances
@@ -30,8 +31,7 @@ class LandmarkQuery:
     @property
     def threshold(self) -> float:
         """The largest reprojection error of an inlier, pixels."""
-        camera = self.images[-1].intrinsics
-        return max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))
+        return pixel_threshold(self.images[-1].intrinsics)
 
     def observed(self, matches: LandmarkMatches) -> ObservedPoints:
         """Return the landmarks and keypoints of ``matches`` as input of a pose solver."""
@@ -50,3 +50,8 @@ class LandmarkQuery:
     def _number(self, matches: LandmarkMatches) -> Int[Tensor, "m"]:
         first = torch.tensor([0, *(len(image.keypoints) for image in self.images)]).cumsum(0)
         return first[matches.view] + matches.keypoint
+
+
+def pixel_threshold(camera: Intrinsics) -> float:
+    """Return the largest reprojection error of an inlier, pixels."""
+    return max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.mapping.calibration import CALIBRATED, CalibrationPrior
+from bidnerf_core.mapping.calibration import CALIBRATED, Calibration, CalibrationPrior
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import ReprojectionFit
 
@@ -29,6 +29,12 @@ class Miscalibration:
     probability: Float[Tensor, "4"]  # that the given parameter is wrong
 
     @staticmethod
+    def unknown() -> Miscalibration:
+        """Return that of intrinsics that no image has been compared with."""
+        zero = torch.zeros(4, dtype=torch.float64)
+        return Miscalibration(zero, zero, zero)
+
+    @staticmethod
     def of(free: ReprojectionFit, landmarks: LandmarkMap) -> Miscalibration:
         """Judge by a fit in which the intrinsics were free."""
         value = torch.tensor(astuple(free.calibration), dtype=torch.float64)
@@ -37,6 +43,11 @@ class Miscalibration:
         log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
         log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES))
         return Miscalibration(value, free.calibration_deviations, log_odds.sigmoid())
+
+    @property
+    def calibration(self) -> Calibration:
+        """The correction that fits best."""
+        return Calibration(*self.apparent.tolist())
 
     @property
     def deviations(self) -> Float[Tensor, "4"]:
