@@ -33,7 +33,7 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.registry import load_backend
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
-from bidnerf_core.tensor_files import check_weights, packed, read_tensors
+from bidnerf_core.tensor_files import checked_weights, packed, read_tensors
 from bidnerf_core.training import TrainingState
 
 FORMAT = "bidnerf map"
@@ -246,10 +246,10 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     backend, where = load_backend(info.backend, str(folder)), str(folder / DESCRIPTION)
     outline = _outline(backend, info, where)
     if outline is not None:  # before memory is taken for a field of any size that map.json describes
-        check_weights(outline, tensors, folder / info.weights)
+        tensors = checked_weights(outline, tensors, folder / info.weights)
     field, _ = build_field(backend, info, where)
     if outline is None:
-        check_weights(field, tensors, folder / info.weights)
+        tensors = checked_weights(field, tensors, folder / info.weights)
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
@@ -260,8 +260,8 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
     """Return the state from which the interrupted training of ``field`` can be resumed."""
     if info.training is None:
         raise InputError(f"{folder}: training is complete ({info.step} steps), nothing to resume")
-    weights = read_tensors(folder / info.weights)
-    check_weights(field, weights, folder / info.weights)
+    path = folder / info.weights
+    weights = checked_weights(field, read_tensors(path), path)
     return TrainingState(info.step, weights, read_tensors(folder / info.training))
 
 

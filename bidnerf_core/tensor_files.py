@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as tensors_from_bytes
 from torch import Tensor, nn
 
+from bidnerf_core.backend import UpgradingField
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField
 from bidnerf_core.files import open_binary
@@ -64,8 +65,13 @@ def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) 
         raise InputError(f"{path}: not {what} ({why}); bake it anew with 'bidnerf bake'") from error
 
 
-def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> None:
-    """Compare names, shapes and values with what a field takes: torch's own message would run over many lines."""
+def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """Return the tensors that a field takes from a file, brought up to date where an earlier version stored them.
+
+    Their names, shapes and values are compared with the field's own: torch's own message would run over many lines.
+    """
+    if isinstance(field, UpgradingField):
+        tensors = field.upgraded_state(tensors)
     module = cast(nn.Module, field)
     expected = module.state_dict()
     for name, value in expected.items():
@@ -86,6 +92,7 @@ def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) 
     for name, _ in module.named_buffers():
         if name in tensors and bool(tensors[name].isnan().any()):
             raise InputError(f"{path}: tensor {name!r} holds NaN, expected numbers")
+    return tensors
 
 
 def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -108,11 +108,11 @@ def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None
 
 def test_what_follows_from_the_occupancy_is_brought_up_to_date_on_loading(tmp_path: Path) -> None:
     sparse = field(0)
-    sparse.sampler.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
+    sparse.occupancy.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
     save_map(tmp_path, info(), TrainingState(5, sparse.state_dict(), {}))
     loaded = load_map(tmp_path).field
     assert isinstance(loaded, HashGridField)
-    assert not loaded.sampler.near_occupied.any()
+    assert not loaded.occupancy.near_occupied.any()
     assert loaded.coarse_sampler.occupied.any()
 
 
@@ -395,7 +395,7 @@ def _with_weights(folder: Path, name: str, value: Tensor) -> Path:
     ],
     ids=["int", "nan"],
 )
-@pytest.mark.parametrize("name", ["sampler.peak", "colour.0.bias"])
+@pytest.mark.parametrize("name", ["occupancy.peak", "colour.0.bias"])
 def test_weights_and_buffers_of_another_kind_are_refused(
     name: str, change: Callable[[Tensor], Tensor], said: str, tmp_path: Path
 ) -> None:

@@ -70,9 +70,10 @@ def _bake(
 
 
 def bake_map(
-    folder: Path, views: Sequence[View], config: BakeConfig, rendered_landmarks: bool = False
-) -> None:
-    """Bake the surface and the landmarks of the map in ``folder``.
+    folder: Path, views: Sequence[View], config: BakeConfig, rendered_landmarks: bool = False,
+    tracked: TrackedViews | None = None,
+) -> None:  # fmt: skip
+    """Bake the surface and the landmarks of the map in ``folder``; ``tracked`` if the views' keypoints were tracked already.
 
     Views with measured depth take the place of rendered ones for the surface, and all ``views`` give landmarks. Without
     views, landmarks come from images that the field renders, unless the map has landmarks of photos, which are kept where
@@ -93,7 +94,7 @@ def bake_map(
     noise = colour_noise(stored.field, stored.bounds, views) if views else stored.colour_noise
     source: LandmarkSource = "photos" if views else "rendered images"
     images = views or rendered_views(stored.field, stored.bounds, cameras)
-    _bake_landmarks(folder, stored, images, noise, source)
+    _bake_landmarks(folder, stored, images, noise, source, tracked)
 
 
 def _has_photo_landmarks(folder: Path, info: MapInfo) -> bool:
@@ -126,15 +127,17 @@ def _bake_surface(
 
 
 def _bake_landmarks(
-    folder: Path, stored: Map, views: Sequence[View], noise: float | None, source: LandmarkSource
-) -> None:
+    folder: Path, stored: Map, views: Sequence[View], noise: float | None, source: LandmarkSource,
+    tracked: TrackedViews | None,
+) -> None:  # fmt: skip
     """Build landmarks of the views, and record what photos are fit for.
 
     A scene without texture has no landmarks, and the surface alone then serves.
     """
     began = time.monotonic()
-    with counted("landmarks", "steps") as report:
-        tracked = tracked_views(views, progress=report)
+    if tracked is None:
+        with counted("landmarks", "steps") as report:
+            tracked = tracked_views(views, progress=report)
     trial = HeldOutTrial()
     try:
         landmarks = tried_landmarks(tracked, views, report=say)

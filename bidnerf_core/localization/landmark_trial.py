@@ -49,10 +49,7 @@ def build_tried_landmarks(
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
-    """Build landmarks as ``mapping.landmark_building.build_landmarks`` does, and try them on images that are held out.
-
-    The trial sets ``correlation``, ``calibration_scatter`` and ``trial`` of the landmarks.
-    """
+    """Build landmarks as ``mapping.landmark_building.build_landmarks`` does, and try them: see ``tried_landmarks``."""
     return tried_landmarks(tracked_views(views, features, config, progress), views, features, config, report)
 
 
@@ -63,7 +60,11 @@ def tried_landmarks(
     config: LandmarkConfig = DEFAULTS,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
-    """Return the landmarks of ``views`` whose keypoints are already matched, after a trial of them."""
+    """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on images that are held out.
+
+    The trial sets ``correlation``, ``calibration_scatter`` and ``trial`` of the landmarks. Raises ``InputError`` if there
+    are no landmarks.
+    """
     landmarks = tracked.landmarks(config, report)
     held_out = _held_out(len(views))
     answers = _answers(tracked, views, held_out, features, config)

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
+from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.mapping.keypoint_depth import depth_noise, measured_depth, placed
-from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks, seen_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
 from bidnerf_core.mapping.pose_scatter import pose_scatter
 from bidnerf_core.mapping.tracks import PosedKeypoints, epipolar_matches, joined_tracks
@@ -86,10 +86,14 @@ class TrackedViews:
             )
         return _bounded(found, config.most, report)
 
+    def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
+        """Return the triangulated landmarks that each image shows, whose depth training takes where none was measured."""
+        kept, positions, covariance = _triangulated(self.observations, radians(config.parallax))
+        return seen_landmarks(kept, positions, noise(kept.sightings, positions) ** 2 * covariance)
+
     def triangulated(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
         """Return the keypoints that agree on a triangulated point, and those points (metres, world)."""
-        tracked = torch.bincount(self.observations.point)[self.observations.point] > 1
-        kept, positions, _ = _triangulated(self.observations[tracked], radians(config.parallax))
+        kept, positions, _ = _triangulated(self.observations, radians(config.parallax))
         return kept, positions
 
     def without(self, images: Sequence[int]) -> TrackedViews:
@@ -127,11 +131,10 @@ def _detected(view: View, features: Features) -> PosedKeypoints:
 
 
 def _located(
-    observations: TrackedKeypoints, depth: Float[Tensor, "m"], config: LandmarkConfig
+    observations: TrackedKeypoints, depth: Float[Tensor, "k"], config: LandmarkConfig
 ) -> LandmarkMap:
     """Return the triangulated landmarks, then those that measured depth places, made from the remaining keypoints."""
-    tracked = torch.bincount(observations.point)[observations.point] > 1
-    kept, positions, covariance = _triangulated(observations[tracked], radians(config.parallax))
+    kept, positions, covariance = _triangulated(observations, radians(config.parallax))
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
     triangulated = replace(
@@ -139,9 +142,15 @@ def _located(
         pose_covariance=pose_scatter(kept, positions, pixel_noise),
     )
     relative = depth_noise(sightings, positions, depth[kept.number])
-    left = observations[~torch.isin(observations.number, kept.number) & (tracked | config.singles)]
-    rest, positions, covariance = placed(left, depth[left.number], relative, pixel_noise)
+    left = ~torch.isin(observations.number, kept.number)
+    rest = observations[left & (_tracked(observations) | config.singles)]
+    rest, positions, covariance = placed(rest, depth[rest.number], relative, pixel_noise)
     return concatenated([triangulated, fused_landmarks(rest, positions, covariance, pixel_noise)])
+
+
+def _tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
+    """Return which keypoints show a point that another keypoint shows too."""
+    return torch.bincount(observations.point)[observations.point] > 1
 
 
 def _triangulated(
@@ -151,7 +160,7 @@ def _triangulated(
 
     ``least`` is the smallest parallax (radians) of a point.
     """
-    observations, _ = observations.compacted()
+    observations, _ = observations[_tracked(observations)].compacted()
     count = observations.count
     points = intersected(observations.sightings, count)
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
