@@ -56,15 +56,16 @@ def test_an_image_without_depth_is_tracked_by_colour_in_a_map_without_landmarks(
     assert float(pose_error(answers[0].T_world_camera, flight_pose(0)).translation) < 0.01
 
 
-def test_frames_without_colours_are_tracked_by_depth() -> None:
-    """A depth camera's frames follow those of a colour camera, in a map with landmarks."""
+def test_frames_without_colours_are_bridged() -> None:
+    """Shape alone fits a corridor anywhere along it, so it confirms no pose; the next photo does."""
     frames = flight()[:6]
-    frames = [(t, depth_only(f) if n >= 3 else f, T) for n, (t, f, T) in enumerate(frames)]
-    tracker = Tracker(localizer())
-    answers = tracked(frames, tracker)
-    assert_right(answers, frames)
-    assert "landmarks" in answers[2].reason
-    assert "measured points" in answers[3].reason
+    frames = [(t, depth_only(f) if n in (3, 4) else f, T) for n, (t, f, T) in enumerate(frames)]
+    answers = tracked(frames, Tracker(localizer()))
+    assert_right(answers[:3] + answers[5:], frames[:3] + frames[5:])
+    for answer, (_, _, truth) in zip(answers[3:5], frames[3:5], strict=True):
+        assert answer.outcome is Outcome.UNDETERMINED
+        assert "no colours" in answer.reason
+        assert float(pose_error(answer.T_world_camera, truth).translation) < 0.1
 
 
 def test_a_frame_without_colours_and_depth_is_reported() -> None:

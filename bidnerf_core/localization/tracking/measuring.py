@@ -53,6 +53,9 @@ ENOUGH = 40
 """The number of followed landmarks that agree from which on no new ones are sought."""
 SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
+SHAPE_ALONE = Verdict(
+    Outcome.UNDETERMINED, "no colours were recorded, and shape alone does not show a slide along walls"
+)
 DETERMINED = 0.02, math.radians(3)
 """Largest standard deviation of an accepted pose by depth or colour: shares of the scene's extent, and radians."""
 
@@ -226,7 +229,8 @@ def by_surface(
     covariance = found.covariance
     pose = PoseEstimate(found.T_world_camera, (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance)
     loss = 1 - found.diagnostics.colour_inliers
-    return Measurement(pose, found.diagnostics.verdict(), loss, replace(state, window=window))
+    verdict = found.diagnostics.verdict() if frame.has_colour else SHAPE_ALONE
+    return Measurement(pose, verdict, loss, replace(state, window=window))
 
 
 def by_colour(
