@@ -66,6 +66,8 @@ MANY_LANDMARKS = 500
 """The number of landmarks from which on a scene is textured."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
+SUPPORTED = 0.45
+"""Least confidence of landmarks in a pose that the surface accepts on its own grounds."""
 LOSS_POINTS = 200
 """Number of points on which the losses along the path are computed."""
 
@@ -96,20 +98,28 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     began, answer, matcher = time.perf_counter(), None, problem.matcher if config.landmarks else None
     if matcher is not None:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
-    if answer is not None and answer.verdict.outcome in (Outcome.CONVERGED, Outcome.MISCALIBRATED):
-        # With wrong intrinsics, the surface is not found at the right place either.
+    has_points = _measured_points(problem) >= LEAST_POINTS
+    if answer is not None and _is_final(answer.verdict.outcome, has_points):
         return localization_by_landmarks(problem, answer, began)
     if answer is not None and problem.start is None:
         problem = replace(problem, start=answer.T)  # one more place to look
     if problem.surface is None:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
-    if _measured_points(problem) >= LEAST_POINTS:
+    if has_points:
         found = _by_points(problem, problem.surface, config, seed)
     else:
         found = _by_images(problem.without_depth(), problem.surface, config, seed)
     return (
         found if matcher is None else _compared_with_landmarks(found, problem, matcher, config, seed, began)
     )
+
+
+def _is_final(outcome: Outcome, has_points: bool) -> bool:
+    """Whether the surface has nothing to add to what landmarks found."""
+    if outcome is Outcome.UNCERTAIN:
+        return not has_points
+    # With wrong intrinsics, the surface is not found at the right place either.
+    return outcome in (Outcome.CONVERGED, Outcome.MISCALIBRATED)
 
 
 def _compared_with_landmarks(
@@ -125,7 +135,9 @@ def _compared_with_landmarks(
     if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
         refined = localization_by_landmarks(problem, answer, began)
-        return replace(refined, reason=f"found on the surface; {refined.reason}")
+        supported = found.converged and answer.confidence is not None and answer.confidence >= SUPPORTED
+        outcome = Outcome.CONVERGED if supported else refined.outcome
+        return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")

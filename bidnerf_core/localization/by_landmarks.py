@@ -71,6 +71,7 @@ class LandmarkAnswer:
     covariance: Float[Tensor, "6 6"]
     diagnostics: LandmarkDiagnostics
     terms: tuple[str, ...] = ()  # what was fused with the landmarks
+    confidence: float | None = None  # probability that the pose is right
 
 
 def answer_by_landmarks(
@@ -95,7 +96,7 @@ def fused_answer(
     diagnostics = landmark_diagnostics(found, searched)
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.full_covariance, diagnostics)
     if not verdict.accepted or found.estimates_calibration:
-        return answer  # the other terms would need intrinsics as exact as the landmarks'
+        return _judged(answer)  # the other terms would need intrinsics as exact as the landmarks'
     problem = _from(problem, found)
     about, generator = pivot("scene", problem), Generator().manual_seed(seed)
     terms = dict[str, FusedTerm]()
@@ -105,7 +106,13 @@ def fused_answer(
         answer = replace(answer, diagnostics=diagnostics)
     if rays and is_sharp(problem):
         terms["rendering"] = _rendered_term(problem, rays, about, generator)
-    return _fused(answer, terms, about) if terms else answer
+    return _judged(_fused(answer, terms, about) if terms else answer)
+
+
+def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
+    """Return the answer with its confidence, which can turn its verdict into a rejection."""
+    judgement = judged(answer.verdict, answer.diagnostics)
+    return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
 
 
 def _from(problem: Problem, found: LandmarkPose) -> Problem:
@@ -177,15 +184,15 @@ def _fused(answer: LandmarkAnswer, terms: dict[str, FusedTerm], about: Pivot) ->
 
 def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
     """Return an answer as a localization of method ``auto``."""
-    found, judgement = answer.found, judged(answer.verdict, answer.diagnostics)
+    found = answer.found
     poses = [found.T_world_camera, answer.T]
     if problem.start is not None:
         poses = [problem.start, *poses]
     fused = f", fused with {' and '.join(answer.terms)}" if answer.terms else ""
     return Localization(
         T_world_camera=answer.T,
-        outcome=judgement.verdict.outcome,
-        reason=judgement.verdict.reason + fused,
+        outcome=answer.verdict.outcome,
+        reason=answer.verdict.reason + fused,
         steps=len(poses) - 1,
         seconds=time.perf_counter() - began,
         loss=found.noise,
@@ -194,6 +201,6 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
         losses=torch.full((len(poses) - 1,), found.noise, dtype=torch.float64),
         covariance=answer.covariance,
         focal_factor=found.focal_factor,
-        confidence=judgement.confidence,
+        confidence=answer.confidence,
         diagnostics=answer.diagnostics,
     )
