@@ -33,7 +33,7 @@ class FieldConfig(Settings):
     geometry_features: Count = 15
     # cells of the occupancy grid along the longest side of the scene
     grid_resolution: Annotated[int, Range(2, 1024)] = 128
-    # at most, where the scene is contracted; elsewhere, or with 0, all intervals in occupied cells: few in a box
+    # largest number where the scene is contracted; elsewhere, or with 0, all intervals in occupied cells
     samples_per_ray: Annotated[int, Range(0)] = 32
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 

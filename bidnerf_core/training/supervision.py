@@ -25,9 +25,9 @@ COLOUR_PENALTY = 1e-3  # weight of their penalty beside the colour error
 class SupervisionConfig(Settings):
     """Weights of the terms of the loss, for every recipe."""
 
-    # of the term of depth, measured or of landmarks, beside the colour term; 0 leaves it out
+    # weight of depth, measured or of landmarks, beside colour; 0 leaves it out
     depth_weight: NotNegative = 0.1
-    distortion_weight: NotNegative = 0.0  # of the term that gathers a ray's weight in one place
+    distortion_weight: NotNegative = 0.0  # weight of the term that gathers a ray's weight in one place
     exposure: bool = True  # learn a colour transform of each image, unless images have alpha
 
 
