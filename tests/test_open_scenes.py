@@ -93,11 +93,13 @@ def test_an_occupancy_grid_of_contracted_space_samples_its_occupied_cells_only()
     found = grid.grid.at(cells, rays.at(middle))[inner]
     assert float(found.float().mean()) > 0.99
     assert float(grid.grid.at(cells, at)[inner].float().mean()) > 0.9
-    steps = torch.linspace(OPEN.near, OPEN.far, 4000).expand(len(rays.near), -1)
-    every = grid.grid.at(cells, rays.at(steps))
-    length = torch.where(samples.valid, samples.ends - samples.starts, 0).sum(-1)
-    expected = every.float().mean(-1) * (OPEN.far - OPEN.near)
-    assert float(((length - expected).abs() / (OPEN.far - OPEN.near)).mean()) < 0.05
+    # In the coordinate that is divided evenly: in metres, the last cell is as long as all others together.
+    near, far = place(torch.stack([rays.near, rays.far], dim=-1)).unbind(-1)
+    steps = near[:, None] + (far - near)[:, None] * (torch.arange(4000) + 0.5) / 4000
+    every = grid.grid.at(cells, rays.at(OPEN.spacing(rays).distance(steps)))
+    length = torch.where(samples.valid, place(samples.ends) - place(samples.starts), 0).sum(-1)
+    expected = every.float().mean(-1) * (far - near)
+    assert float(((length - expected).abs() / (far - near)).mean()) < 0.05
 
 
 def test_only_the_inner_half_of_contracted_space_is_carved() -> None:

@@ -118,10 +118,14 @@ class OccupancyGrid(nn.Module):
         slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
         middles = far[:, None].expand(-1, width).clone()
         middles[ray, slot] = place
-        valid = torch.arange(width, device=ray.device) < counts[:, None]
+        number = torch.arange(width, device=ray.device)
+        valid = number < counts[:, None]
         half = self.step / 2
         starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
         ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)
+        if self.bounds.contracted:  # the rest of a step at the far end is short in the coordinate, but long in metres
+            rest = (number == counts[:, None] - 1) & (far[:, None] - ends < self.step)
+            ends = torch.where(rest, far[:, None], ends)
         return RaySamples(starts, ends, valid)
 
     def _refresh(self) -> None:
