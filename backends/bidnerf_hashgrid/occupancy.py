@@ -123,7 +123,9 @@ class OccupancyGrid(nn.Module):
         half = self.step / 2
         starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
         ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)
-        if self.bounds.contracted:  # the rest of a step at the far end is short in the coordinate, but long in metres
+        if (
+            self.bounds.contracted
+        ):  # the rest of a step at the far end is short in the coordinate, but long in metres
             rest = (number == counts[:, None] - 1) & (far[:, None] - ends < self.step)
             ends = torch.where(rest, far[:, None], ends)
         return RaySamples(starts, ends, valid)
