@@ -77,7 +77,7 @@ def main() -> None:
         folder.name: measured(folder, data, given.frames)
         for folder, data in zip(given.map, given.data, strict=True)
     }
-    print(write_record(given.name, results, 0))
+    print(write_record(Path(__file__).parent / "results" / f"{given.name}.json", results, 0))
 
 
 if __name__ == "__main__":
