@@ -19,7 +19,7 @@ from bidnerf_core.field import RadianceField
 from bidnerf_core.files import open_binary
 
 Part = TypeVar("Part")
-EXPECTED = "a safetensors file"
+EXPECTED_FILE = "a safetensors file"
 LARGEST_HEADER = 16 * 2**20
 """Bytes; a tensor takes about a hundred of them."""
 
@@ -29,13 +29,13 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     if not os.path.lexists(path):
         raise InputError(f"{path}: no such file, but map.json names it; the map is incomplete")
     try:
-        with open_binary(path, EXPECTED) as file:
+        with open_binary(path, EXPECTED_FILE) as file:
             _check_length(path, file)
             return tensors_from_bytes(file.read())
     except (SafetensorError, KeyError, ValueError, RuntimeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: not readable ({error}), expected {EXPECTED}") from error
+        raise InputError(f"{path}: not readable ({error}), expected {EXPECTED_FILE}") from error
 
 
 def _check_length(path: Path, file: BinaryIO) -> None:
@@ -43,15 +43,17 @@ def _check_length(path: Path, file: BinaryIO) -> None:
     size = os.fstat(file.fileno()).st_size
     length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
     if not length <= min(size - 8, LARGEST_HEADER):
-        raise InputError(f"{path}: not readable (its header is cut off), expected {EXPECTED}")
+        raise InputError(f"{path}: not readable (its header is cut off), expected {EXPECTED_FILE}")
     try:
         header = json.loads(file.read(length))
         ends = [part["data_offsets"][1] for name, part in header.items() if name != "__metadata__"]
         described = 8 + length + max(ends, default=0)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path}: not readable (its header is damaged), expected {EXPECTED}") from error
+        raise InputError(f"{path}: not readable (its header is damaged), expected {EXPECTED_FILE}") from error
     if described != size:
-        raise InputError(f"{path}: has {size} bytes, its header describes {described}; expected {EXPECTED}")
+        raise InputError(
+            f"{path}: has {size} bytes, its header describes {described}; expected {EXPECTED_FILE}"
+        )
     file.seek(0)
 
 

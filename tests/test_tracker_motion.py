@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3, InputError
 from bidnerf_core.localization.tracking.clock import Clock
-from bidnerf_core.localization.tracking.motion import GAP, Motion, PoseEstimate, pixel_radius
+from bidnerf_core.localization.tracking.motion import LONGEST_GAP, Motion, PoseEstimate, pixel_radius
 from bidnerf_core.localization.tracking.single_pose import retracted, update_between
 
 VELOCITY = torch.tensor([0.3, -0.1, 0.2, 0.2, 0.4, -0.1], dtype=torch.float64)
@@ -43,7 +43,7 @@ def test_prediction_forth_and_back_returns() -> None:
     assert torch.allclose(there.T_world_camera.matrix(), motion.T_world_camera.matrix(), atol=1e-12)
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.03, -0.1, GAP + 1])
+@pytest.mark.parametrize("seconds", [0.0, 0.03, -0.1, LONGEST_GAP + 1])
 def test_uncertainty_grows_with_time_and_stays_a_covariance(seconds: float) -> None:
     motion = Motion.at(measured(path(0.0), bias=1e-3), 1.0)
     later = motion.predicted(seconds)
@@ -53,9 +53,9 @@ def test_uncertainty_grows_with_time_and_stays_a_covariance(seconds: float) -> N
 
 def test_a_long_gap_keeps_the_pose() -> None:
     motion = Motion.at(measured(path(0.0)), 1.0).moved(path(0.1), covariance(1e-3), 0.1)
-    later = motion.predicted(2 * GAP)
+    later = motion.predicted(2 * LONGEST_GAP)
     assert torch.equal(later.T_world_camera.matrix(), motion.T_world_camera.matrix())
-    assert float(later.noise[0, 0]) > GAP**2  # it may have moved at the speed of a camera
+    assert float(later.noise[0, 0]) > LONGEST_GAP**2  # it may have moved at the speed of a camera
 
 
 def test_fusing_equals_the_product_of_gaussians() -> None:

@@ -39,7 +39,7 @@ from bidnerf_core.evaluation.bench import (
     shard_of,
 )
 from bidnerf_core.evaluation.cluster import dask_executor
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand
+from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.provenance import command_line, note_run, provenance
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -207,7 +207,7 @@ def _sizes(given: tuple[str, ...]) -> tuple[Size, ...] | None:
 def _faults(given: Names) -> tuple[str, ...]:
     """Return the faults to try; images as they are where none is given."""
     with wrong_usage():
-        return expand(word for group in given for word in group) or (NO_FAULT,)
+        return expand_faults(word for group in given for word in group) or (NO_FAULT,)
 
 
 def _own_data(map: str) -> str:

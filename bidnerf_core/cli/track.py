@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from bidnerf_core.cli.camera_options import CameraFile, FieldOfView, FocalLength
 from bidnerf_core.cli.common import (
     Flag,
     MapFolder,
@@ -34,10 +35,6 @@ from bidnerf_core.localization import Localization, Localizer, Tracker, TrackerC
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
 
-one_camera = tyro.conf.create_mutex_group(
-    required=False, title="the camera of images that have none in their format (default: as EXIF has it)"
-)
-
 
 def run(arguments: list[str]) -> None:
     def track(
@@ -61,19 +58,9 @@ def run(arguments: list[str]) -> None:
             Path | None,
             option("PNG", "draw the path over the map's surface, coloured by its uncertainty", ""),
         ] = None,
-        camera: Annotated[
-            Path | None,
-            one_camera,
-            option(
-                "CAMERA.json", "file with intrinsics: transforms.json, cameras.json, COLMAP's cameras.txt", ""
-            ),
-        ] = None,
-        focal: Annotated[
-            float | None, one_camera, option("PX", "focal length in pixels of the image file", "")
-        ] = None,
-        hfov: Annotated[
-            float | None, one_camera, option("DEG", "horizontal field of view of the upright image", "")
-        ] = None,
+        camera: CameraFile = None,
+        focal: FocalLength = None,
+        hfov: FieldOfView = None,
         depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
         every: Annotated[int, option("N", "take every Nth frame only")] = 1,
         start: Annotated[

@@ -40,7 +40,7 @@ from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.photos import natural_order
 from bidnerf_core.se3 import SE3
 
-MILLIMETRE = 0.001
+DEPTH_UNIT = 0.001
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
 COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)
 T_COLOUR_DEPTH = SE3(
@@ -154,7 +154,7 @@ class SevenScenesDataset(OpaqueDataset[SceneFrame]):
         colour, alpha = read_image(frame.image)
         depth = None
         if frame.depth.is_file():
-            depth = self._read_depth(frame.depth, MILLIMETRE).metres
+            depth = self._read_depth(frame.depth, DEPTH_UNIT).metres
             if depth.shape != colour.shape[:2]:
                 raise InputError(
                     f"{frame.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "

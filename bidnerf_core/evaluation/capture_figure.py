@@ -14,9 +14,9 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.plot_style import COLOURS, new_figure, styled
 from bidnerf_core.mapping.capture_coverage import horizontal_axes
-from bidnerf_core.mapping.capture_report import CaptureReport, Gap, PhotoRecord, Problem
+from bidnerf_core.mapping.capture_report import CaptureReport, Gap, PhotoProblem, PhotoRecord
 
-LOOKS: dict[Problem, tuple[str, str]] = {
+LOOKS: dict[PhotoProblem, tuple[str, str]] = {
     "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),
     "apart": (COLOURS[7], "s"), "isolated": (COLOURS[6], "D"), "blurred": (COLOURS[4], "h"),
     "badly exposed": (COLOURS[5], "*"),
@@ -25,7 +25,7 @@ LOOKS: dict[Problem, tuple[str, str]] = {
 SOUND = COLOURS[2]
 MOST_POINTS = 20_000
 """Largest number of landmarks that are drawn."""
-MARGIN = 0.5
+CAPTURE_MARGIN = 0.5
 """How far beyond the cameras the picture reaches, as a share of their extent; landmarks farther away are left out."""
 MOST_LABELS = 16
 """Largest number of photos with problems that are named in the picture."""
@@ -71,7 +71,7 @@ def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport)
     if report.coverage.arrangement in ("around", "one side"):
         shown = np.concatenate([cameras, np.zeros((1, 2))])
     low, high = shown.min(0), shown.max(0)
-    reach = max(float((high - low).max()), 1e-6) * (0.5 + MARGIN)
+    reach = max(float((high - low).max()), 1e-6) * (0.5 + CAPTURE_MARGIN)
     middle = (low + high) / 2
     panel.set_xlim(middle[0] - reach, middle[0] + reach)
     panel.set_ylim(middle[1] - reach, middle[1] + reach)

@@ -19,7 +19,7 @@ from bidnerf_core.se3 import SE3
 
 SURFELS = 12_000
 """Largest number of surfels that are drawn."""
-MARGIN = 1.5
+PATH_MARGIN = 1.5
 """How far around the path the surface is drawn, in multiples of the path's size; at least half of the scene's extent."""
 
 
@@ -90,7 +90,7 @@ def _draw_surface(
     """Draw a sample of the surfels around the path in their colours."""
     points = surface.surfels.positions.double().numpy() @ projection
     middle = places.mean(0)
-    size = max(0.5 * surface.extent, MARGIN * float(np.abs(places - middle).max()))
+    size = max(0.5 * surface.extent, PATH_MARGIN * float(np.abs(places - middle).max()))
     near = np.flatnonzero((np.abs(points - middle) <= size).all(-1))
     some = near[:: max(1, -(-len(near) // SURFELS))]
     colours = surface.surfels.rgb[torch.from_numpy(some)].clamp(0, 1).numpy()

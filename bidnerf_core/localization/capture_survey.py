@@ -25,7 +25,7 @@ from bidnerf_core.mapping.capture_photos import (
     nearby,
     photo_measures,
 )
-from bidnerf_core.mapping.capture_report import CaptureReport, PhotoRecord, Problem
+from bidnerf_core.mapping.capture_report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
@@ -35,7 +35,7 @@ from bidnerf_core.mapping.triangulation import noise
 from bidnerf_core.se3 import SE3
 
 DEFAULTS, NOT_TRIED = LandmarkConfig(), HeldOutTrial()
-OUTLIER = 4.0
+OUTLYING_UPDATE = 4.0
 """Deviations (robust) from the other photos of the capture from which on a photo stands out."""
 LEAST_BLUR = 0.5
 """Octaves of the energy of fine detail that a photo must at least lack to be blurred."""
@@ -51,7 +51,7 @@ POSE_DEVIATIONS, POSE_PIXELS = 6.0, 4.0
 """A pose is bad if the landmarks' pose is so many standard deviations away and the image moves by so many pixels between
 them, which is twice as far as a match may lie from its epipolar line.
 """
-TURNED = 60.0
+TURNED_ANGLE = 60.0
 """Degrees of rotation about the optical axis from which on a photo is turned rather than badly posed."""
 ALONG_AXIS = 0.9
 """Least cosine between that rotation's axis and the optical axis."""
@@ -67,14 +67,14 @@ class _Posed:
     mirrored: bool = False
 
     @property
-    def problem(self) -> Problem | None:
+    def problem(self) -> PhotoProblem | None:
         angle = float(torch.linalg.vector_norm(self.update[3:]))
         if self.mirrored:
             return "mirrored"
         if self.deviations < POSE_DEVIATIONS or self.pixels < POSE_PIXELS:
             return None
         about_axis = abs(float(self.update[5])) >= ALONG_AXIS * angle
-        return "turned" if about_axis and math.degrees(angle) >= TURNED else "badly posed"
+        return "turned" if about_axis and math.degrees(angle) >= TURNED_ANGLE else "badly posed"
 
     def onto(self, record: PhotoRecord) -> PhotoRecord:
         """Return the record with how far the given pose is off; a mirrored photo has no pose to compare."""
@@ -136,7 +136,7 @@ def _matched(tracked: TrackedViews) -> TrackedKeypoints:
     return tracked.observations[torch.bincount(point)[point] > 1].compacted()[0]
 
 
-def _sound(views: Sequence[View], problems: Sequence[tuple[Problem, ...]]) -> Sequence[View]:
+def _sound(views: Sequence[View], problems: Sequence[tuple[PhotoProblem, ...]]) -> Sequence[View]:
     """Return the views of the main group whose poses are right, as far as is known."""
     wrong = {"mirrored", "turned", "badly posed", "apart"}
     return [v for v, p in zip(views, problems, strict=True) if not wrong & set(p)] or views
@@ -225,33 +225,33 @@ def _problems(
     near: Bool[Tensor, "v v"],
     group: Int[Tensor, "v"],
     posed: Mapping[int, _Posed | None],
-) -> list[tuple[Problem, ...]]:
+) -> list[tuple[PhotoProblem, ...]]:
     """Return the problems of each photo, the gravest first."""
     blurred = _standing_out(-above_neighbours(measures.sharpness, near), LEAST_BLUR)
     clipped = torch.maximum(
         above_neighbours(measures.overexposed, near), above_neighbours(measures.underexposed, near)
     )
     badly_exposed = _standing_out(exposure.abs(), LEAST_EXPOSURE) | (clipped > CLIPPED)
-    names: list[tuple[Problem, ...]] = []
+    names: list[tuple[PhotoProblem, ...]] = []
     grouped = bool((group >= 0).any())  # where no photo is linked to others, no photo stands out for it
     for i in range(len(exposure)):
         found = posed.get(i)
         wrong = found.problem if found else None
-        place: Problem | None = wrong or (_place(int(group[i])) if grouped and not found else None)
-        listed: tuple[Problem | None, ...] = (
+        place: PhotoProblem | None = wrong or (_place(int(group[i])) if grouped and not found else None)
+        listed: tuple[PhotoProblem | None, ...] = (
             place, "blurred" if blurred[i] else None, "badly exposed" if badly_exposed[i] else None,
         )  # fmt: skip
         names.append(tuple(problem for problem in listed if problem is not None))
     return names
 
 
-def _place(group: int) -> Problem | None:
+def _place(group: int) -> PhotoProblem | None:
     return "isolated" if group < 0 else "apart" if group > 0 else None
 
 
 def _standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
-    """Return which values exceed both ``least`` and ``OUTLIER`` robust standard deviations of all about zero."""
-    return values > max(least, OUTLIER * 1.4826 * float(values.abs().median()))
+    """Return which values exceed both ``least`` and ``OUTLYING_UPDATE`` robust standard deviations of all about zero."""
+    return values > max(least, OUTLYING_UPDATE * 1.4826 * float(values.abs().median()))
 
 
 def _three(vector: Float[Tensor, "3"]) -> tuple[float, float, float]:

@@ -30,7 +30,7 @@ from bidnerf_core.localization.tracking.odometry import Odometry
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints
 from bidnerf_core.localization.tracking.relocalization import has_points, relocalized, uses_landmarks
 from bidnerf_core.localization.tracking.settings import TrackerConfig
-from bidnerf_core.localization.tracking.state import TrackerState, load_state, save_state
+from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
 from bidnerf_core.mapping.features import Sift, grey_image
 from bidnerf_core.se3 import SE3
 
@@ -105,7 +105,7 @@ class Tracker:
 
     def restore(self, path: str | Path) -> None:
         """Continue where the tracker that wrote the file was. Raises ``InputError`` for another map's file, or a damaged one."""
-        self._state = load_state(Path(path), self._key)
+        self._state = load_tracker_state(Path(path), self._key)
 
     def _begun(
         self, frame: Frame, image: Grey | None, state: TrackerState

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from bidnerf_core.mapping.capture_report import Arrangement, CaptureReport, Gap, PhotoRecord, Problem
+from bidnerf_core.mapping.capture_report import Arrangement, CaptureReport, Gap, PhotoProblem, PhotoRecord
 
 SUMMARY_LINES = 5
 """Largest number of lines of a summary."""
@@ -26,7 +26,7 @@ ARRANGEMENTS: dict[Arrangement, str] = {
     "one place": "taken from one place",
     "unknown": "too few to tell how they lie",
 }
-PROBLEMS: dict[Problem, tuple[str, str]] = {
+PROBLEMS: dict[PhotoProblem, tuple[str, str]] = {
     "mirrored": ("mirrored", "flip the image back, and turn off the mirroring of selfies"),
     "turned": (
         "turned against the pose",

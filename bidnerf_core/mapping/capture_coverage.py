@@ -1,4 +1,4 @@
-"""From where a capture sees its scene, and from where it does not."""
+"""The coverage of a capture: from where it sees its scene, and from where it does not."""
 
 from __future__ import annotations
 

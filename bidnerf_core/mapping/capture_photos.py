@@ -21,17 +21,17 @@ FINE, COARSE = 1.0, 4.0
 """Standard deviations (pixels) of the Gaussians of the two scales whose energies are compared. The finer one suppresses
 noise, which would pass for detail.
 """
-STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
+SHARPNESS_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
 """Directions (rows, columns) of the second differences: motion blurs one of them alone."""
 DARKEST = 2 / 255
 """Brightness below which pixels are equally dark: quantisation leaves nothing to compare."""
-WHITE, BLACK = 254 / 255, 4 / 255
+OVEREXPOSED, UNDEREXPOSED = 254 / 255, 4 / 255
 """Brightness of the largest channel from which on, and up to which, a pixel holds no measurement."""
 GAMMA = 2.2
 """Exponent from the values of an image to linear light, approximately that of sRGB."""
 ENOUGH_SHARED = 10
 """Least number of landmarks by which the exposure of a photo is compared; with fewer, whole images are compared."""
-ROUNDS = 20
+EXPOSURE_ROUNDS = 20
 """Rounds of alternation between the brightness of landmarks and the exposure of photos."""
 NEIGHBOURS = 8
 """Number of photos from nearby places with which a photo is compared."""
@@ -59,8 +59,8 @@ def _measured(frame: Frame) -> tuple[float, float, float, float]:
     shown = image[inside] if inside.any() else image.reshape(-1, 3)
     brightest = shown.max(-1)
     light = float(np.median(log_light(shown.mean(-1))))
-    return _sharpness(image.mean(-1)), light, float((brightest >= WHITE).mean()), float(
-        (brightest <= BLACK).mean()
+    return _sharpness(image.mean(-1)), light, float((brightest >= OVEREXPOSED).mean()), float(
+        (brightest <= UNDEREXPOSED).mean()
     )  # fmt: skip
 
 
@@ -76,7 +76,9 @@ def _sharpness(grey: np.ndarray) -> float:
         size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (FINE, COARSE))
-    ratios = [_energy(fine, step, 1) / max(_energy(coarse, step, int(COARSE)), 1e-12) for step in STEPS]
+    ratios = [
+        _energy(fine, step, 1) / max(_energy(coarse, step, int(COARSE)), 1e-12) for step in SHARPNESS_STEPS
+    ]
     return float(np.log2(max(min(ratios), 1e-12)))
 
 
@@ -121,7 +123,7 @@ def exposures(
     light = _light_of_keypoints(views, seen)
     enough = torch.bincount(image, minlength=len(views)) >= ENOUGH_SHARED
     found = torch.zeros(len(views), dtype=torch.float64)
-    for _ in range(ROUNDS):
+    for _ in range(EXPOSURE_ROUNDS):
         of_points = _medians(light - found[image], point, seen.count)
         of_images = _medians(light - of_points[point], image, len(views))
         found = torch.where(enough, of_images, 0.0)

@@ -10,7 +10,7 @@ from typing import Literal
 
 from bidnerf_core.mapping.landmarks import HeldOutTrial
 
-Problem = Literal["mirrored", "turned", "badly posed", "apart", "isolated", "blurred", "badly exposed"]
+PhotoProblem = Literal["mirrored", "turned", "badly posed", "apart", "isolated", "blurred", "badly exposed"]
 """What can be wrong with a photo, the gravest first. A photo that is "apart" is linked to a few others only, as are photos of
 a second place.
 """
@@ -39,7 +39,7 @@ class PhotoRecord:
     pose_translation: float | None = None  # metres
     pose_rotation_deg: float | None = None
     pose_deviations: float | None = None  # in standard deviations of such differences in this capture
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[PhotoProblem, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class CaptureReport:
     trial: HeldOutTrial = HeldOutTrial()
     exposure_range: float = 0.0  # stops between the darkest and the brightest tenth of the photos
 
-    def with_problem(self, *problems: Problem) -> list[PhotoRecord]:
+    def with_problem(self, *problems: PhotoProblem) -> list[PhotoRecord]:
         """Return the photos that have any of the problems, in the order of the capture."""
         return [photo for photo in self.photos if set(photo.problems) & set(problems)]
 

@@ -28,7 +28,7 @@ LATER_KINDS = {
     "calibration_scatter": ((4,), torch.float64),
     "trial": ((4,), torch.float64),  # the fields of ``HeldOutTrial`` in order
 }
-"""The same for tensors that maps of earlier versions lack."""
+"""Shape and dtype of the tensors that maps of earlier versions lack."""
 
 
 def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:

@@ -26,7 +26,7 @@ RESECTION_STEPS = 20
 """Largest number of steps; from a good start, four or five suffice."""
 SMALL_STEP = 1e-4
 """Squared length of a step, in standard deviations of the unknowns, below which the iteration has converged."""
-SETTLED = 0.01
+NOISE_TOLERANCE = 0.01
 """Relative change of the estimated noise below which it has converged."""
 LEAST_NOISE = 0.05
 """Lower limit of the estimated noise, pixels: no detector is more accurate."""
@@ -84,7 +84,7 @@ def resect(
             continue
         state, system, damping = moved, tried, damping / 10
         better = max(LEAST_NOISE, noise * tried.spread)
-        settled = abs(better / noise - 1) < SETTLED
+        settled = abs(better / noise - 1) < NOISE_TOLERANCE
         if not settled:
             noise = better
             system = equations(state, noise)

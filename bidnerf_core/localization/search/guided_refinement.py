@@ -39,7 +39,7 @@ CERTAIN = 0.999
 """Probability that the given intrinsics are wrong above which the estimated ones are taken."""
 MOST_DISTANCE = (0.5 * NORM) ** 2
 """Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
-LEAST_MATCHES = 6
+LEAST_GUIDED_MATCHES = 6
 """Least number of guided matches for another round."""
 
 
@@ -48,7 +48,6 @@ class GuidedPose:
     """A pose refined on guided matches."""
 
     fit: ReprojectionFit
-    prior: CalibrationPrior  # of the intrinsics, as they were taken in the end
     correspondences: LandmarkMatches
     visible: int  # landmarks that should be visible from there
     chance: float  # matches that the last round would find at a wrong pose
@@ -75,7 +74,7 @@ def confirmed(query: LandmarkQuery, T_world_rig: SE3) -> GuidedPose | None:
     """Refine a pose that was found by other means on guided matches; None if there are too few."""
     radius = RADII[0] * query.threshold
     found = guided_matches(query.images, query.landmarks, T_world_rig, radius, MOST_DISTANCE)
-    if len(found) < LEAST_MATCHES:
+    if len(found) < LEAST_GUIDED_MATCHES:
         return None
     fit = resect(
         query.observed(found), T_world_rig, radius / 2, query.prior, correlation=query.landmarks.correlation
@@ -88,15 +87,13 @@ def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches,
     correlation = query.landmarks.correlation
     fit, found = _guided(query, query.prior, fit, found, most, RADII)
     free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
-    prior = query.prior
     wrong = Miscalibration.of(free, query.landmarks)
-    if wrong.worst[1] > CERTAIN and not prior.log_focal:
-        prior = NOMINAL
-        fit, found = _guided(query, prior, free, found, most, RADII[1:])
+    if wrong.worst[1] > CERTAIN and not query.prior.log_focal:
+        fit, found = _guided(query, NOMINAL, free, found, most, RADII[1:])
     radius = RADII[-1] * query.threshold
     projections = projected_landmarks(query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius)
     visible, chance = sum(map(len, projections)), matches_by_chance(projections, radius, most)
-    return GuidedPose(fit, prior, found, visible, chance, wrong)
+    return GuidedPose(fit, found, visible, chance, wrong)
 
 
 def _guided(
@@ -115,7 +112,7 @@ def _guided(
         data = query.observed(guided)
         agrees = _depth_agrees(data, fit.T_world_rig)
         guided, data = guided[agrees], data[agrees]
-        if len(guided) < LEAST_MATCHES:
+        if len(guided) < LEAST_GUIDED_MATCHES:
             break
         changed, found = _changed(guided, found), guided
         fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, query.landmarks.correlation)
@@ -136,7 +133,7 @@ def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
     z = data.in_camera(T_world_rig)[:, 2]
     known = data.depth > 0
     ratio = torch.where(known, z / torch.where(known, data.depth, 1), 1)
-    scale = ratio[known].median() if int(known.sum()) >= LEAST_MATCHES else 1.0
+    scale = ratio[known].median() if int(known.sum()) >= LEAST_GUIDED_MATCHES else 1.0
     return (ratio / scale - 1).abs() <= DEPTH_OFF
 
 

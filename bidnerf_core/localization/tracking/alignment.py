@@ -31,7 +31,7 @@ optimistic for hand-held sensors.
 """
 ALIGNMENT_STEPS = 8
 """Largest number of steps of an alignment without landmarks, at each of its scales."""
-SETTLED = 1e-4
+ALIGNED_STEP = 1e-4
 """Length of a step (metres and radians) at which the alignment has ended."""
 
 
@@ -49,7 +49,7 @@ def measured_cloud(frame: Frame, count: int, scale: float, generator: Generator)
     return cloud if scale == 1 else replace(cloud, points=scale * cloud.points)
 
 
-def joined(now: CloudInCamera, before: Sequence[CloudInCamera]) -> PointCloud:
+def joined_clouds(now: CloudInCamera, before: Sequence[CloudInCamera]) -> PointCloud:
     """Return the points of a window of frames in the camera of the last, placed by the frames' relative poses."""
     clouds = [now.cloud]
     for past in before:
@@ -82,7 +82,7 @@ def fused_with_surface(
         # The steps are so short that they add up; the prior pulls back by all of them.
         step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)
         T, moved = retracted(T, at_camera @ step), moved + step
-        if float(torch.linalg.vector_norm(step)) < SETTLED:
+        if float(torch.linalg.vector_norm(step)) < ALIGNED_STEP:
             break
     to_pivot = torch.linalg.inv(at_camera)
     information = to_pivot.T @ hessian @ to_pivot
@@ -123,7 +123,7 @@ def aligned(
         variance = max(float(cost.residual_variance(T[None])[0]), LEAST_VARIANCE)
         term = FusedTerm(cost, variance, SURFACE_MEASUREMENTS * views)
         T = (
-            descend(Sum((prior, term.scaled)), T[None], ALIGNMENT_STEPS, about.moved, stop=SETTLED)
+            descend(Sum((prior, term.scaled)), T[None], ALIGNMENT_STEPS, about.moved, stop=ALIGNED_STEP)
             .T[0]
             .normalized()
         )

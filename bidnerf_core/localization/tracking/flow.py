@@ -10,11 +10,11 @@ from torch import Tensor
 
 from bidnerf_core.mapping.features import FIRST_CENTRE
 
-WINDOW = (13, 13)
+FLOW_WINDOW = (13, 13)
 """Pixels of the patches that are compared."""
 LEVELS = 3
 """Number of pyramid levels above the image itself; each halves it."""
-STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
+FLOW_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 """Largest number of iterations on each level, and the step (pixels) below which they end."""
 RETURN = 0.7
 """Largest distance (pixels) between a point and where the flow back from its new place leads to."""
@@ -38,12 +38,12 @@ def flow(
     before = _as_bright_as(now, before)
     start = _corner_based(pixels)
     there, seen, _ = cv2.calcOpticalFlowPyrLK(
-        before, now, start, _corner_based(guess), winSize=WINDOW, maxLevel=LEVELS,
-        criteria=STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE,
+        before, now, start, _corner_based(guess), winSize=FLOW_WINDOW, maxLevel=LEVELS,
+        criteria=FLOW_STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE,
     )  # fmt: skip
     back, seen_back, _ = cv2.calcOpticalFlowPyrLK(
-        now, before, there, start.copy(), winSize=WINDOW, maxLevel=1,
-        criteria=STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE,
+        now, before, there, start.copy(), winSize=FLOW_WINDOW, maxLevel=1,
+        criteria=FLOW_STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE,
     )  # fmt: skip
     height, width = now.shape
     inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(-1)

@@ -27,7 +27,7 @@ from bidnerf_core.localization.tracking.alignment import (
     CloudInCamera,
     aligned,
     fused_with_surface,
-    joined,
+    joined_clouds,
     measured_cloud,
 )
 from bidnerf_core.localization.tracking.detection import (
@@ -49,7 +49,7 @@ WIDEST = 0.4
 """Largest radius, as a share of the image's diagonal, within which landmarks are sought around their prediction."""
 SIGMAS = 3.0
 """The radius in standard deviations of the prediction."""
-ENOUGH = 40
+ENOUGH_LANDMARKS = 40
 """The number of followed landmarks that agree from which on no new ones are sought."""
 SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
@@ -137,7 +137,7 @@ class ByLandmarks:
         self, state: TrackerState, points: FollowedPoints, judged: tuple[LandmarkPose, Verdict]
     ) -> bool:
         left = judged[0].inliers
-        few = left < max(ENOUGH, self.config.refresh_share * state.sought)
+        few = left < max(ENOUGH_LANDMARKS, self.config.refresh_share * state.sought)
         pose, verdict = judged
         few |= pose.position_deviation > LandmarkThresholds().precision * pose.distance
         return few or state.age >= self.config.refresh_frames or not verdict.accepted
@@ -190,7 +190,7 @@ class ByLandmarks:
         if not verdict.accepted or surface is None or not frame.has_depth:
             return Measurement(pose, verdict, found.noise, state)
         here = CloudInCamera(self._cloud(frame, found, state.frames), found.T_world_camera)
-        cloud = joined(here, state.window)
+        cloud = joined_clouds(here, state.window)
         pose = fused_with_surface(pose, surface, cloud, self.config.depth_steps, 1 + len(state.window))
         kept_clouds = (*state.window, here)[-(self.config.window - 1) :] if self.config.window > 1 else ()
         verdict = replace(verdict, reason=f"{verdict.reason}, fused with depth")
@@ -221,7 +221,7 @@ def by_surface(
     translation, rotation = predicted.noise[:6, :6].diagonal().split(3)
     off = math.sqrt(float(translation.mean() + rotation.mean() * predicted.reach**2))
     found = aligned(
-        surface, joined(here, state.window), predicted.T_world_camera, predicted.covariance,
+        surface, joined_clouds(here, state.window), predicted.T_world_camera, predicted.covariance,
         2 * off, views,
     )  # fmt: skip
     here = replace(here, T_world_camera=found.T_world_camera)

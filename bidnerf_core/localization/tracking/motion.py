@@ -24,7 +24,7 @@ ACCELERATION, TURN_ACCELERATION = 2.0, 4.0
 """Standard deviations of the acceleration: reaches a second squared, and radians a second squared. Those of a hand-held camera
 that is moved briskly.
 """
-GAP = 0.6
+LONGEST_GAP = 0.6
 """Seconds without a frame after which the velocity is no longer used."""
 UNFORESEEN = 60.0
 """Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is dropped."""
@@ -73,7 +73,7 @@ class Motion:
 
         After a gap, the pose stays where it was and its uncertainty grows with the speed that a camera may have.
         """
-        motion = self.at_rest() if abs(seconds) > GAP else self
+        motion = self.at_rest() if abs(seconds) > LONGEST_GAP else self
         step = motion.velocity * seconds
         T = retracted(motion.T_world_camera, step)
         back = _adjoint_of_inverse(step)

@@ -19,7 +19,7 @@ from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, resect
 from bidnerf_core.se3 import SE3
 
-LEAST_POINTS = 6
+LEAST_FOLLOWED = 6
 """Least number of points from which a pose is estimated."""
 INLIER = 3.0
 """Largest reprojection error of an inlier, in standard deviations along both axes together."""
@@ -112,14 +112,14 @@ def fit_pose(
     ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. Where most points do not agree with the robust fit, a
     consensus of samples within ``threshold`` pixels replaces the start.
     """
-    if len(data) < LEAST_POINTS:
+    if len(data) < LEAST_FOLLOWED:
         return None
     fit = resect(data, _nearby(data, start, threshold), noise, correlation=correlation)
     found = PointFit(fit, data, _inliers(data, fit))
     if found.share >= MAJORITY and found.fit.noise <= threshold:
         return found
     consensus = sample_consensus(data, torch.zeros(len(data), dtype=torch.long), threshold, seed=0)
-    if consensus is None or int(consensus.inliers.sum()) < LEAST_POINTS:
+    if consensus is None or int(consensus.inliers.sum()) < LEAST_FOLLOWED:
         return found
     better = resect(data[consensus.inliers], consensus.T_world_rig, threshold / 2, correlation=correlation)
     other = PointFit(better, data, _inliers(data, better))

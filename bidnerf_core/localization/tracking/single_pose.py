@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.se3 import SE3
 
-SERIES_BELOW = 1e-4
+SERIES_ANGLE = 1e-4
 """Angle (radians) under which the coefficients of the Jacobians come from their series."""
 
 
@@ -38,7 +38,7 @@ def _left_jacobian(phi: np.ndarray) -> np.ndarray:
     angle = math.sqrt(float(phi @ phi))
     x, y, z = phi
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    if angle < SERIES_BELOW:
+    if angle < SERIES_ANGLE:
         return np.eye(3) + cross / 2 + cross @ cross / 6
     b, c = (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
     jacobian: np.ndarray = np.eye(3) + b * cross + c * (cross @ cross)

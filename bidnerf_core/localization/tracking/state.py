@@ -23,7 +23,7 @@ from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.se3 import SE3
 
-FORMAT, VERSION = "bidnerf tracker", 1
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 1
 CLOUD = ("points", "rgb", "origins", "coloured")
 
 
@@ -70,7 +70,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
     for number, past in enumerate(state.window):
         tensors |= _pose_tensors(f"window.{number}", past.T_world_camera)
         tensors |= {f"window.{number}.{name}": getattr(past.cloud, name) for name in CLOUD}
-    content = {"format": FORMAT, "version": VERSION, "map": key, "state": numbers}
+    content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": numbers}
     metadata = {"bidnerf": json.dumps(content, allow_nan=False)}
     write_file(
         path,
@@ -78,7 +78,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
     )
 
 
-def load_state(path: Path, key: str) -> TrackerState:
+def load_tracker_state(path: Path, key: str) -> TrackerState:
     """Read a state. Raises ``InputError`` for another file, another version, and another map than ``key``."""
     numbers, tensors = _read(path, key)
     try:
@@ -96,10 +96,10 @@ def _read(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise InputError(
             f"{path}: not readable ({error}), expected a file that Tracker.save wrote"
         ) from error
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
+    if not isinstance(found, dict) or found.get("format") != STATE_FORMAT:
         raise InputError(f"{path}: not the state of a tracker, expected a file that Tracker.save wrote")
-    if found.get("version") != VERSION:
-        raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}")
+    if found.get("version") != STATE_VERSION:
+        raise InputError(f"{path}: version {found.get('version')!r}, expected {STATE_VERSION}")
     if found.get("map") != key:
         raise InputError(f"{path}: belongs to map {found.get('map')!r}, the tracker's is {key!r}")
     return found["state"], tensors
