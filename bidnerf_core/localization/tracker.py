@@ -20,10 +20,12 @@ from bidnerf_core.localization.tracking.measuring import (
     ByLandmarks,
     Measurement,
     by_colour,
+    by_shape,
     by_surface,
     determined,
     followed,
     is_vague,
+    precise,
 )
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
 from bidnerf_core.localization.tracking.odometry import Odometry
@@ -31,6 +33,7 @@ from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints
 from bidnerf_core.localization.tracking.relocalization import has_points, relocalized, uses_landmarks
 from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
+from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.features import Sift, grey_image
 from bidnerf_core.se3 import SE3
 
@@ -117,10 +120,10 @@ class Tracker:
             if answer.converged:
                 return answer, state
         found = relocalized(
-            self.localizer, frame, self._start, state.lost, self.config.patience, seed=state.frames
+            self.localizer, frame, self._start, state.searchable, self.config.patience, seed=state.frames
         )
         if found is None or not found.converged:
-            return self._unknown(found), replace(state, lost=state.lost + 1)
+            return self._unknown(found), replace(state, lost=state.lost + 1, searchable=state.searchable + 1)
         return self._found(frame, image, state, found)
 
     def _at_start(self, frame: Frame, start: SE3) -> Motion:
@@ -131,7 +134,9 @@ class Tracker:
         self, frame: Frame, image: Grey | None, state: TrackerState, motion: Motion, seconds: float
     ) -> tuple[Localization, TrackerState]:
         """Find the pose from that of the last frame. If it is not accepted, search anew from the next frame on."""
-        predicted = motion.predicted(seconds)
+        predicted, surface = motion.predicted(seconds), self.localizer.map.surface
+        if image is None and surface is not None and has_points(frame):
+            return self._by_shape(surface, frame, state, predicted)
         points = followed(state, image, frame, predicted.T_world_camera)
         predicted, points, how = self._by_odometry(frame, points, motion, predicted, seconds)
         measured = self._measured(frame, image, state, points, predicted)
@@ -142,7 +147,7 @@ class Tracker:
                 self.localizer,
                 frame,
                 predicted.T_world_camera,
-                state.lost,
+                state.searchable,
                 self.config.patience,
                 state.frames,
             )
@@ -154,6 +159,23 @@ class Tracker:
             f"lost for {state.lost} frame{'s' if state.lost > 1 else ''}, bridged by {how}: {verdict.reason}"
         )
         return _localization(predicted, Verdict(verdict.outcome, reason), predicted, 1.0), state
+
+    def _by_shape(
+        self, surface: SurfaceMap, frame: Frame, state: TrackerState, predicted: Motion
+    ) -> tuple[Localization, TrackerState]:
+        """Correct the prediction by the depth of a frame that has no colours; nothing is searched.
+
+        A fit that leaves the position uncertain is not accepted. It still corrects what the shape determines.
+        """
+        found = by_shape(surface, frame, state, predicted, self.config)
+        if not found.verdict.accepted:
+            verdict = replace(found.verdict, reason=f"not corrected by shape: {found.verdict.reason}")
+            state = replace(state, motion=predicted, lost=state.lost + 1)
+            return _localization(predicted, verdict, predicted, found.loss), state
+        motion = predicted.refined(found.pose)
+        verdict = precise(found.verdict, motion.covariance, self._reach(frame))
+        state = replace(state, motion=motion, lost=0 if verdict.accepted else state.lost + 1)
+        return _localization(motion, verdict, predicted, found.loss), state
 
     def _by_odometry(
         self, frame: Frame, points: FollowedPoints, motion: Motion, predicted: Motion, seconds: float
@@ -194,7 +216,7 @@ class Tracker:
             predicted, reach=self._reach(frame, measured.state.points, measured.pose.T_world_camera)
         )
         motion = motion.updated(measured.pose)
-        state = replace(measured.state, motion=motion, lost=0)
+        state = replace(measured.state, motion=motion, lost=0, searchable=0)
         if self._by_landmarks is None:
             corners = self._odometry.replenished(frame, image, state.points, motion.T_world_camera)
             state = replace(state, points=corners)
@@ -219,7 +241,7 @@ class Tracker:
             state = replace(state, points=corners)
         reason = f"relocalized after {state.lost} frames: {found.reason}" if state.lost else found.reason
         answer = replace(found, method=METHOD, reason=reason, covariance=motion.covariance)
-        return answer, replace(state, motion=motion, lost=0)
+        return answer, replace(state, motion=motion, lost=0, searchable=0)
 
     def _adrift(
         self, frame: Frame, image: Grey | None, state: TrackerState, points: FollowedPoints, predicted: Motion
@@ -227,7 +249,14 @@ class Tracker:
         """Return the state of a tracker that is lost: corners to follow, and a velocity that is trusted less and less."""
         corners = self._odometry.replenished(frame, image, points, predicted.T_world_camera)
         motion = replace(predicted, velocity=VELOCITY_KEPT * predicted.velocity)
-        return replace(state, motion=motion, points=corners, window=(), lost=state.lost + 1)
+        return replace(
+            state,
+            motion=motion,
+            points=corners,
+            window=(),
+            lost=state.lost + 1,
+            searchable=state.searchable + 1,
+        )
 
     def _unknown(self, found: Localization | None) -> Localization:
         """Return the answer for a frame of which no pose is known, nor that of any frame before it."""

@@ -41,6 +41,7 @@ from bidnerf_core.localization.tracking.flow import Grey, flow
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
 from bidnerf_core.localization.tracking.settings import TrackerConfig
+from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
@@ -53,9 +54,8 @@ ENOUGH_LANDMARKS = 40
 """The number of followed landmarks that agree from which on no new ones are sought."""
 SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
-SHAPE_ALONE = Verdict(
-    Outcome.UNDETERMINED, "no colours were recorded, and shape alone does not show a slide along walls"
-)
+FORESEEN = 25.0
+"""Largest squared Mahalanobis distance between a prediction and an accepted pose by shape alone."""
 DETERMINED = 0.02, math.radians(3)
 """Largest standard deviation of an accepted pose by depth or colour: shares of the scene's extent, and radians."""
 
@@ -229,8 +229,27 @@ def by_surface(
     covariance = found.covariance
     pose = PoseEstimate(found.T_world_camera, (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance)
     loss = 1 - found.diagnostics.colour_inliers
-    verdict = found.diagnostics.verdict() if frame.has_colour else SHAPE_ALONE
-    return Measurement(pose, verdict, loss, replace(state, window=window))
+    return Measurement(pose, found.diagnostics.verdict(), loss, replace(state, window=window))
+
+
+def by_shape(
+    surface: SurfaceMap, frame: Frame, state: TrackerState, predicted: Motion, config: TrackerConfig
+) -> Measurement:
+    """Return the predicted pose corrected by measured depth without colours: fused with the prediction already."""
+    cloud = measured_cloud(frame, config.depth_points, 1.0, Generator().manual_seed(state.frames))
+    prediction = PoseEstimate(predicted.T_world_camera, predicted.noise[:6, :6], predicted.bias)
+    translation, rotation = prediction.covariance.diagonal().split(3)
+    off = math.sqrt(float(translation.mean() + rotation.mean() * predicted.reach**2))
+    found = fit_shape(surface, cloud, prediction, off)
+    loss = 1 - found.diagnostics.on_surface
+    rejected = found.diagnostics.rejection()
+    if rejected is None and found.surprise > FORESEEN:
+        rejected = Verdict(
+            Outcome.AMBIGUOUS, "the measured shape fits a place that the motion does not lead to"
+        )
+    share = f"{found.diagnostics.on_surface:.0%} of the measured points lie on the surface"
+    of = "" if found.determined == 6 else f", which determines {found.determined} of 6 directions"
+    return Measurement(found.pose, rejected or Verdict(Outcome.CONVERGED, share + of), loss, state)
 
 
 def by_colour(

@@ -28,6 +28,14 @@ LONGEST_GAP = 0.6
 """Seconds without a frame after which the velocity is no longer used."""
 UNFORESEEN = 60.0
 """Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is dropped."""
+CALM, RESTLESS, LEAST_AGILITY = 0.93, 1.25, 0.05
+"""Factors on the agility when a measured pose is near the prediction and when it is not, and its lower limit."""
+NEAR = 4.15
+"""Squared Mahalanobis distance up to which a measured translation or rotation is near the prediction. That of a consistent
+prediction exceeds it in a quarter of the frames, for which the two factors balance.
+"""
+KNOWN = 0.5
+"""Variance of a velocity, as a share of that of an unknown one, up to which predictions show how briskly a camera moves."""
 LEAST_SECONDS = 1e-3
 """Least time between two frames for which noise of the motion is added; frames may be repeated or lack distinct times."""
 
@@ -54,6 +62,10 @@ class Motion:
     noise: Float[Tensor, "12 12"]  # covariance of pose and velocity
     bias: Float[Tensor, "6 6"]  # covariance of the pose's error that frames share
     reach: float  # metres: distance to what the camera sees, which scales translations
+    agility: tuple[float, float] = (
+        1.0,
+        1.0,
+    )  # factors on the accelerations: how briskly this camera has moved of late
 
     @staticmethod
     def at(pose: PoseEstimate, reach: float) -> Motion:
@@ -106,13 +118,44 @@ class Motion:
             _symmetric(noise),
             shared @ shared.T,
             self.reach,
+            self.agility,
+        )
+
+    def refined(self, fused: PoseEstimate) -> Motion:
+        """Return the state whose pose, fused with a measurement already, is ``fused``; the velocity follows it."""
+        gain = torch.linalg.solve(self.noise[:6, :6], self.noise[:6]).T
+        delta = gain @ update_between(self.T_world_camera, fused.T_world_camera)
+        noise = self.noise + gain @ (fused.noise - self.noise[:6, :6]) @ gain.T
+        velocity = self.velocity + delta[6:]
+        return replace(
+            self,
+            T_world_camera=fused.T_world_camera,
+            velocity=velocity,
+            noise=_symmetric(noise),
+            bias=fused.bias,
         )
 
     def updated(self, measured: PoseEstimate) -> Motion:
         """Return the state after fusing it with a measured pose, or at that pose alone if no prediction could foresee it."""
         if self.distance(measured) > UNFORESEEN:
             return Motion.at(measured, self.reach)
-        return self.corrected(measured)
+        return replace(self.corrected(measured), agility=self._observed_agility(measured))
+
+    def _observed_agility(self, measured: PoseEstimate) -> tuple[float, float]:
+        """Return the agility after a measured pose, adapted until the predicted accelerations match (Mehra 1970).
+
+        A velocity that is not known yet says nothing about it.
+        """
+        velocity = self.noise.diagonal()[6:9].mean() / (self.reach * SPEED) ** 2
+        if float(velocity) > KNOWN:
+            return self.agility
+        off = update_between(self.T_world_camera, measured.T_world_camera)
+        spread = self.noise[:6, :6] + measured.noise
+        found = []
+        for part, factor in zip((slice(0, 3), slice(3, 6)), self.agility, strict=True):
+            far = float(off[part] @ torch.linalg.solve(spread[part, part], off[part])) > NEAR
+            found.append(min(1.0, max(LEAST_AGILITY, factor * (RESTLESS if far else CALM))))
+        return found[0], found[1]
 
     def moved(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
         """Return the state after a motion that the images themselves gave, ``seconds`` later.
@@ -139,7 +182,8 @@ class Motion:
 
     def _acceleration_noise(self, seconds: float) -> Float[Tensor, "12 12"]:
         seconds = max(abs(seconds), LEAST_SECONDS)
-        spread = _scaled(self.reach * ACCELERATION, TURN_ACCELERATION)
+        along, about = self.agility
+        spread = _scaled(along * self.reach * ACCELERATION, about * TURN_ACCELERATION)
         pairs = torch.tensor([[seconds**4 / 4, seconds**3 / 2], [seconds**3 / 2, seconds**2]])
         return torch.kron(pairs.double(), spread)
 

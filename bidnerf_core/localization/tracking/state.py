@@ -23,7 +23,7 @@ from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.se3 import SE3
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 1
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 2
 CLOUD = ("points", "rgb", "origins", "coloured")
 
 
@@ -35,6 +35,7 @@ class TrackerState:
     motion: Motion | None = None  # None before the first pose was found
     frames: int = 0  # that the tracker has been called with
     lost: int = 0  # consecutive frames without an accepted pose, up to the last one
+    searchable: int = 0  # of these, the frames that could be searched
     points: FollowedPoints = field(default_factory=FollowedPoints.none)
     image: Grey | None = None  # the last one, in which the points were seen
     sought: int = 0  # number of points when they were last sought
@@ -57,6 +58,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
         "sought": state.sought, "age": state.age, "usual_distance": _written(state.usual_distance),
         "noise": state.noise, "window": len(state.window),
         "reach": None if state.motion is None else state.motion.reach,
+        "agility": None if state.motion is None else state.motion.agility, "searchable": state.searchable,
     }  # fmt: skip
     tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
     tensors |= {
@@ -109,7 +111,8 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
     motion = None
     if numbers["reach"] is not None:
         velocity, noise, bias = (tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias"))
-        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers["reach"])
+        along, about = (float(factor) for factor in numbers["agility"])
+        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers["reach"], (along, about))
     window = tuple(
         CloudInCamera(
             PointCloud(*(tensors[f"window.{number}.{name}"] for name in CLOUD)),
@@ -121,7 +124,8 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
     usual = numbers["usual_distance"]
     miscalibration = Miscalibration(*(tensors[f"miscalibration.{f.name}"] for f in fields(Miscalibration)))
     return TrackerState(
-        Clock(numbers["now"], numbers["interval"]), motion, numbers["frames"], numbers["lost"], points,
+        Clock(numbers["now"], numbers["interval"]), motion, numbers["frames"], numbers["lost"],
+        numbers["searchable"], points,
         tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
         float("inf") if usual is None else usual, miscalibration, numbers["noise"], window,
     )  # fmt: skip
