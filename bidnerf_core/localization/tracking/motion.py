@@ -28,11 +28,9 @@ LONGEST_GAP = 0.6
 """Seconds without a frame after which the velocity is no longer used."""
 UNFORESEEN = 60.0
 """Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is dropped."""
-CALM, RESTLESS, LEAST_AGILITY = 0.93, 1.25, 0.05
-"""Factors on the agility when a measured pose is near the prediction and when it is not, and its lower limit."""
-NEAR = 4.15
-"""Squared Mahalanobis distance up to which a measured translation or rotation is near the prediction. That of a consistent
-prediction exceeds it in a quarter of the frames, for which the two factors balance.
+ADAPTED, LEAST_AGILITY, MOST_SURPRISE = 0.4, 0.1, 9.0
+"""Share of the squared agility that each measured pose renews, its lower limit, and the largest ratio of a squared innovation
+to the expected one that counts.
 """
 KNOWN = 0.5
 """Variance of a velocity, as a share of that of an unknown one, up to which predictions show how briskly a camera moves."""
@@ -62,10 +60,7 @@ class Motion:
     noise: Float[Tensor, "12 12"]  # covariance of pose and velocity
     bias: Float[Tensor, "6 6"]  # covariance of the pose's error that frames share
     reach: float  # metres: distance to what the camera sees, which scales translations
-    agility: tuple[float, float] = (
-        1.0,
-        1.0,
-    )  # factors on the accelerations: how briskly this camera has moved of late
+    agility: float = 1.0  # factor on the acceleration: how briskly the camera has changed its velocity of late
 
     @staticmethod
     def at(pose: PoseEstimate, reach: float) -> Motion:
@@ -141,21 +136,19 @@ class Motion:
             return Motion.at(measured, self.reach)
         return replace(self.corrected(measured), agility=self._observed_agility(measured))
 
-    def _observed_agility(self, measured: PoseEstimate) -> tuple[float, float]:
+    def _observed_agility(self, measured: PoseEstimate) -> float:
         """Return the agility after a measured pose, adapted until the predicted accelerations match (Mehra 1970).
 
-        A velocity that is not known yet says nothing about it.
+        A velocity that is not known yet says nothing about it. Turns are left out: they change more abruptly than the way
+        that somebody walks, and what is measured determines them well.
         """
-        velocity = self.noise.diagonal()[6:9].mean() / (self.reach * SPEED) ** 2
-        if float(velocity) > KNOWN:
+        velocity = float(self.noise.diagonal()[6:9].mean()) / (self.reach * SPEED) ** 2
+        if velocity > KNOWN:
             return self.agility
-        off = update_between(self.T_world_camera, measured.T_world_camera)
-        spread = self.noise[:6, :6] + measured.noise
-        found = []
-        for part, factor in zip((slice(0, 3), slice(3, 6)), self.agility, strict=True):
-            far = float(off[part] @ torch.linalg.solve(spread[part, part], off[part])) > NEAR
-            found.append(min(1.0, max(LEAST_AGILITY, factor * (RESTLESS if far else CALM))))
-        return found[0], found[1]
+        off = update_between(self.T_world_camera, measured.T_world_camera)[:3]
+        spread = (self.noise[:6, :6] + measured.noise)[:3, :3]
+        ratio = min(MOST_SURPRISE, float(off @ torch.linalg.solve(spread, off)) / 3)
+        return min(1.0, max(LEAST_AGILITY, self.agility * math.sqrt(1 - ADAPTED + ADAPTED * ratio)))
 
     def moved(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
         """Return the state after a motion that the images themselves gave, ``seconds`` later.
@@ -182,8 +175,7 @@ class Motion:
 
     def _acceleration_noise(self, seconds: float) -> Float[Tensor, "12 12"]:
         seconds = max(abs(seconds), LEAST_SECONDS)
-        along, about = self.agility
-        spread = _scaled(along * self.reach * ACCELERATION, about * TURN_ACCELERATION)
+        spread = _scaled(self.agility * self.reach * ACCELERATION, TURN_ACCELERATION)
         pairs = torch.tensor([[seconds**4 / 4, seconds**3 / 2], [seconds**3 / 2, seconds**2]])
         return torch.kron(pairs.double(), spread)
 

@@ -26,7 +26,7 @@ from bidnerf_core.se3 import SE3
 
 WEAK = 0.1
 """Share of the mean information of the three best directions below which a direction is left to the prediction."""
-SHAPE_STEPS = 5
+SHAPE_STEPS = 8
 """Largest number of steps at each scale."""
 JUDGED_CELLS = 4.0
 """Largest scale of distances at which the fit is judged, in cells of the surface's grid. In a large scene, a share of its

@@ -111,8 +111,7 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
     motion = None
     if numbers["reach"] is not None:
         velocity, noise, bias = (tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias"))
-        along, about = (float(factor) for factor in numbers["agility"])
-        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers["reach"], (along, about))
+        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers["reach"], numbers["agility"])
     window = tuple(
         CloudInCamera(
             PointCloud(*(tensors[f"window.{number}.{name}"] for name in CLOUD)),
