@@ -220,7 +220,7 @@ class _Residuals:
         by_local = np.stack([one, zero, -x, zero, one, -y], axis=1).reshape(-1, 2, 3) / z[..., None]
         by_rig = (scale[..., None] * bent) @ by_local @ self._rotation
         # A point of the rig's frame moves by -rho + p x phi under T exp(rho, phi), and r (p x phi) = (r x p) phi.
-        by_pose = np.concatenate([-by_rig, np.cross(by_rig, rig[:, None])], axis=-1)
+        by_pose = np.concatenate([-by_rig, _cross(by_rig, rig[:, None])], axis=-1)
         if not len(free):
             return by_pose
         focal = self._focal[:, 0]
@@ -236,7 +236,20 @@ class _Residuals:
 def _spread(residual: Array, unknowns: int) -> float:
     """Return a robust standard deviation along an axis, corrected for the number of unknowns that were fitted."""
     spare = max(1.0, residual.size - unknowns) / residual.size
-    return 1.4826 * float(np.median(np.abs(residual))) / spare**0.5
+    return 1.4826 * _median(np.abs(residual).ravel()) / spare**0.5
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return ``np.cross`` of vectors along the last axis, in a fifth of its time for small arrays."""
+    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
+
+
+def _median(values: Array) -> float:
+    """Return ``np.median`` of finite values, without the time that its checks take."""
+    half, odd = divmod(len(values), 2)
+    ordered = np.partition(values, (half - 1 + odd, half))
+    return float(ordered[half]) if odd else float(0.5 * (ordered[half - 1] + ordered[half]))
 
 
 def _solved(hessian: Array, damping: float, right: Array) -> Array:

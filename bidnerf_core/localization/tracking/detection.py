@@ -28,7 +28,7 @@ from bidnerf_core.localization.search.matching import EXACT, LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
-from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
+from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL
 from bidnerf_core.mapping.features import Features
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import resect
@@ -81,12 +81,12 @@ class LandmarkDetector:
         radius: float,
         most_distance: float,
         noise: float,
-        apparent: Calibration = GIVEN,
+        known: Miscalibration | None = None,
     ) -> Recognized | None:
         """Match keypoints with landmarks that project within ``radius`` pixels of them, and fit the pose to the matches.
 
         ``most_distance`` is the largest squared distance between the descriptors of a match, ``noise`` a first guess at that
-        of keypoints (pixels), ``apparent`` one at the intrinsics that fit best. Returns None if too few match.
+        of keypoints (pixels), ``known`` what is known of wrong intrinsics; without it, they are checked. Returns None if too few match.
         """
         number = self._near(frame.intrinsics, T_world_camera)
         image = query_image(frame, SE3.identity(), self.features)
@@ -107,7 +107,8 @@ class LandmarkDetector:
         evidence = _guided_evidence(query, found, tight, most_distance)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
         points = replace(points, landmark=number[points.landmark])
-        return Recognized(points, found, evidence, most_distance, self._miscalibration(found, apparent))
+        wrong = self._miscalibration(found) if known is None else known
+        return Recognized(points, found, evidence, most_distance, wrong)
 
     def _seen(
         self, frame: Frame, query: LandmarkQuery, T: SE3, radius: float, most_distance: float, noise: float
@@ -138,10 +139,10 @@ class LandmarkDetector:
             return index
         return index[landmarks.views[index].argsort(descending=True, stable=True)[:NEARBY].sort().values]
 
-    def _miscalibration(self, found: PointFit, apparent: Calibration) -> Miscalibration:
+    def _miscalibration(self, found: PointFit) -> Miscalibration:
         """Judge the given intrinsics by those that fit the landmarks best."""
         free = resect(
-            found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL, apparent,
+            found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL, GIVEN,
             self.landmarks.correlation,
         )  # fmt: skip
         return Miscalibration.of(free, self.landmarks)

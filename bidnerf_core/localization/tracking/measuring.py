@@ -52,6 +52,8 @@ SIGMAS = 3.0
 """The radius in standard deviations of the prediction."""
 ENOUGH_LANDMARKS = 40
 """The number of followed landmarks that agree from which on no new ones are sought."""
+CALIBRATED = 30
+"""The number of frames after which recognised landmarks check the given intrinsics again."""
 SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
 FORESEEN = 25.0
@@ -110,7 +112,7 @@ class ByLandmarks:
             evidence = flow_evidence(found, frame.intrinsics)
             judged = self._judged(frame, points, found, evidence, state.miscalibration)
         state = replace(state, age=state.age + 1)
-        if judged is None or self._wants_more(state, points, judged):
+        if judged is None or self._wants_more(state, predicted, judged):
             fresh = self._recognized(frame, state, predicted, judged)
             if fresh is not None and (judged is None or fresh[1].accepted or not judged[1].accepted):
                 judged, points, found, state = fresh[:2], fresh[2], fresh[3], fresh[4]
@@ -134,12 +136,13 @@ class ByLandmarks:
         return pose, landmark_verdict(pose, SINGLE)
 
     def _wants_more(
-        self, state: TrackerState, points: FollowedPoints, judged: tuple[LandmarkPose, Verdict]
+        self, state: TrackerState, predicted: Motion, judged: tuple[LandmarkPose, Verdict]
     ) -> bool:
         left = judged[0].inliers
         few = left < max(ENOUGH_LANDMARKS, self.config.refresh_share * state.sought)
         pose, verdict = judged
-        few |= pose.position_deviation > LandmarkThresholds().precision * pose.distance
+        together = torch.linalg.inv(predicted.covariance) + torch.linalg.inv(pose.full_covariance)
+        few |= not precise(verdict, torch.linalg.inv(together), pose.distance).accepted
         return few or state.age >= self.config.refresh_frames or not verdict.accepted
 
     def _recognized(
@@ -159,8 +162,9 @@ class ByLandmarks:
             radius = max(least, search_radius(predicted, camera))
             if radius > most:
                 return None
+        due = state.calibrated is None or state.frames - state.calibrated >= CALIBRATED
         seen = self.detector(
-            frame, T, radius, state.usual_distance, state.noise, state.miscalibration.calibration
+            frame, T, radius, state.usual_distance, state.noise, state.miscalibration if not due else None
         )
         if seen is None:
             return None
@@ -176,6 +180,7 @@ class ByLandmarks:
             age=0,
             usual_distance=seen.usual_distance,
             miscalibration=seen.miscalibration,
+            calibrated=state.frames if due else state.calibrated,
         )
         return pose, verdict, seen.points, replace(seen.found, inliers=kept), state
 

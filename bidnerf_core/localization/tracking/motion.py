@@ -60,7 +60,9 @@ class Motion:
     noise: Float[Tensor, "12 12"]  # covariance of pose and velocity
     bias: Float[Tensor, "6 6"]  # covariance of the pose's error that frames share
     reach: float  # metres: distance to what the camera sees, which scales translations
-    agility: float = 1.0  # factor on the acceleration: how briskly the camera has changed its velocity of late
+    agility: float = (
+        1.0  # factor on the acceleration: how briskly the camera has changed its velocity of late
+    )
 
     @staticmethod
     def at(pose: PoseEstimate, reach: float) -> Motion:

@@ -42,6 +42,7 @@ class TrackerState:
     age: int = 0  # frames since then
     usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
     miscalibration: Miscalibration = field(default_factory=Miscalibration.unknown)
+    calibrated: int | None = None  # the frame (of ``frames``) in which the intrinsics were last checked
     noise: float = 1.0  # pixels: of the points in the last image
     window: tuple[CloudInCamera, ...] = ()
 
@@ -59,6 +60,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
         "noise": state.noise, "window": len(state.window),
         "reach": None if state.motion is None else state.motion.reach,
         "agility": None if state.motion is None else state.motion.agility, "searchable": state.searchable,
+        "calibrated": state.calibrated,
     }  # fmt: skip
     tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
     tensors |= {
@@ -126,7 +128,8 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
         Clock(numbers["now"], numbers["interval"]), motion, numbers["frames"], numbers["lost"],
         numbers["searchable"], points,
         tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
-        float("inf") if usual is None else usual, miscalibration, numbers["noise"], window,
+        float("inf") if usual is None else usual, miscalibration, numbers["calibrated"], numbers["noise"],
+        window,
     )  # fmt: skip
 
 
