@@ -212,10 +212,9 @@ class Tracker:
         self, frame: Frame, image: Grey | None, measured: Measurement, predicted: Motion
     ) -> tuple[Localization, TrackerState]:
         """Fuse an accepted pose with the prediction, unless the camera moved in a way that no prediction could foresee."""
-        motion = replace(
-            predicted, reach=self._reach(frame, measured.state.points, measured.pose.T_world_camera)
-        )
-        motion = motion.updated(measured.pose)
+        motion = predicted.updated(measured.pose) if measured.motion is None else measured.motion
+        reach = self._reach(frame, measured.state.points, measured.pose.T_world_camera)
+        motion = replace(motion, reach=reach)
         state = replace(measured.state, motion=motion, lost=0, searchable=0)
         if self._by_landmarks is None:
             corners = self._odometry.replenished(frame, image, state.points, motion.T_world_camera)

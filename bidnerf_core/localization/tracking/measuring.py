@@ -70,7 +70,7 @@ class Measurement:
     verdict: Verdict
     loss: float
     state: TrackerState  # with the points and the window of this frame
-    steps: int = 0
+    motion: Motion | None = None  # fused with the prediction, where the verdict needed that already
 
 
 def followed(state: TrackerState, image: Grey | None, frame: Frame, predicted: SE3) -> FollowedPoints:
@@ -119,8 +119,9 @@ class ByLandmarks:
         if judged is None or found is None:
             return None
         measured = self._fused(frame, state, points[found.inliers], *judged)
-        covariance = predicted.updated(measured.pose).covariance
-        return replace(measured, verdict=precise(measured.verdict, covariance, judged[0].distance))
+        motion = predicted.updated(measured.pose)
+        verdict = precise(measured.verdict, motion.covariance, judged[0].distance)
+        return replace(measured, verdict=verdict, motion=motion)
 
     def _judged(
         self,

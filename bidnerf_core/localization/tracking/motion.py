@@ -134,12 +134,14 @@ class Motion:
 
     def updated(self, measured: PoseEstimate) -> Motion:
         """Return the state after fusing it with a measured pose, or at that pose alone if no prediction could foresee it."""
-        if self.distance(measured) > UNFORESEEN:
+        off = update_between(self.T_world_camera, measured.T_world_camera)
+        spread = self.noise[:6, :6] + measured.noise
+        if float(off @ torch.linalg.solve(spread, off)) > UNFORESEEN:
             return Motion.at(measured, self.reach)
-        return replace(self.corrected(measured), agility=self._observed_agility(measured))
+        return replace(self.corrected(measured), agility=self._observed_agility(off[:3], spread[:3, :3]))
 
-    def _observed_agility(self, measured: PoseEstimate) -> float:
-        """Return the agility after a measured pose, adapted until the predicted accelerations match (Mehra 1970).
+    def _observed_agility(self, off: Float[Tensor, "3"], spread: Float[Tensor, "3 3"]) -> float:
+        """Return the agility after a position that was ``off`` the prediction, of covariance ``spread`` (Mehra 1970).
 
         A velocity that is not known yet says nothing about it. Turns are left out: they change more abruptly than the way
         that somebody walks, and what is measured determines them well.
@@ -147,8 +149,6 @@ class Motion:
         velocity = float(self.noise.diagonal()[6:9].mean()) / (self.reach * SPEED) ** 2
         if velocity > KNOWN:
             return self.agility
-        off = update_between(self.T_world_camera, measured.T_world_camera)[:3]
-        spread = (self.noise[:6, :6] + measured.noise)[:3, :3]
         ratio = min(MOST_SURPRISE, float(off @ torch.linalg.solve(spread, off)) / 3)
         return min(1.0, max(LEAST_AGILITY, self.agility * math.sqrt(1 - ADAPTED + ADAPTED * ratio)))
 
@@ -168,12 +168,6 @@ class Motion:
         return replace(
             self, T_world_camera=T_world_camera, velocity=step / seconds, noise=_symmetric(noise), bias=bias
         )
-
-    def distance(self, measured: PoseEstimate) -> float:
-        """Return the squared Mahalanobis distance of a measured pose from this one; 6 on average."""
-        off = update_between(self.T_world_camera, measured.T_world_camera)
-        spread = self.noise[:6, :6] + measured.noise
-        return float(off @ torch.linalg.solve(spread, off))
 
     def _acceleration_noise(self, seconds: float) -> Float[Tensor, "12 12"]:
         seconds = max(abs(seconds), LEAST_SECONDS)
