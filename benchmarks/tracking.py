@@ -166,6 +166,13 @@ def noisy_depth(frames: Frames) -> Run:
     return Run(changed(frames, range(len(frames)), noisy).frames)
 
 
+def without_depth_frames(run: Run) -> Run:
+    """Return the frames with colours alone."""
+    kept = [number for number, timed in enumerate(run.frames) if timed.frame.has_colour]
+    blind = [place for place, number in enumerate(kept) if number in run.blind]
+    return Run([run.frames[number] for number in kept], range(blind[0], blind[-1] + 1) if blind else range(0))
+
+
 def changed(frames: Frames, part: range, change: Callable[[Frame], Frame]) -> Run:
     return Run([replace(f, frame=change(f.frame)) if i in part else f for i, f in enumerate(frames)], part)
 
@@ -310,7 +317,7 @@ def plan(localizer: Localizer, quick: bool) -> list[tuple[str, Callable[[Frames]
 
 
 def sequence(stored: Map, path: Path, given: argparse.Namespace, store: RowStore) -> dict[str, Any]:
-    frames, localizer = read(path), Localizer(stored)
+    frames, localizer = read(path)[: given.first], Localizer(stored)
     if given.tuning_frames:
         frames = [frame for frame in frames if frame.split == "train"]
     found: dict[str, Any] = {}
@@ -318,7 +325,9 @@ def sequence(stored: Map, path: Path, given: argparse.Namespace, store: RowStore
         if given.only and not any(word in name for word in given.only):
             continue
         run = change(frames)
-        key = [path.name, stored.info.weights, str(stored.info.landmarks), name, given.tuning_frames]
+        if not depth:  # frames of depth alone would then show nothing
+            run = without_depth_frames(run)
+        key = [path.name, stored.info.weights, name, len(run.frames), given.tuning_frames]
         rows = store.get(key, lambda run=run, make=make, depth=depth: tracked(run, make(), depth))
         found[name] = summary(rows, run.blind)
         held_out = [row for row in rows if row["split"] not in (None, "train")]
@@ -365,6 +374,7 @@ def main() -> None:
     parser.add_argument(
         "--quick", action="store_true", help="leave out auto on each frame, which takes longest"
     )
+    parser.add_argument("--first", type=int, help="the first frames of each sequence alone")
     parser.add_argument("--only", nargs="*", default=(), help="runs whose names contain one of these")
     given = parser.parse_args()
     torch.set_num_threads(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time as clocks
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -26,6 +27,7 @@ from bidnerf_core.cli.following import STDIN, requests
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.cli.tracked_path import TrackedPath, check_out
+from bidnerf_core.cli.tracking_video import TrackingVideo, check_video
 from bidnerf_core.datasets import open_sequence
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.errors import InputError
@@ -58,6 +60,10 @@ def run(arguments: list[str]) -> None:
             Path | None,
             option("PNG", "draw the path over the map's surface, coloured by its uncertainty", ""),
         ] = None,
+        video: Annotated[
+            Path | None,
+            option("MP4", "draw each image beside the map as rendered from its pose; takes far longer", ""),
+        ] = None,
         camera: CameraFile = None,
         focal: FocalLength = None,
         hfov: FieldOfView = None,
@@ -88,18 +94,22 @@ def run(arguments: list[str]) -> None:
             check_out(out)
         if plot is not None:
             require_matplotlib()
+        if video is not None:
+            check_video(video)
         given = GivenCamera(camera, focal, hfov)
         begin = None if start is None else read_pose(start)
         stored = load_map(map)
         path = TrackedPath(stored.info.backend)
         tracker = Tracker(Localizer(stored), config, begin)
-        step = _Step(tracker, path, depth)
+        drawn = nullcontext() if video is None else TrackingVideo(video, stored)
         began = clocks.perf_counter()
         try:
-            if follow:
-                _follow(str(sequence), step, given, stored.bounds.background)
-            else:
-                _track(sequence, step, given, every, stored.bounds.background)
+            with drawn as drawing:
+                step = _Step(tracker, path, depth, drawing)
+                if follow:
+                    _follow(str(sequence), step, given, stored.bounds.background)
+                else:
+                    _track(sequence, step, given, every, stored.bounds.background)
         finally:  # Ctrl-C included: what there is, is written whole
             seconds = clocks.perf_counter() - began
             if out is not None and path.frames:
@@ -115,13 +125,15 @@ def run(arguments: list[str]) -> None:
 class _Step:
     """Tracks a frame, keeps the answer, and says when the tracker is lost and when it has found its way again."""
 
-    def __init__(self, tracker: Tracker, path: TrackedPath, depth: bool) -> None:
-        self.tracker, self.path, self._depth = tracker, path, depth
+    def __init__(self, tracker: Tracker, path: TrackedPath, depth: bool, video: TrackingVideo | None) -> None:
+        self.tracker, self.path, self._depth, self._video = tracker, path, depth, video
         self._lost_at: int | None = None
 
     def __call__(self, frame: Frame, time: float | None, truth: SE3 | None = None) -> Localization:
         found = self.tracker(frame if self._depth else replace(frame, depth=None), time)
         self.path.add(frame, time, found, truth)
+        if self._video is not None:
+            self._video.add(frame, time, found)
         number = len(self.path.frames)
         if not found.converged and self._lost_at is None:
             self._lost_at = number

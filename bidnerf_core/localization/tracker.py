@@ -13,6 +13,7 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.localization.auto import AutoConfig
 from bidnerf_core.localization.localizer import Localizer, Start, start_pose
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.tracking.answers import METHOD, tracked_localization, unknown
 from bidnerf_core.localization.tracking.clock import Clock
 from bidnerf_core.localization.tracking.detection import LandmarkDetector
 from bidnerf_core.localization.tracking.flow import Grey
@@ -37,8 +38,6 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.features import Sift, grey_image
 from bidnerf_core.se3 import SE3
 
-METHOD = "track"
-"""The method that poses of a tracker name."""
 START = 0.03, 0.1
 """Standard deviations of a start whose uncertainty is not given: shares of the scene's extent, and radians."""
 VELOCITY_KEPT = 0.6
@@ -117,13 +116,16 @@ class Tracker:
         if self._start is not None and state.frames == 1:
             motion = self._at_start(frame, self._start)
             answer, state = self._continued(frame, image, state, motion, 0.0)
-            if answer.converged:
+            if answer.converged or image is None:
                 return answer, state
+        if image is None:  # a shape alone fits in many places of a building
+            return unknown(self._start, self._extent), replace(state, lost=state.lost + 1)
         found = relocalized(
             self.localizer, frame, self._start, state.searchable, self.config.patience, seed=state.frames
         )
         if found is None or not found.converged:
-            return self._unknown(found), replace(state, lost=state.lost + 1, searchable=state.searchable + 1)
+            answer = unknown(self._start, self._extent) if found is None else replace(found, method=METHOD)
+            return answer, replace(state, lost=state.lost + 1, searchable=state.searchable + 1)
         return self._found(frame, image, state, found)
 
     def _at_start(self, frame: Frame, start: SE3) -> Motion:
@@ -158,7 +160,7 @@ class Tracker:
         reason = (
             f"lost for {state.lost} frame{'s' if state.lost > 1 else ''}, bridged by {how}: {verdict.reason}"
         )
-        return _localization(predicted, Verdict(verdict.outcome, reason), predicted, 1.0), state
+        return tracked_localization(predicted, Verdict(verdict.outcome, reason), predicted, 1.0), state
 
     def _by_shape(
         self, surface: SurfaceMap, frame: Frame, state: TrackerState, predicted: Motion
@@ -171,11 +173,11 @@ class Tracker:
         if not found.verdict.accepted:
             verdict = replace(found.verdict, reason=f"not corrected by shape: {found.verdict.reason}")
             state = replace(state, motion=predicted, lost=state.lost + 1)
-            return _localization(predicted, verdict, predicted, found.loss), state
+            return tracked_localization(predicted, verdict, predicted, found.loss), state
         motion = predicted.refined(found.pose)
         verdict = precise(found.verdict, motion.covariance, self._reach(frame))
         state = replace(state, motion=motion, lost=0 if verdict.accepted else state.lost + 1)
-        return _localization(motion, verdict, predicted, found.loss), state
+        return tracked_localization(motion, verdict, predicted, found.loss), state
 
     def _by_odometry(
         self, frame: Frame, points: FollowedPoints, motion: Motion, predicted: Motion, seconds: float
@@ -219,7 +221,7 @@ class Tracker:
         if self._by_landmarks is None:
             corners = self._odometry.replenished(frame, image, state.points, motion.T_world_camera)
             state = replace(state, points=corners)
-        return _localization(motion, measured.verdict, predicted, measured.loss), state
+        return tracked_localization(motion, measured.verdict, predicted, measured.loss), state
 
     def _found(
         self, frame: Frame, image: Grey | None, state: TrackerState, found: Localization
@@ -254,19 +256,8 @@ class Tracker:
             points=corners,
             window=(),
             lost=state.lost + 1,
-            searchable=state.searchable + 1,
+            searchable=state.searchable + (image is not None),
         )
-
-    def _unknown(self, found: Localization | None) -> Localization:
-        """Return the answer for a frame of which no pose is known, nor that of any frame before it."""
-        if found is not None:
-            return replace(found, method=METHOD)
-        T = SE3.identity() if self._start is None else self._start
-        covariance = torch.diag(torch.tensor([self._extent] * 3 + [torch.pi] * 3).double() ** 2)
-        return Localization(
-            T, Outcome.TOO_FEW_MATCHES, "the beginning of the sequence has not been recognised yet", 0, 0.0, 1.0,
-            METHOD, T[None], torch.zeros(0, dtype=torch.float64), covariance,
-        )  # fmt: skip
 
     @property
     def _extent(self) -> float:
@@ -294,20 +285,3 @@ class Tracker:
     def _key(self) -> str:
         info: Any = getattr(self.localizer.map, "info", None)
         return "" if info is None else str(info.weights)
-
-
-def _localization(motion: Motion, verdict: Verdict, predicted: Motion, loss: float) -> Localization:
-    """Return the state of the motion as the answer for a frame; its path leads from the prediction to the pose."""
-    T = motion.T_world_camera
-    return Localization(
-        T_world_camera=T,
-        outcome=verdict.outcome,
-        reason=verdict.reason,
-        steps=1,
-        seconds=0.0,
-        loss=loss,
-        method=METHOD,
-        poses=SE3.stack([predicted.T_world_camera, T]),
-        losses=torch.tensor([loss], dtype=torch.float64),
-        covariance=motion.covariance,
-    )

@@ -23,6 +23,9 @@ LEAST_TEXTURE = 1e-3
 BRIGHTNESS = 0.02
 """Relative change of an image's mean from which on its brightness is matched first: the flow assumes constant brightness."""
 
+PATCH, LEAST_CORRELATION = 4, 0.6
+"""Pixels from the middle to the border of the patches that are compared, and their least correlation."""
+
 Grey = UInt8[np.ndarray, "h w"]
 
 
@@ -50,6 +53,28 @@ def flow(
     returned = np.linalg.norm(back - start, axis=-1) <= RETURN
     found = inside & returned & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)
     return torch.from_numpy(there + FIRST_CENTRE).to(pixels), torch.from_numpy(found)
+
+
+def alike(
+    before: Grey, now: Grey, pixels: Float[Tensor, "m 2"], there: Float[Tensor, "m 2"]
+) -> Bool[Tensor, "m"]:
+    """Return which patches about ``pixels`` of one image resemble those about ``there`` in the next.
+
+    The flow follows patches of mere noise to wherever it began to search; these do not correlate.
+    """
+    one, two = (_patches(image, place) for image, place in ((before, pixels), (now, there)))
+    spread = np.sqrt((one**2).sum(-1) * (two**2).sum(-1)).clip(min=1e-6)
+    return torch.from_numpy((one * two).sum(-1) >= LEAST_CORRELATION * spread)
+
+
+def _patches(image: Grey, pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m p"]:
+    """Return the grey values about pixels, less their mean."""
+    steps = np.arange(-PATCH, PATCH + 1)
+    column, row = np.moveaxis(pixels.floor().long().numpy(), -1, 0)
+    rows = (row[:, None] + steps).clip(0, image.shape[0] - 1)
+    columns = (column[:, None] + steps).clip(0, image.shape[1] - 1)
+    found = image[rows[:, :, None], columns[:, None, :]].reshape(len(pixels), -1).astype(np.float32)
+    return found - found.mean(-1, keepdims=True)
 
 
 def corners(image: Grey, count: int, apart: float) -> Float[Tensor, "n 2"]:

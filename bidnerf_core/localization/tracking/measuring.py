@@ -37,9 +37,9 @@ from bidnerf_core.localization.tracking.detection import (
     landmark_pose,
     well_spread,
 )
-from bidnerf_core.localization.tracking.flow import Grey, flow
+from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
-from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
+from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose
 from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
@@ -83,6 +83,9 @@ def followed(state: TrackerState, image: Grey | None, frame: Frame, predicted: S
         again, found_again = flow(state.image, image, state.points.pixels, state.points.pixels)
         if int(found_again.sum()) > int(found.sum()):
             pixels, found = again, found_again
+    fresh = (state.points.landmark == FRESH) & found
+    if bool(fresh.any()):  # landmarks have proved that they can be recognised, corners have not
+        found[fresh.clone()] = alike(state.image, image, state.points.pixels[fresh], pixels[fresh])
     return replace(state.points, pixels=pixels)[found]
 
 
@@ -142,8 +145,9 @@ class ByLandmarks:
         left = judged[0].inliers
         few = left < max(ENOUGH_LANDMARKS, self.config.refresh_share * state.sought)
         pose, verdict = judged
-        together = torch.linalg.inv(predicted.covariance) + torch.linalg.inv(pose.full_covariance)
-        few |= not precise(verdict, torch.linalg.inv(together), pose.distance).accepted
+        if pose.position_deviation > LandmarkThresholds().precision * pose.distance:
+            fused = predicted.updated(self._estimate(pose))  # the prediction may make up for it
+            few |= not precise(verdict, fused.covariance, pose.distance).accepted
         return few or state.age >= self.config.refresh_frames or not verdict.accepted
 
     def _recognized(
@@ -189,10 +193,7 @@ class ByLandmarks:
         self, frame: Frame, state: TrackerState, kept: FollowedPoints, found: LandmarkPose, verdict: Verdict
     ) -> Measurement:
         state = replace(state, points=kept, noise=found.noise)
-        # Errors that the landmarks of an image have in common are those of the next image, too.
-        noise = (found.covariance - self.detector.landmarks.pose_covariance) / self.correlation
-        bias = found.full_covariance - noise
-        pose, surface = PoseEstimate(found.T_world_camera, noise, bias), self.map.surface
+        pose, surface = self._estimate(found), self.map.surface
         if not verdict.accepted or surface is None or not frame.has_depth:
             return Measurement(pose, verdict, found.noise, state)
         here = CloudInCamera(self._cloud(frame, found, state.frames), found.T_world_camera)
@@ -201,6 +202,11 @@ class ByLandmarks:
         kept_clouds = (*state.window, here)[-(self.config.window - 1) :] if self.config.window > 1 else ()
         verdict = replace(verdict, reason=f"{verdict.reason}, fused with depth")
         return Measurement(pose, verdict, found.noise, replace(state, window=kept_clouds))
+
+    def _estimate(self, found: LandmarkPose) -> PoseEstimate:
+        """Split a pose's covariance: errors that the landmarks of an image have in common are those of the next image, too."""
+        noise = (found.covariance - self.detector.landmarks.pose_covariance) / self.correlation
+        return PoseEstimate(found.T_world_camera, noise, found.full_covariance - noise)
 
     def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:
         generator = Generator().manual_seed(seed)
