@@ -2,9 +2,10 @@ r"""Track a sequence in a map: error, undetected losses, recovery from faults, c
 
     python benchmarks/tracking.py MAP:SEQUENCE [MAP:SEQUENCE ...] --name tracking
 
-Each sequence is tracked in the order of time, backwards, and with every 2nd and 4th frame; with depth and without; with a
-window of several frames on noisy depth; and with faults. Frames of splits other than the training's are summarised apart, too.
-Baselines get the same frames: method ``auto`` on each frame anew, and generalised ICP from its own last pose (small_gicp).
+Each sequence is tracked in the order of time; and its first 160 frames backwards, with every 2nd and 4th frame, with a
+window of several frames on noisy depth, and with faults; with depth and without. Frames of splits other than the training's are summarised apart, too.
+Baselines: method ``auto`` on every 6th frame anew, generalised ICP from its own last pose (small_gicp), and, where it is
+installed, Open3D's odometry. Frames of depth alone, which a LiDAR records between photos, are left out without depth.
 Settings were chosen on the training frames of tum_fr1_xyz alone (``--tuning-frames`` takes only those); nothing was chosen by
 other frames or sequences. One process of one thread; finished runs are kept, so that an interrupted benchmark goes on.
 """
@@ -17,6 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,8 @@ WRONG = 0.05, 5.0
 """An accepted pose with a larger error (metres, degrees) is an undetected loss."""
 RIGHT = 0.02, 1.0
 """A rejected pose with a smaller error counts as one that should have been accepted."""
+SHORT = 160
+"""The number of frames that all runs but those "in order" are shown."""
 FIRST = 40
 """The number of the frame at which faults begin."""
 
@@ -112,7 +116,7 @@ def half_covered(frames: Frames) -> Run:
 
 
 def carried(frames: Frames) -> Run:
-    """Leave out 100 frames without a trace in the time stamps."""
+    """Leave out up to 100 frames without a trace in the time stamps."""
     there = min(FIRST + 100, len(frames) - 20)
     before, after = frames[:FIRST], frames[there:]
     if before[-1].time is None or after[0].time is None or frames[FIRST].time is None:
@@ -232,6 +236,48 @@ class GicpFromLast:
         )  # fmt: skip
 
 
+class Open3dOdometry:
+    """Open3D's RGB-D odometry from frame to frame (Park et al. 2017), with ``auto`` at first, every 30 frames, and when it fails."""
+
+    EVERY = 30
+
+    def __init__(self, localizer: Localizer) -> None:
+        import open3d
+
+        self._o3d, self._localizer = open3d, localizer
+        self._last: tuple[Any, SE3] | None = None
+        self._age = 0
+
+    def __call__(self, frame: Frame, time: float | None) -> Localization:
+        image = self._image(frame)
+        T = None if self._last is None or self._age >= self.EVERY else self._moved(frame, image, *self._last)
+        if T is None:
+            found = self._localizer(frame)
+            self._age, self._last = 0, (image, found.T_world_camera) if found.converged else None
+            return found
+        self._age, self._last = self._age + 1, (image, T)
+        return Localization(T, Outcome.CONVERGED, "", 1, 0.0, 0.0, "odometry", T[None], torch.zeros(1))
+
+    def _moved(self, frame: Frame, image: Any, before: Any, T_world_before: SE3) -> SE3 | None:
+        o3d, camera = self._o3d, frame.intrinsics
+        pinhole = o3d.camera.PinholeCameraIntrinsic(
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5
+        )
+        done, T_before_now, _ = o3d.pipelines.odometry.compute_rgbd_odometry(
+            image, before, pinhole, torch.eye(4, dtype=torch.float64).numpy(),
+            o3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm(),
+        )  # fmt: skip
+        return T_world_before @ SE3.from_matrix(torch.tensor(T_before_now).double()) if done else None
+
+    def _image(self, frame: Frame) -> Any:
+        geometry, depth = self._o3d.geometry, frame.depth
+        assert depth is not None
+        rgb = (255 * frame.rgb).round().byte().contiguous().numpy()
+        return geometry.RGBDImage.create_from_color_and_depth(
+            geometry.Image(rgb), geometry.Image(depth.float().contiguous().numpy()), 1.0, 10.0
+        )
+
+
 def tracked(
     run: Run, step: Callable[[Frame, float | None], Localization], depth: bool
 ) -> list[dict[str, Any]]:
@@ -306,8 +352,11 @@ def plan(localizer: Localizer, quick: bool) -> list[tuple[str, Callable[[Frames]
         runs += [(f"{kind}, {name}", order, depth, track) for name, order in ORDERS.items()]
         runs += [(f"{kind}, {name}", fault, depth, track) for name, fault in FAULTS.items()]
         if not quick:
-            runs.append((f"{kind}, auto on each frame", whole, depth, partial(EachAnew, localizer)))
+            runs.append((f"{kind}, auto on every 6th", thinned(6), depth, partial(EachAnew, localizer)))
     runs.append(("RGB-D, GICP from the last pose", whole, True, partial(GicpFromLast, localizer)))
+    if find_spec("open3d") is not None:
+        name = "RGB-D, Open3D's odometry with relocalization"
+        runs.append((name, whole, True, partial(Open3dOdometry, localizer)))
     for size in WINDOWS:
         config = TrackerConfig(window=size)
         runs.append(
@@ -324,7 +373,7 @@ def sequence(stored: Map, path: Path, given: argparse.Namespace, store: RowStore
     for name, change, depth, make in plan(localizer, given.quick):
         if given.only and not any(word in name for word in given.only):
             continue
-        run = change(frames)
+        run = change(frames if name.endswith("in order") else frames[:SHORT])
         if not depth:  # frames of depth alone would then show nothing
             run = without_depth_frames(run)
         key = [path.name, stored.info.weights, name, len(run.frames), given.tuning_frames]

@@ -196,3 +196,34 @@ def test_a_folder_that_is_not_there_is_refused(bidnerf: Run, tmp_path: Path) -> 
     status, _, err = bidnerf("track", "MAP", tmp_path / "none", "--follow", "--hfov", 60)
     assert status == 1
     assert "no such folder" in err
+
+
+# The video.
+
+
+def test_a_video_shows_each_frame_beside_the_map(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    """The right half shows the map from the pose found, so it resembles the left half."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    words = ("track", "MAP", data, "--out", tmp_path / "path.txt", "--video", tmp_path / "path.mp4")
+    status, _, err = bidnerf(*words)
+    assert status == 0, err
+    assert {file.name for file in tmp_path.iterdir()} == {"path.mp4", "path.txt"}
+    reader = ffmpeg.read_frames(str(tmp_path / "path.mp4"))
+    width, height = next(reader)["size"]
+    pictures = [np.frombuffer(raw, np.uint8).reshape(height, width, 3) for raw in reader]
+    assert len(pictures) == FRAMES
+    first, lost = pictures[0].astype(float), pictures[3].astype(float)
+    left, right = (part[30:-10] for part in (first[:, : width // 2], first[:, width // 2 :]))
+    assert np.abs(left - right).mean() < 15
+    dark = lost[:, : width // 2][30:-10]
+    assert np.abs(dark - lost[:, width // 2 :][30:-10]).mean() > 40
+
+
+@pytest.mark.parametrize("name", ["path.gif", "nowhere/path.mp4"])
+def test_a_video_that_cannot_be_written_is_refused_before_any_work(
+    bidnerf: Run, data: Path, tmp_path: Path, name: str
+) -> None:
+    status, _, err = bidnerf("track", "MAP", data, "--out", tmp_path / "p.txt", "--video", tmp_path / name)
+    assert status == 1
+    assert name in err
+    assert not (tmp_path / "p.txt").exists()

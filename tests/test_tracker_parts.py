@@ -27,7 +27,16 @@ from bidnerf_core.localization.tracking.odometry import LEAST_CORNERS, Odometry
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping.features import grey_image
-from flights import INTERVAL, assert_right, flight, flight_pose, localizer, tracked, without_depth
+from flights import (
+    INTERVAL,
+    assert_honest,
+    assert_right,
+    flight,
+    flight_pose,
+    localizer,
+    tracked,
+    without_depth,
+)
 from textured_field import textured_map
 
 NEAR = torch.tensor([0.01, -0.01, 0.01, 0.01, 0.01, -0.02], dtype=torch.float64)
@@ -56,16 +65,37 @@ def test_an_image_without_depth_is_tracked_by_colour_in_a_map_without_landmarks(
     assert float(pose_error(answers[0].T_world_camera, flight_pose(0)).translation) < 0.01
 
 
-def test_frames_without_colours_are_bridged() -> None:
-    """Shape alone fits a corridor anywhere along it, so it confirms no pose; the next photo does."""
-    frames = flight()[:6]
-    frames = [(t, depth_only(f) if n in (3, 4) else f, T) for n, (t, f, T) in enumerate(frames)]
-    answers = tracked(frames, Tracker(localizer()))
-    assert_right(answers[:3] + answers[5:], frames[:3] + frames[5:])
-    for answer, (_, _, truth) in zip(answers[3:5], frames[3:5], strict=True):
-        assert answer.outcome is Outcome.UNDETERMINED
-        assert "no colours" in answer.reason
-        assert float(pose_error(answer.T_world_camera, truth).translation) < 0.1
+def test_frames_without_colours_are_corrected_by_their_depth() -> None:
+    """Each is better than its prediction, and an accepted one is right."""
+    frames = [(t, depth_only(f) if n % 3 else f, T) for n, (t, f, T) in enumerate(flight()[:10])]
+    tracker = Tracker(localizer())
+    answers = tracked(frames, tracker)
+    photos, between = slice(0, None, 3), [n for n in range(10) if n % 3]
+    assert_right(answers[photos], frames[photos])
+    assert_honest(answers, frames)
+    for n in between:
+        before, after = (float(pose_error(T, frames[n][2]).translation) for T in answers[n].poses)
+        assert after < max(0.03, 0.7 * before), frames[n][1].name
+        assert "measured points lie on the surface" in answers[n].reason
+    assert sum(answers[n].converged for n in between[2:]) >= 2
+
+
+def test_a_plane_without_colours_corrects_nothing() -> None:
+    """It would fit every wall."""
+    frames = flight()[:4]
+    time, frame, truth = frames[3]
+    wall = replace(depth_only(frame), depth=torch.full_like(frame.rgb[..., 0], 1.4))
+    frames[3] = (time, wall, truth)
+    answer = tracked(frames, Tracker(localizer()))[3]
+    assert not answer.converged
+    assert torch.equal(answer.poses.translation[0], answer.poses.translation[1])
+
+
+def test_no_sequence_begins_with_a_shape_alone() -> None:
+    tracker = Tracker(localizer())
+    answers = tracked([(t, depth_only(f), T) for t, f, T in flight()[:2]], tracker)
+    assert [answer.outcome for answer in answers] == [Outcome.TOO_FEW_MATCHES] * 2
+    assert_right(tracked(flight()[2:3], tracker), flight()[2:3])
 
 
 def test_a_frame_without_colours_and_depth_is_reported() -> None:

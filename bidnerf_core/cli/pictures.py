@@ -11,9 +11,9 @@ from torch import Tensor
 from bidnerf_core.evaluation.figures import blend, overlay, tile
 from bidnerf_core.frames import Frame
 from bidnerf_core.images import reduced
+from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.rendering import render_image
 from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import Map
 
 PICTURE_SIDE = 240
 """Pixels of the longer side; larger photos are reduced, since rendering takes time for each pixel."""
@@ -22,7 +22,7 @@ PICTURE_SIDE = 240
 class Painter:
     """Draws overlays of one photo with renderings of a map."""
 
-    def __init__(self, map: Map, frame: Frame) -> None:
+    def __init__(self, map: SceneMap, frame: Frame) -> None:
         scale = PICTURE_SIDE / max(frame.intrinsics.width, frame.intrinsics.height)
         self._map = map
         self._camera = frame.intrinsics if scale >= 1 else frame.intrinsics.scaled(scale)

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from PIL import Image
 from torch import Tensor
 
+from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.figures import tile
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import Localization
-from bidnerf_core.rendering import render_image
-from bidnerf_core.storage import Map
+from bidnerf_core.localization.problem import SceneMap
 
-PANEL_HEIGHT = 240
-"""Pixels; the width follows from the first image."""
-RENDERED_SIDE = 160
-"""Largest side (pixels) of a rendered image before it is enlarged: rendering takes longer than tracking."""
-STRIP = 6
-"""Pixels of the strip below the images, whose colour says whether the pose was accepted."""
-ACCEPTED, LOST = (0.0, 0.62, 0.45), (0.84, 0.37, 0.0)
+WRITTEN_SUFFIXES = (".mp4", ".mkv", ".webm")
 RATES = 1.0, 60.0
-"""Least and largest number of frames a second; without time stamps it is ``USUAL_RATE``."""
+"""Least and largest number of frames a second."""
 USUAL_RATE = 30.0
+"""Frames a second of sequences without time stamps."""
 DEEPEST = 5.0
 """Metres of depth that are drawn white, where only depth was recorded."""
 
@@ -40,21 +36,19 @@ def check_video(file: Path) -> None:
         raise InputError(
             f"{file}: writing a video needs the extra 'video' (pip install 'bidnerf[video]')"
         ) from error
-    if file.suffix.lower() not in (".mp4", ".mkv", ".webm") or not file.parent.is_dir():
-        raise InputError(
-            f"{file}: expected a name that ends with .mp4, .mkv or .webm in a folder that exists"
-        )
+    if file.suffix.lower() not in WRITTEN_SUFFIXES or not file.parent.is_dir():
+        endings = ", ".join(WRITTEN_SUFFIXES)
+        raise InputError(f"{file}: expected a name that ends with {endings}, in a folder that exists")
 
 
 class TrackingVideo:
-    """Writes a frame of the video for each frame that is tracked; whole or not at all."""
+    """Writes a picture for each frame that is tracked, at the rate of the first two."""
 
-    def __init__(self, file: Path, scene: Map) -> None:
+    def __init__(self, file: Path, scene: SceneMap) -> None:
         self._file, self._scene = file, scene
         self._partial = file.with_name(f".{file.stem}.partial{file.suffix}")
-        self._writer: Generator[None, bytes, None] | None = None
-        self._size: tuple[int, int] | None = None
-        self._waiting: tuple[bytes, float | None] | None = None
+        self._writer: Generator[None, bytes | None, None] | None = None
+        self._first: tuple[UInt8[np.ndarray, "h w 3"], float | None] | None = None
 
     def __enter__(self) -> TrackingVideo:
         return self
@@ -62,59 +56,58 @@ class TrackingVideo:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._waiting is not None:
-            self._begin(USUAL_RATE)
+        """Finish the file, which takes its name only then."""
+        if self._writer is None and self._first is not None:
+            self._writer = self._opened(self._first[0], USUAL_RATE)
         if self._writer is not None:
             self._writer.close()
-            os.replace(self._partial, self._file)
+            self._partial.replace(self._file)
 
     def add(self, frame: Frame, time: float | None, found: Localization) -> None:
-        """Draw a frame; the rate is that of the first two."""
-        if self._size is None:
-            camera = frame.intrinsics
-            self._size = (PANEL_HEIGHT, 2 * round(PANEL_HEIGHT * camera.width / camera.height / 2))
-        picture = self._drawn(frame, found, self._size)
-        if self._writer is not None:
-            self._writer.send(picture)
-        elif self._waiting is None:
-            self._waiting = picture, time
-        else:
-            before = self._waiting[1]
-            apart = None if time is None or before is None else abs(time - before)
-            self._begin(min(RATES[1], max(RATES[0], 1 / apart)) if apart else USUAL_RATE)
-            assert self._writer is not None
-            self._writer.send(picture)
+        """Draw a frame."""
+        picture = self._drawn(frame, found)
+        if self._first is None:
+            self._first = picture, time
+            return
+        first, began = self._first
+        if self._writer is None:
+            apart = 0.0 if time is None or began is None else abs(time - began)
+            rate = min(RATES[1], max(RATES[0], 1 / apart)) if apart else USUAL_RATE
+            self._writer = self._opened(first, rate)
+        if picture.shape != first.shape:
+            size = (first.shape[1], first.shape[0])
+            picture = np.asarray(Image.fromarray(picture).resize(size))
+        self._writer.send(picture.tobytes())
 
-    def _begin(self, rate: float) -> None:
+    def _opened(self, first: UInt8[np.ndarray, "h w 3"], rate: float) -> Generator[None, bytes | None, None]:
         from imageio_ffmpeg import write_frames
 
-        assert self._size is not None
-        assert self._waiting is not None
-        height, width = self._size
-        self._writer = write_frames(
-            str(self._partial), (2 * width, height + STRIP), fps=rate, macro_block_size=2, quality=7
+        size = (first.shape[1], first.shape[0])
+        writer: Generator[None, bytes | None, None] = write_frames(
+            str(self._partial), size, fps=rate, macro_block_size=2, quality=7
         )
-        self._writer.send(None)
-        self._writer.send(self._waiting[0])
-        self._waiting = None
+        writer.send(None)
+        writer.send(first.tobytes())
+        return writer
 
-    def _drawn(self, frame: Frame, found: Localization, size: tuple[int, int]) -> bytes:
-        camera = frame.intrinsics
-        small = camera.scaled(min(1.0, RENDERED_SIDE / max(camera.width, camera.height)))
-        rendered = render_image(self._scene.field, small, found.T_world_camera, self._scene.bounds).rgb
-        panels = torch.cat([_resized(_observed(frame), size), _resized(rendered, size)], dim=1)
-        strip = torch.tensor(ACCEPTED if found.converged else LOST).expand(STRIP, panels.shape[1], 3)
-        picture = (255 * torch.cat([panels, strip]).clamp(0, 1)).round().byte()
-        return bytes(picture.contiguous().numpy().tobytes())
+    def _drawn(self, frame: Frame, found: Localization) -> UInt8[np.ndarray, "h w 3"]:
+        painter = Painter(self._scene, frame)
+        caption = "rendered at the pose found" if found.converged else f"not accepted: {found.outcome}"
+        tiles = (
+            tile(_observed(frame, painter.observed), f"observed: {frame.name}"),
+            tile(painter.rendered(found.T_world_camera), caption),
+        )
+        picture = np.concatenate(tiles, axis=1)
+        return np.ascontiguousarray(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
 
 
-def _observed(frame: Frame) -> Float[Tensor, "h w 3"]:
+def _observed(frame: Frame, reduced: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     """Return a frame's colours, or its depth in grey where no colours were recorded."""
     if frame.has_colour or frame.depth is None:
-        return frame.rgb.cpu()
-    return (frame.depth.cpu() / DEEPEST).clamp(0, 1)[..., None].expand(-1, -1, 3)
-
-
-def _resized(image: Float[Tensor, "h w 3"], size: tuple[int, int]) -> Float[Tensor, "ph pw 3"]:
-    planes = image.float().permute(2, 0, 1)[None]
-    return F.interpolate(planes, size=size, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
+        return reduced
+    grey = (frame.depth.cpu() / DEEPEST).clamp(0, 1)
+    rows, columns = (
+        torch.linspace(0, old - 1, new).round().long()
+        for old, new in zip(grey.shape, reduced.shape[:2], strict=True)
+    )
+    return grey[rows][:, columns][..., None].expand(-1, -1, 3)

@@ -56,8 +56,11 @@ CALIBRATED = 30
 """The number of frames after which recognised landmarks check the given intrinsics again."""
 SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
-FORESEEN = 25.0
-"""Largest squared Mahalanobis distance between a prediction and an accepted pose by shape alone."""
+VAGUE = 0.35
+"""Largest uncertainty of a prediction that shape alone corrects, as a share of the distance to what is seen."""
+TOO_VAGUE = Verdict(
+    Outcome.UNDETERMINED, "no colours were recorded, and the prediction is too uncertain for the shape"
+)
 DETERMINED = 0.02, math.radians(3)
 """Largest standard deviation of an accepted pose by depth or colour: shares of the scene's extent, and radians."""
 
@@ -252,16 +255,10 @@ def by_shape(
     prediction = PoseEstimate(predicted.T_world_camera, predicted.noise[:6, :6], predicted.bias)
     translation, rotation = prediction.covariance.diagonal().split(3)
     off = math.sqrt(float(translation.mean() + rotation.mean() * predicted.reach**2))
+    if off > VAGUE * predicted.reach:
+        return Measurement(prediction, TOO_VAGUE, 1.0, state)
     found = fit_shape(surface, cloud, prediction, off)
-    loss = 1 - found.diagnostics.on_surface
-    rejected = found.diagnostics.rejection()
-    if rejected is None and found.surprise > FORESEEN:
-        rejected = Verdict(
-            Outcome.AMBIGUOUS, "the measured shape fits a place that the motion does not lead to"
-        )
-    share = f"{found.diagnostics.on_surface:.0%} of the measured points lie on the surface"
-    of = "" if found.determined == 6 else f", which determines {found.determined} of 6 directions"
-    return Measurement(found.pose, rejected or Verdict(Outcome.CONVERGED, share + of), loss, state)
+    return Measurement(found.pose, found.verdict(), 1 - found.diagnostics.on_surface, state)
 
 
 def by_colour(

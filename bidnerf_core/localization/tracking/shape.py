@@ -17,6 +17,7 @@ from torch import Tensor
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE
+from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.by_points import JUDGED
 from bidnerf_core.localization.tracking.alignment import ALIGNED_STEP, DEPTH_MEASUREMENTS, SURFACE_BIAS
 from bidnerf_core.localization.tracking.motion import PoseEstimate
@@ -28,6 +29,10 @@ WEAK = 0.1
 """Share of the mean information of the three best directions below which a direction is left to the prediction."""
 SHAPE_STEPS = 8
 """Largest number of steps at each scale."""
+PLANE = 3
+"""The number of directions that a plane determines."""
+FORESEEN = 25.0
+"""Largest squared Mahalanobis distance between a prediction and an accepted pose."""
 JUDGED_CELLS = 4.0
 """Largest scale of distances at which the fit is judged, in cells of the surface's grid. In a large scene, a share of its
 extent would accept points that are far off the surface.
@@ -42,6 +47,20 @@ class ShapeFit:
     diagnostics: SurfaceDiagnostics
     surprise: float  # squared Mahalanobis distance of the pose from the prediction
     determined: int  # number of directions that the shape determines, of six
+
+    def verdict(self) -> Verdict:
+        """Judge the fit; whether the position is certain enough is judged apart."""
+        rejected = self.diagnostics.rejection()
+        if rejected is not None:
+            return rejected
+        if self.determined <= PLANE:
+            return Verdict(Outcome.UNDETERMINED, "all that was measured is a plane, which fits every wall")
+        if self.surprise > FORESEEN:
+            why = "the measured shape fits a place that the motion does not lead to"
+            return Verdict(Outcome.AMBIGUOUS, why)
+        share = f"{self.diagnostics.on_surface:.0%} of the measured points lie on the surface"
+        of = "" if self.determined == 6 else f", which determines {self.determined} of 6 directions"
+        return Verdict(Outcome.CONVERGED, share + of)
 
 
 def fit_shape(surface: SurfaceMap, cloud: PointCloud, predicted: PoseEstimate, spread: float) -> ShapeFit:
