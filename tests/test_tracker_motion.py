@@ -139,3 +139,37 @@ def test_maps_of_single_poses_equal_those_of_batches(angle: float) -> None:
     moved = retracted(T, tangent)
     assert torch.allclose(moved.matrix(), T.retract(tangent).matrix(), atol=1e-12)
     assert torch.allclose(update_between(T, moved), tangent, atol=1e-9)
+
+
+def smooth(seconds: float, jerk: float = 0.0) -> PoseEstimate:
+    return measured(path(seconds).retract(torch.tensor([jerk, 0, 0, 0, 0, 0], dtype=torch.float64)))
+
+
+def test_a_camera_that_keeps_its_velocity_is_predicted_ever_more_certainly() -> None:
+    """The accelerations that the filter expects follow those that it sees, up and down."""
+    motion, sizes = Motion.at(smooth(0.0), 1.0), []
+    for number in range(1, 20):
+        predicted = motion.predicted(0.1)
+        sizes.append(float(predicted.noise.diagonal()[:3].sum()))
+        motion = predicted.updated(smooth(0.1 * number))
+    assert sizes[-1] < 0.2 * sizes[3]
+    calm = motion.agility
+    for number, jerk in enumerate((0.01, -0.012, 0.01, -0.01, 0.012), 20):
+        motion = motion.predicted(0.1).updated(smooth(0.1 * number, jerk))
+    assert motion.agility > 1.5 * calm
+
+
+def test_a_velocity_that_is_not_known_says_nothing_about_accelerations() -> None:
+    motion = Motion.at(smooth(0.0), 1.0).predicted(0.1).updated(smooth(0.1))
+    assert motion.agility == 1.0
+
+
+def test_a_pose_that_is_fused_already_corrects_the_velocity_as_the_measurement_would() -> None:
+    """Fusing by the filter is the oracle."""
+    start = Motion.at(measured(path(0.0)), 1.0).corrected(measured(path(0.0)))
+    predicted = start.predicted(0.1)
+    direct = predicted.corrected(measured(path(0.1)))
+    pose = PoseEstimate(direct.T_world_camera, direct.noise[:6, :6], direct.bias)
+    again = predicted.refined(pose)
+    assert torch.allclose(again.velocity, direct.velocity, atol=1e-6)
+    assert torch.allclose(again.noise, direct.noise, atol=1e-8)

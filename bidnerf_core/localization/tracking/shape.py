@@ -29,8 +29,6 @@ WEAK = 0.1
 """Share of the mean information of the three best directions below which a direction is left to the prediction."""
 SHAPE_STEPS = 8
 """Largest number of steps at each scale."""
-PLANE = 3
-"""The number of directions that a plane determines."""
 FORESEEN = 25.0
 """Largest squared Mahalanobis distance between a prediction and an accepted pose."""
 JUDGED_CELLS = 4.0
@@ -53,8 +51,6 @@ class ShapeFit:
         rejected = self.diagnostics.rejection()
         if rejected is not None:
             return rejected
-        if self.determined <= PLANE:
-            return Verdict(Outcome.UNDETERMINED, "all that was measured is a plane, which fits every wall")
         if self.surprise > FORESEEN:
             why = "the measured shape fits a place that the motion does not lead to"
             return Verdict(Outcome.AMBIGUOUS, why)
