@@ -115,7 +115,7 @@ def test_flow_of_mere_noise_is_recognised() -> None:
 def test_shape_alone_does_not_correct_a_vague_prediction() -> None:
     """A wall would fit any other wall."""
     frames = [(t, depth_only(f) if n == 3 else f, T) for n, (t, f, T) in enumerate(flight()[:4])]
-    late = frames[:3] + [(frames[3][0] + 5.0, *frames[3][1:])]
+    late = [*frames[:3], (frames[3][0] + 5.0, *frames[3][1:])]
     answer = tracked(late, Tracker(localizer()))[3]
     assert answer.outcome is Outcome.UNDETERMINED
     assert "too uncertain" in answer.reason

@@ -87,8 +87,8 @@ def _descended(
         # The residuals at a prediction that is off say nothing of the noise, so it is estimated anew in each step.
         weight = DEPTH_MEASUREMENTS / max(float(cost.residual_variance(T[None])[0]), LEAST_VARIANCE)
         kept = _determined(here.hessian[0], cost.cloud)
-        hessian = weight * at_pivot.T @ kept @ here.hessian[0] @ kept @ at_pivot
-        gradient = weight * at_pivot.T @ kept @ here.gradient[0]
+        hessian = weight * at_pivot.T @ kept.T @ here.hessian[0] @ kept @ at_pivot
+        gradient = weight * at_pivot.T @ kept.T @ here.gradient[0]
         # The steps are so short that they add up; the prior pulls back by all of them.
         step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)
         T, moved = retracted(T, step), moved + step
