@@ -14,6 +14,7 @@ from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.localization.tracker import METHOD
 from flights import (
     FRAMES,
+    INTERVAL,
     assert_honest,
     assert_right,
     covered,
@@ -256,3 +257,32 @@ def test_a_window_reduces_the_error_of_noisy_depth(window: int) -> None:
         frames.append((t, replace(frame, depth=frame.depth * noise), T))
     answers = tracked(frames, Tracker(localizer(), TrackerConfig(window=window)))
     assert_right(answers, frames)
+
+
+def test_an_approximate_focal_length_is_estimated_once_and_kept() -> None:
+    """A given one that is wrong is reported instead."""
+    frames = flight()[:5]
+    off = replace(frames[0][1].intrinsics, fx=1.06 * 130, fy=1.06 * 130)
+    wrong = [(t, replace(f, depth=None, intrinsics=off), T) for t, f, T in frames]
+    known = [(t, replace(f, focal_is_approximate=True), T) for t, f, T in wrong]
+    answers = tracked(known)
+    assert_honest(answers, frames)
+    assert sum(answer.converged for answer in answers) >= 3
+    for answer in answers:
+        if answer.converged:
+            assert answer.focal_factor == pytest.approx(1 / 1.06, rel=0.02)
+    assert not any(answer.converged for answer in tracked(wrong)[:2])
+
+
+def test_the_state_does_not_grow(tmp_path: Path) -> None:
+    """Neither in memory nor as a file, however long the sequence."""
+    tracker, sizes = Tracker(localizer(), TrackerConfig(window=3)), []
+    to_and_fro = [flight()[n] for n in (*range(8), *range(6, 0, -1))]
+    for lap in range(3):
+        for place, (_, frame, _) in enumerate(to_and_fro):
+            tracker(frame, INTERVAL * (lap * len(to_and_fro) + place))
+        tracker.save(tmp_path / "state")
+        sizes.append((tmp_path / "state").stat().st_size)
+        assert len(tracker._state.window) <= 2
+        assert len(tracker._state.points) <= tracker.config.points
+    assert max(sizes) < 1.25 * min(sizes)

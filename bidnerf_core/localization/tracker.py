@@ -13,7 +13,12 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.localization.auto import AutoConfig
 from bidnerf_core.localization.localizer import Localizer, Start, start_pose
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.tracking.answers import METHOD, tracked_localization, unknown
+from bidnerf_core.localization.tracking.answers import (
+    METHOD,
+    tracked_localization,
+    unknown,
+    with_focal_factor,
+)
 from bidnerf_core.localization.tracking.clock import Clock
 from bidnerf_core.localization.tracking.detection import LandmarkDetector
 from bidnerf_core.localization.tracking.flow import Grey
@@ -92,6 +97,7 @@ class Tracker:
         clock, seconds = self._state.clock.step(time)
         image = grey_image(frame.rgb) if frame.has_colour else None
         state = replace(self._state, clock=clock, frames=self._state.frames + 1)
+        frame = with_focal_factor(frame, state.focal_factor)
         if state.motion is None:
             answer, state = self._begun(frame, image, state)
         else:
@@ -99,7 +105,7 @@ class Tracker:
         if image is not None:  # points are followed from the last image, even past frames without one
             state = replace(state, image=image)
         self._state = state
-        return replace(answer, seconds=clocks.perf_counter() - began)
+        return replace(answer, seconds=clocks.perf_counter() - began, focal_factor=self._state.focal_factor)
 
     def save(self, path: str | Path) -> None:
         """Write the tracker's state to a file, from which ``restore`` continues exactly here."""
@@ -232,7 +238,15 @@ class Tracker:
             covariance = self._at_start(frame, found.T_world_camera).covariance
         pose = PoseEstimate(found.T_world_camera, 0.5 * covariance, 0.5 * covariance)
         motion = Motion.at(pose, self._reach(frame))
-        state = replace(state, points=FollowedPoints.none(), window=(), motion=motion)
+        state = replace(
+            state,
+            points=FollowedPoints.none(),
+            window=(),
+            motion=motion,
+            focal_factor=state.focal_factor
+            * found.focal_factor,  # other than 1 for approximate focal lengths
+        )
+        frame = with_focal_factor(frame, found.focal_factor)
         measured = self._measured(frame, image, state, state.points, motion)
         if measured is not None and measured.verdict.accepted:
             state = measured.state

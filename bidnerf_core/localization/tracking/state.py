@@ -43,6 +43,7 @@ class TrackerState:
     usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
     miscalibration: Miscalibration = field(default_factory=Miscalibration.unknown)
     calibrated: int | None = None  # the frame (of ``frames``) in which the intrinsics were last checked
+    focal_factor: float = 1.0  # on approximate focal lengths
     noise: float = 1.0  # pixels: of the points in the last image
     window: tuple[CloudInCamera, ...] = ()
 
@@ -60,7 +61,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
         "noise": state.noise, "window": len(state.window),
         "reach": None if state.motion is None else state.motion.reach,
         "agility": None if state.motion is None else state.motion.agility, "searchable": state.searchable,
-        "calibrated": state.calibrated,
+        "calibrated": state.calibrated, "focal_factor": state.focal_factor,
     }  # fmt: skip
     tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
     tensors |= {
@@ -128,8 +129,8 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
         Clock(numbers["now"], numbers["interval"]), motion, numbers["frames"], numbers["lost"],
         numbers["searchable"], points,
         tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
-        float("inf") if usual is None else usual, miscalibration, numbers["calibrated"], numbers["noise"],
-        window,
+        float("inf") if usual is None else usual, miscalibration, numbers["calibrated"],
+        numbers["focal_factor"], numbers["noise"], window,
     )  # fmt: skip
 
 
