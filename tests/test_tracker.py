@@ -11,7 +11,7 @@ import torch
 
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
-from bidnerf_core.localization.tracker import METHOD
+from bidnerf_core.localization.tracking.answers import METHOD, with_focal_factor
 from flights import (
     FRAMES,
     INTERVAL,
@@ -259,19 +259,20 @@ def test_a_window_reduces_the_error_of_noisy_depth(window: int) -> None:
     assert_right(answers, frames)
 
 
-def test_an_approximate_focal_length_is_estimated_once_and_kept() -> None:
-    """A given one that is wrong is reported instead."""
-    frames = flight()[:5]
+def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
+    """It stands in the state, and corrects frames whose focal length is approximate; others are taken at their word."""
+    frames = flight()[:4]
     off = replace(frames[0][1].intrinsics, fx=1.06 * 130, fy=1.06 * 130)
-    wrong = [(t, replace(f, depth=None, intrinsics=off), T) for t, f, T in frames]
-    known = [(t, replace(f, focal_is_approximate=True), T) for t, f, T in wrong]
-    answers = tracked(known)
-    assert_honest(answers, frames)
-    assert sum(answer.converged for answer in answers) >= 3
-    for answer in answers:
-        if answer.converged:
-            assert answer.focal_factor == pytest.approx(1 / 1.06, rel=0.02)
-    assert not any(answer.converged for answer in tracked(wrong)[:2])
+    known = [
+        (t, replace(f, depth=None, intrinsics=off, focal_is_approximate=True), T) for t, f, T in frames
+    ]
+    tracker = Tracker(localizer())
+    tracker._state = replace(tracker._state, focal_factor=1 / 1.06)
+    answers = tracked(known, tracker)
+    assert_right(answers, known)
+    assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 1.06] * 4, rel=0.01)
+    exact = with_focal_factor(frames[0][1], 1 / 1.06)
+    assert exact.intrinsics == frames[0][1].intrinsics
 
 
 def test_the_state_does_not_grow(tmp_path: Path) -> None:
