@@ -263,9 +263,7 @@ def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
     """It stands in the state, and corrects frames whose focal length is approximate; others are taken at their word."""
     frames = flight()[:4]
     off = replace(frames[0][1].intrinsics, fx=1.06 * 130, fy=1.06 * 130)
-    known = [
-        (t, replace(f, depth=None, intrinsics=off, focal_is_approximate=True), T) for t, f, T in frames
-    ]
+    known = [(t, replace(f, depth=None, intrinsics=off, focal_is_approximate=True), T) for t, f, T in frames]
     tracker = Tracker(localizer())
     tracker._state = replace(tracker._state, focal_factor=1 / 1.06)
     answers = tracked(known, tracker)
