@@ -102,10 +102,10 @@ class Tracker:
             answer, state = self._begun(frame, image, state)
         else:
             answer, state = self._continued(frame, image, state, state.motion, seconds)
-        if image is not None:  # points are followed from the last image, even past frames without one
-            state = replace(state, image=image)
-        self._state = state
-        return replace(answer, seconds=clocks.perf_counter() - began, focal_factor=self._state.focal_factor)
+        # Points are followed from the last image, even past frames without one.
+        self._state = state = state if image is None else replace(state, image=image)
+        seconds = clocks.perf_counter() - began
+        return replace(answer, seconds=seconds, focal_factor=state.focal_factor)
 
     def save(self, path: str | Path) -> None:
         """Write the tracker's state to a file, from which ``restore`` continues exactly here."""
