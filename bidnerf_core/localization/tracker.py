@@ -104,8 +104,7 @@ class Tracker:
             answer, state = self._continued(frame, image, state, state.motion, seconds)
         # Points are followed from the last image, even past frames without one.
         self._state = state = state if image is None else replace(state, image=image)
-        seconds = clocks.perf_counter() - began
-        return replace(answer, seconds=seconds, focal_factor=state.focal_factor)
+        return replace(answer, seconds=clocks.perf_counter() - began, focal_factor=state.focal_factor)
 
     def save(self, path: str | Path) -> None:
         """Write the tracker's state to a file, from which ``restore`` continues exactly here."""
