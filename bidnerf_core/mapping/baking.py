@@ -14,7 +14,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
-from bidnerf_core.mapping.cell_size import chosen_grid, finest_cell, spacing
+from bidnerf_core.mapping.cell_size import chosen_grid, comparison_noise, finest_cell, spacing
 from bidnerf_core.mapping.posed_depth import (
     WITNESSES,
     PosedDepthImage,
@@ -74,7 +74,8 @@ def bake(
 def surface_of(images: Sequence[PosedDepthImage], bounds: SceneBounds, config: BakeConfig) -> SurfaceMap:
     """Return the surface that images with depth show, see ``bake``."""
     cell = max(finest_cell(images, config.opacity), VoxelGrid.filling(bounds, config.cells).cell)
-    points, rgb = _agreed_points(images, 2 * cell, config)
+    tolerance = 2 * max(cell, comparison_noise(images, config.opacity))
+    points, rgb = _agreed_points(images, tolerance, config)
     inside = VoxelGrid.covering(bounds, cell).contains(points)
     points, rgb = points[inside], rgb[inside]
     if not len(points):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
@@ -18,7 +18,11 @@ from bidnerf_core.mapping.surfel_index import MOST_CELLS, SIDE, block_levels, in
 from bidnerf_core.mapping.surfels import surfel_bytes
 from bidnerf_core.voxel_grid import VoxelGrid
 
-PER_CELL = 2.0
+PIXEL = 0.7
+"""Cell as a share of a pixel's footprint: pixels of several images lie between each other's and together resolve more."""
+LAYER = 2.0
+"""Least cell in standard deviations of depth: in finer ones, the points of one plane would make several layers of surfels."""
+PER_CELL = 1.5
 """Least mean number of points in the cells that hold any: with fewer, cells of the surface would be left empty by chance."""
 COMPARED_IMAGES, COMPARED_POINTS = 40, 400
 """Images, and points of each, from which the noise is estimated."""
@@ -31,8 +35,9 @@ COARSER = 2**0.25
 
 
 def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the least cell (metres) that the images are worth: a pixel's footprint, or their noise where that is more."""
-    return max(footprint(images, opacity), depth_noise(images, opacity))
+    """Return the least cell (metres) that the images are worth, by their resolution and by their noise."""
+    pixel = PIXEL * footprint(images, opacity)
+    return max(pixel, LAYER * depth_noise(images, opacity))
 
 
 def footprint(images: Sequence[PosedDepthImage], opacity: float) -> float:
@@ -50,11 +55,24 @@ def depth_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
 
     It contains errors of the poses. It is 0 where no two images show the same points.
     """
+    return _spread(images, opacity, lambda posed, points: posed.smoothly_beyond(points, opacity))
+
+
+def comparison_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
+    """Return ``depth_noise`` as ``agreed`` sees it: against the nearest pixels of images that were thinned out."""
+    return _spread(images, opacity, PosedDepthImage.beyond)
+
+
+def _spread(
+    images: Sequence[PosedDepthImage],
+    opacity: float,
+    beyond: Callable[[PosedDepthImage, Float[Tensor, "p 3"]], Float[Tensor, "p"]],
+) -> float:
     found = []
     for number in range(0, len(images), math.ceil(len(images) / COMPARED_IMAGES)):
         points = images[number].points(images[number].solid(opacity))
         points = points[:: max(1, len(points) // COMPARED_POINTS)]
-        found += [images[other].beyond(points) for other in witnesses(number, images)]
+        found += [beyond(images[other], points) for other in witnesses(number, images)]
     differences = torch.cat(found).abs() if found else torch.zeros(0)
     differences = differences[differences.isfinite()]
     if not len(differences):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.field import RadianceField, SceneBounds
@@ -58,6 +59,16 @@ class PosedDepthImage:
         # Without depth, a rendered image shows the background, and a measured one may show anything.
         behind = torch.where(nothing, torch.nan if self.measured else torch.inf, depth) - local[:, 2]
         return torch.where(within, behind, torch.nan)
+
+    def smoothly_beyond(self, points: Float[Tensor, "p 3"], opacity: float) -> Float[Tensor, "p"]:
+        """Return ``beyond`` with depth interpolated between pixels; NaN where one of the four shows no surface."""
+        local = self.T_world_camera.to(torch.float32).inverse().apply(points)
+        height, width = self.image.depth.shape
+        place = 2 * self.intrinsics.project(local) / local.new_tensor([width, height]) - 1
+        place = place.nan_to_num(2.0).clamp(-2, 2)[None, None]
+        channels = torch.stack([self.image.depth, self.solid(opacity).float()])[None]
+        depth, solid = grid_sample(channels, place, align_corners=False)[0, :, 0]
+        return torch.where(solid > 0.999, depth - local[:, 2], torch.nan)
 
 
 def mean_focal(intrinsics: Intrinsics) -> float:
