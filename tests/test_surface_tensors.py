@@ -91,4 +91,4 @@ def test_a_dense_index_of_an_older_version_gives_the_same_answers(generator: Gen
     stored = surface_from_tensors(surface_tensors(surface))
     assert torch.equal(stored.nearest(cell_centres(surface.grid)), nearest.long())
     with pytest.raises(ValueError, match="nearest has indices"):
-        surface_from_tensors(tensors | {"nearest": nearest - 1})
+        surface_from_tensors(tensors | {"nearest": -1 - nearest})

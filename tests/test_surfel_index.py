@@ -120,7 +120,7 @@ def test_memory_grows_with_the_surface_and_not_with_the_volume() -> None:
         sizes[cell] = index.bytes
     assert sizes[0.01] < 4.6 * sizes[0.02]
     assert sizes[0.01] < 4 * math.prod(VoxelGrid.covering(BOUNDS, 0.01).shape) / 3
-    assert block_levels(plane()[:1], VoxelGrid.covering(BOUNDS, 0.001)).eq(3).float().mean() > 0.99
+    assert block_levels(plane()[:1], VoxelGrid.covering(BOUNDS, 0.003)).eq(3).float().mean() > 0.99
 
 
 def test_blocks_near_surfels_are_resolved_to_cells(generator: Generator) -> None:
@@ -132,7 +132,7 @@ def test_blocks_near_surfels_are_resolved_to_cells(generator: Generator) -> None
     clear = torch.linalg.vector_norm(outside, dim=-1).amin(-1)
     shared = 2.0**levels * GRID.cell
     assert (clear[levels > 0] >= 2 * shared[levels > 0] - 1e-5).all()
-    assert (clear[levels < 3] <= 20 * GRID.cell).all()  # far away, cells do share
+    assert (clear[levels < 3] <= 24 * GRID.cell).all()  # far away, cells do share
 
 
 def test_what_cannot_be_indexed_is_refused() -> None:

@@ -28,6 +28,8 @@ COMPARED_IMAGES, COMPARED_POINTS = 40, 400
 """Images, and points of each, from which the noise is estimated."""
 GROSS = 5.0
 """Differences of more than so many medians are occlusions and gross errors, not noise."""
+MOST_NOISE = 0.02
+"""Images that differ by more than this share of the median distance contradict each other; it is not taken for noise."""
 MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
 COARSER = 2**0.25
@@ -35,9 +37,12 @@ COARSER = 2**0.25
 
 
 def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the least cell (metres) that the images are worth, by their resolution and by their noise."""
-    pixel = PIXEL * footprint(images, opacity)
-    return max(pixel, LAYER * depth_noise(images, opacity))
+    """Return the least cell (metres) that the images are worth, by their resolution and by the noise of measured depth.
+
+    Rendered images are thinned out too much to tell noise from the structure of the scene.
+    """
+    measured = [posed for posed in images if posed.measured]
+    return max(PIXEL * footprint(images, opacity), LAYER * depth_noise(measured, opacity))
 
 
 def footprint(images: Sequence[PosedDepthImage], opacity: float) -> float:
@@ -78,7 +83,8 @@ def _spread(
     if not len(differences):
         return 0.0
     near = differences[differences <= GROSS * differences.median()]
-    return MAD_TO_SIGMA * float(near.median()) / math.sqrt(2)
+    distance = _median([float(depths.median()) for _, depths in _depths(images, opacity)])
+    return min(MAD_TO_SIGMA * float(near.median()) / math.sqrt(2), MOST_NOISE * distance)
 
 
 def chosen_grid(
