@@ -44,6 +44,7 @@ def test_exact_depth_has_little_noise(generator: Generator) -> None:
 
 def test_a_single_image_has_no_noise(generator: Generator) -> None:
     assert depth_noise(images(0.02, generator, 1), 0.9) == 0.0
+    assert depth_noise([], 0.9) == 0.0
 
 
 def test_the_footprint_is_that_of_the_full_image_and_the_spacing_that_of_the_thinned_one() -> None:

@@ -74,7 +74,7 @@ def _spread(
     beyond: Callable[[PosedDepthImage, Float[Tensor, "p 3"]], Float[Tensor, "p"]],
 ) -> float:
     found = []
-    for number in range(0, len(images), math.ceil(len(images) / COMPARED_IMAGES)):
+    for number in range(0, len(images), max(1, math.ceil(len(images) / COMPARED_IMAGES))):
         points = images[number].points(images[number].solid(opacity))
         points = points[:: max(1, len(points) // COMPARED_POINTS)]
         found += [beyond(images[other], points) for other in witnesses(number, images)]
