@@ -37,7 +37,7 @@ from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import local_processes
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error, success_rate
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand, faulty, find_fault, parse_faults
+from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults, faulty, find_fault, parse_faults
 from bidnerf_core.evaluation.fingerprint import views_digest
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
@@ -269,7 +269,7 @@ def arguments() -> argparse.Namespace:
     parser.set_defaults(modes=(False, True))
     given = parser.parse_args()
     usual = [NO_FAULT, *(f"{name}:{size:g}" for name, fault in FAULTS.items() for size in fault.sizes)]
-    given.faults = expand(usual if given.faults is None else given.faults)
+    given.faults = expand_faults(usual if given.faults is None else given.faults)
     given.config = json.dumps(json.loads(given.config), sort_keys=True)
     return given
 

@@ -16,11 +16,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from record import write_record
-
 from bidnerf_core import Frame, Localizer, View, load_map
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.evaluation.provenance import write_record
 
 FACTORS = (0.9, 0.95, 0.98, 0.99, 1.0, 1.01, 1.02, 1.05, 1.1)
 NEAR = (0.05, 5.0)  # metres and degrees within which an answer counts as right
@@ -78,7 +77,7 @@ def main() -> None:
         folder.name: measured(folder, data, given.frames)
         for folder, data in zip(given.map, given.data, strict=True)
     }
-    print(write_record(given.name, results, 0))
+    print(write_record(Path(__file__).parent / "results" / f"{given.name}.json", results, 0))
 
 
 if __name__ == "__main__":

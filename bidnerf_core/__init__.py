@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         levels,
     )
     from bidnerf_core.frames import Frame, View
-    from bidnerf_core.localization import Localization, Localizer, Outcome
+    from bidnerf_core.localization import Localization, Localizer, Outcome, Tracker, TrackerConfig
     from bidnerf_core.observations import Observations
     from bidnerf_core.registry import list_backends, load_backend
     from bidnerf_core.rendering import render, render_image
@@ -44,7 +44,7 @@ HOMES = {
     "errors": ("InputError", "InputWarning"),
     "field": ("FieldValues", "RadianceField", "RaySampler", "RaySamples", "Rays", "SceneBounds", "levels"),
     "frames": ("Frame", "View"),
-    "localization": ("Localization", "Localizer", "Outcome"),
+    "localization": ("Localization", "Localizer", "Outcome", "Tracker", "TrackerConfig"),
     "observations": ("Observations",),
     "registry": ("list_backends", "load_backend"),
     "rendering": ("render", "render_image"),
@@ -71,6 +71,8 @@ __all__ = [
     "RaySamples",
     "Rays",
     "SceneBounds",
+    "Tracker",
+    "TrackerConfig",
     "View",
     "levels",
     "list_backends",

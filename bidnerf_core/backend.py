@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.frames import View
@@ -43,6 +43,15 @@ class QuickConfig(Protocol):
 
     def quick_config(self) -> Any:
         """Return a config of the backend's ``config_type`` that trains such a scene in about a minute."""
+        ...
+
+
+@runtime_checkable
+class UpgradingField(Protocol):
+    """An optional part of a field: it takes the states that earlier versions of its backend stored."""
+
+    def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return a stored state, of this version or of an earlier one, with the tensors that the field has now."""
         ...
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 
 import torch
 from jaxtyping import Float
@@ -40,6 +41,7 @@ class Intrinsics:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        self._check_types()
         for name in ("fx", "fy"):
             value = getattr(self, name)
             if not SMALLEST_FOCAL <= value <= LARGEST_PIXELS:
@@ -58,14 +60,29 @@ class Intrinsics:
                 f"distortion has {len(self.distortion)} coefficients, expected 0, 4, 5, 8, 12 or 14"
             )
 
+    def _check_types(self) -> None:
+        """Raise ``InputError`` for what is no number, and for sizes that are not whole."""
+        for name in ("fx", "fy", "cx", "cy"):
+            _require(name, getattr(self, name), Real, "a number of pixels")
+        for name in ("width", "height"):
+            _require(name, getattr(self, name), Integral, "a whole number of pixels")
+        if not isinstance(self.distortion, tuple | list):
+            raise InputError(f"distortion is a {type(self.distortion).__name__}, expected coefficients")
+        for value in self.distortion:
+            _require("distortion", value, Real, "coefficients of a real lens")
+
     @staticmethod
     def from_focal(focal: float, width: int, height: int) -> Intrinsics:
         """Return a camera without distortion; ``focal`` is in pixels, the principal point in the middle of the image."""
+        _require_size("width", width)
+        _require_size("height", height)
         return Intrinsics(focal, focal, width / 2, height / 2, width, height)
 
     @staticmethod
     def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
         """Return a camera without distortion that sees ``degrees`` from the left edge of the image to the right one."""
+        _require("horizontal field of view", degrees, Real, "degrees between 0 and 180")
+        _require_size("width", width)
         if not 0 < degrees < 180:
             raise InputError(
                 f"horizontal field of view is {degrees}, expected degrees between 0 and 180 (both excluded)"
@@ -139,6 +156,17 @@ class Intrinsics:
 
     def _coefficients(self) -> Tensor:
         return torch.tensor(self.distortion, dtype=torch.float64)
+
+
+def _require(name: str, value: object, kind: type, expected: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, kind):
+        raise InputError(f"{name} is {value!r:.60}, expected {expected}")
+
+
+def _require_size(name: str, value: object) -> None:
+    _require(name, value, Integral, "a whole number of pixels")
+    if not 1 <= int(value) <= LARGEST_SIZE:  # type: ignore[call-overload]
+        raise InputError(f"{name} is {value!r:.30}, expected 1 to {LARGEST_SIZE} pixels")
 
 
 P1, P2, S1, S2, S3, S4, TAU_X, TAU_Y = 2, 3, 8, 9, 10, 11, 12, 13

@@ -11,7 +11,7 @@ from bidnerf_core.camera import Intrinsics, same_aspect
 from bidnerf_core.camera_records import camera_record
 from bidnerf_core.errors import InputError
 from bidnerf_core.exif import Exif
-from bidnerf_core.files import open_binary
+from bidnerf_core.files import read_file
 from bidnerf_core.orientation import Orientation
 from bidnerf_core.records import parse_record
 
@@ -166,8 +166,7 @@ def read_camera(path: Path, size: tuple[int, int]) -> Intrinsics:
     JSON without ``w`` and ``h`` describes an image of ``size`` (width, height). Raises ``InputError`` for other files, for
     lenses that are not perspective, and where ``cameras.txt`` holds several different cameras.
     """
-    with open_binary(path, "a JSON file or COLMAP's cameras.txt") as file:
-        content = file.read()
+    content = read_file(path, "a JSON file or COLMAP's cameras.txt")
     if content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"["):
         record = camera_record(parse_record(str(path), content))
         return record.intrinsics(record.width or size[0], record.height or size[1])
@@ -179,8 +178,7 @@ def read_camera(path: Path, size: tuple[int, int]) -> Intrinsics:
 
 def read_text_cameras(path: Path) -> dict[int, Intrinsics]:
     """Read COLMAP's ``cameras.txt``; its cameras by their ids. Raises ``InputError``."""
-    with open_binary(path, "COLMAP's cameras.txt") as file:
-        return _colmap_cameras(path, file.read())
+    return _colmap_cameras(path, read_file(path, "COLMAP's cameras.txt"))
 
 
 def _colmap_cameras(path: Path, content: bytes) -> dict[int, Intrinsics]:

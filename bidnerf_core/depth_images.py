@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.arrays import read_array
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.files import open_binary
-from bidnerf_core.images import decode, reason, to_numpy
+from bidnerf_core.images import decode, to_numpy
 
 FARTHEST = 1e9
 """Metres. No sensor measures more, and float32 has no use for it."""
@@ -71,7 +71,7 @@ def read_depth_image(path: Path, unit: float | None) -> DepthImage:
 
     Raises ``InputError`` for anything else.
     """
-    raw = _load(path) if path.suffix.lower() == ".npy" else decode(path)
+    raw = read_array(path, "a .npy file") if path.suffix.lower() == ".npy" else decode(path)
     return depth_image(raw, unit, f"{path}: depth")
 
 
@@ -86,7 +86,7 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
     """
     values = to_numpy(raw)
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
-    if values.ndim != 2 or values.dtype.kind not in "uif":
+    if values.ndim != 2 or not values.size or values.dtype.kind not in "uif":
         found = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
         raise InputError(f"{what} is {found}, expected one channel of whole or floating-point numbers")
     if unit is None:
@@ -165,13 +165,3 @@ class DepthReader:
                 f"{path}: depth: {remark}, here and in the images that follow", InputWarning, stacklevel=2
             )
         return found
-
-
-def _load(path: Path) -> np.ndarray:
-    with open_binary(path, "a .npy file") as file:
-        try:
-            return np.asarray(np.load(file, allow_pickle=False))
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(
-                f"{path}: not readable as an array ({reason(error)}), expected a .npy file"
-            ) from error

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Collection
+
 
 class InputError(ValueError):
     """An input is not usable; the message is a line that can be shown to the user as it is."""
@@ -9,3 +12,10 @@ class InputError(ValueError):
 
 class InputWarning(UserWarning):
     """An input was ambiguous and a convention was assumed; the message is a line that says which."""
+
+
+def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
+    """Return the error for a name that is not among ``known``; it suggests the one that is spelt most alike."""
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f", did you mean {near[0]!r}?" if near else f", expected one of {', '.join(known)}"
+    return InputError(f"no {what} {name!r}{hint}")

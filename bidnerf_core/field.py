@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
+from bidnerf_core.contraction import RaySpacing, contract
 from bidnerf_core.errors import InputError
 
 
@@ -87,6 +88,8 @@ class SceneBounds:
     near: float  # metres along a ray: nothing of interest is nearer ...
     far: float  # ... or farther
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour seen where a ray meets nothing
+    # Whether there is matter beyond the box, as far as ``far``: fields contract what lies outside of the box's cube.
+    contracted: bool = False
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
@@ -111,16 +114,55 @@ class SceneBounds:
         a, b = self.lower, self.upper
         return ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2, (a[2] + b[2]) / 2)
 
+    @property
+    def side(self) -> float:
+        """Side of the cube around the box (metres)."""
+        return max(self.size)
+
+    def normalized(self, positions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+        """Return positions (metres, world) scaled so that the modelled space is the cube [-1, 1].
+
+        This is the cube around the box or, where the scene is contracted, all space: the cube around the box then fills the
+        inner half of each axis.
+        """
+        scaled = (positions - positions.new_tensor(self.centre)) * (2 / self.side)
+        return contract(scaled) / 2 if self.contracted else scaled
+
     def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
-        """Return the rays limited to the box and to [near, far] (slab method). The limits carry no gradient."""
+        """Return the rays limited to [near, far] and, unless the scene is contracted, to the box (slab method).
+
+        The limits carry no gradient.
+        """
         with torch.no_grad():
-            lower, upper = (origins.new_tensor(corner) for corner in (self.lower, self.upper))
-            tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
-            slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
-            first, second = (lower - origins) * slope, (upper - origins) * slope
-            near = torch.minimum(first, second).amax(-1).clamp(self.near, self.far)
-            far = torch.maximum(first, second).amin(-1).clamp(max=self.far)
+            if self.contracted:
+                near = torch.full_like(origins[..., 0], self.near)
+                return Rays(origins, directions, near, torch.full_like(near, self.far))
+            enter, leave = self._crossed(origins, directions, self.lower, self.upper)
+            near = enter.clamp(self.near, self.far)
+            far = leave.clamp(max=self.far)
         return Rays(origins, directions, near, torch.maximum(near, far))
+
+    @torch.no_grad()
+    def spacing(self, rays: Rays) -> RaySpacing:
+        """Return the coordinate along the rays in which a field with these bounds is to be sampled evenly."""
+        origins, directions = rays.origins.detach(), rays.directions.detach()
+        if not self.contracted:
+            return RaySpacing(torch.zeros_like(rays.near), float("inf"))
+        half = self.side / 2
+        lower, upper = (tuple(c + sign * half for c in self.centre) for sign in (-1, 1))
+        enter, leave = self._crossed(origins, directions, lower, upper)
+        return RaySpacing(torch.where(leave > enter, leave, 0).clamp(min=0), half)
+
+    def _crossed(
+        self, origins: Tensor, directions: Tensor, lower: tuple[float, ...], upper: tuple[float, ...]
+    ) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
+        """Return the distances (metres) at which the lines through rays enter and leave a box; they miss it where these
+        are not in order.
+        """
+        tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
+        slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
+        first, second = ((origins.new_tensor(corner) - origins) * slope for corner in (lower, upper))
+        return torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
 
 
 def widened(rays: Rays, factor: float) -> Rays:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 import stat
 from pathlib import Path
@@ -11,6 +12,9 @@ from typing import BinaryIO
 
 from bidnerf_core.errors import InputError
 
+LARGEST_TEXT = 128 * 2**20
+"""Bytes. What is parsed as text takes ten times as much memory as its file; the size is checked before it is read."""
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}")
 FILE_KINDS = {
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
@@ -41,12 +45,40 @@ def open_binary(path: Path, expected: str) -> BinaryIO:
     raise InputError(f"{path}: is {kind}, expected {expected}")
 
 
+def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
+    """Return the content of a regular file. Raises ``InputError`` as ``open_binary`` does, and for more than ``most`` bytes."""
+    with open_binary(path, expected) as file:
+        return read_open_file(file, path, expected, most)
+
+
+def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
+    """Return the rest of the open file ``path``. Raises ``InputError`` where it cannot be read or has more than ``most`` bytes."""
+    size = os.fstat(file.fileno()).st_size
+    if size > most:
+        found, limit = (f"{count / 2**20:,.0f} MiB" for count in (size, most))
+        raise InputError(f"{path}: has {found}, expected {expected} of at most {limit}")
+    try:
+        return file.read()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}), expected {expected}") from error
+
+
+def temporary(path: Path) -> Path:
+    """Return a new name beside ``path`` that ``is_temporary`` recognises."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+
+
+def is_temporary(name: str) -> bool:
+    """Return whether a file of this name was being written when its process was killed."""
+    return TEMPORARY.fullmatch(name) is not None
+
+
 def write_file(path: Path, content: bytes) -> None:
     """Write a file that appears under its name only once all of it is on the disk.
 
     Raises ``OSError``, which names the file; whatever stood there before is then untouched.
     """
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    beside = temporary(path)
     try:
         with beside.open("wb") as file:
             file.write(content)

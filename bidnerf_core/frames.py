@@ -175,8 +175,18 @@ def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Floa
 
 
 @dataclass(frozen=True, eq=False)
+class SeenLandmarks:
+    """Landmarks that an image shows, and how far from its camera they are."""
+
+    pixels: Float[Tensor, "n 2"]  # column and row; the centre of the first pixel is (0.5, 0.5)
+    distance: Float[Tensor, "n"]  # metres from the camera, not z
+    deviation: Float[Tensor, "n"]  # metres: standard deviation of the distance
+
+
+@dataclass(frozen=True, eq=False)
 class View:
     """A frame and where its camera is in some reference frame: the world, or the last camera of a rig."""
 
     frame: Frame
     T_ref_camera: SE3
+    landmarks: SeenLandmarks | None = None  # those that training takes distances from

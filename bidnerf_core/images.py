@@ -106,9 +106,12 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
 
 
 def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
-    """Return the values of an array of numpy or torch (any device and type) as numpy's."""
+    """Return the values of an array of numpy or torch (any device and type) as numpy's. Raises ``InputError``."""
     if not isinstance(array, Tensor):
-        return np.asarray(array)
+        try:
+            return np.asarray(array)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"got a {type(array).__name__}, expected an array of numbers") from error
     values = array.detach().cpu()
     return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
 

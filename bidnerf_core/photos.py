@@ -122,8 +122,8 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 def _limited(source: CameraSource, largest: int | None) -> tuple[CameraSource, tuple[int, int]]:
     """Return the camera and the size (width, height) of an image whose longer side has at most ``largest`` pixels."""
     camera = source.intrinsics
-    if largest is not None and largest < 1:
-        raise InputError(f"largest is {largest}, expected a positive number of pixels")
+    if largest is not None and not (isinstance(largest, int) and largest >= 1):
+        raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
     longer = max(camera.width, camera.height)
     if largest is None or longer <= largest:
         return source, (camera.width, camera.height)

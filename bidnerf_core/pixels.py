@@ -63,7 +63,7 @@ def observe(
     directions = T.rotate(ray / length[:, None])
     origins = T.translation.expand_as(directions)
     there = frame.rgb.device if device is None else device
-    coloured = torch.ones(len(length), dtype=torch.bool)
+    coloured = torch.full((len(length),), frame.has_colour)
     return Observations(origins, directions, frame.rgb[rows, columns], depth * length, coloured).to(
         there, dtype
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
+from bidnerf_core.files import read_file
 
 LARGEST_FILE = sys.float_info.max  # JSON knows NaN, 1e999 and integers that no float holds
 
@@ -69,8 +69,7 @@ class Record:
 
 def read_record(path: Path) -> Record:
     """Read the JSON object in the file ``path``. Raises ``InputError`` with line and column where it is broken."""
-    with open_binary(path, "a JSON file") as file:
-        return parse_record(str(path), file.read())
+    return parse_record(str(path), read_file(path, "a JSON file"))
 
 
 def parse_record(where: str, content: bytes) -> Record:

@@ -22,6 +22,7 @@ class Rendering:
     opacity: Float[Tensor, "*r"]  # 0 nothing was met, 1 nothing shines through
     weights: Float[Tensor, "*r s"]
     samples: RaySamples
+    density: Float[Tensor, "*r s"] | None = None  # per metre, at the samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,7 @@ def render_samples(
     opacity = weights.sum(-1)
     behind = torch.as_tensor(background, dtype=weights.dtype, device=weights.device)
     rgb = (weights[..., None] * values.rgb).sum(-2) + (1 - opacity)[..., None] * behind
-    return Rendering(rgb, (weights * samples.middles).sum(-1), opacity, weights, samples)
+    return Rendering(rgb, (weights * samples.middles).sum(-1), opacity, weights, samples, values.density)
 
 
 @torch.no_grad()

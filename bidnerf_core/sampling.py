@@ -7,21 +7,27 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import max_pool1d, pad
 
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.rendering import query_samples, rendering_weights
 from bidnerf_core.voxel_grid import OccupancyMask
 
 
 @dataclass(frozen=True)
 class Stratified:
-    """``count`` equal intervals of [near, far]; with jitter, their borders move at random within half an interval."""
+    """``count`` intervals of [near, far]; with jitter, their borders move at random within half an interval.
+
+    They are equal in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
+    """
 
     count: int
+    bounds: SceneBounds | None = None
 
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        near, far = rays.near.detach()[..., None], rays.far.detach()[..., None]
+        limits = torch.stack([rays.near.detach(), rays.far.detach()], dim=-1)
+        spacing = None if self.bounds is None else self.bounds.spacing(rays)
+        near, far = (limits if spacing is None else spacing.place(limits)).split(1, dim=-1)
         borders = torch.linspace(0, 1, self.count + 1, dtype=near.dtype, device=near.device)
         borders = borders.expand(*rays.near.shape, -1)
         if jitter is not None:
@@ -31,6 +37,8 @@ class Stratified:
             inner = borders[..., 1:-1] + shift.to(near) / self.count
             borders = torch.cat([borders[..., :1], inner, borders[..., -1:]], dim=-1)
         distances = near + (far - near) * borders
+        if spacing is not None:
+            distances = spacing.distance(distances)
         valid = (far > near).expand(*rays.near.shape, self.count)
         return RaySamples(distances[..., :-1], distances[..., 1:], valid)
 
@@ -113,6 +121,89 @@ class Importance:
             weights = rendering_weights(query_samples(self.field, rays, rough).density, rough)
             weights = torch.where(rough.valid, weights + 1e-5, 0)
             return _cut(rough, *inverse_transform(rough, weights, self.count, jitter))
+
+
+EVEN_SHARE = 0.25
+"""Fraction of the borders that ``Concentrated`` spreads evenly, so that matter which the guide does not know of is found."""
+TAIL = 0.005
+"""Fraction of a ray's weight, at either end, that ``Concentrated`` leaves to evenly spread intervals."""
+
+
+@dataclass(frozen=True)
+class Concentrated:
+    """At most ``count`` intervals of each ray, short where the field ``guide`` has its weight and long elsewhere.
+
+    Three quarters of the borders divide the weight that the guide gives to the ray's own valid intervals into equal parts, the
+    others their length. Each interval is as long as what it replaces. A ray with ``count`` intervals or fewer keeps them. No
+    gradient flows through the choice.
+    """
+
+    guide: RadianceField
+    count: int
+
+    @torch.no_grad()
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        rough = _gathered(self.guide.sampler(rays, jitter))
+        if rough.starts.shape[-1] <= self.count:
+            return rough
+        weights = rendering_weights(query_samples(self.guide, rays, rough).density, rough)
+        few = rough.valid.sum(-1) <= self.count
+        kept = RaySamples(*(part[..., : self.count] for part in (rough.starts, rough.ends, rough.valid)))
+        return _either(few, kept, concentrated(rough, weights, self.count, jitter))
+
+
+def concentrated(
+    samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
+) -> RaySamples:
+    """Return ``count`` intervals in place of ``samples``, short where these have ``weights``, see ``Concentrated``."""
+    length = torch.where(samples.valid, samples.ends - samples.starts, 0)
+    laid = pad(length.cumsum(-1), (1, 0))  # borders of the intervals, laid end to end
+    border = _borders(weights, length, laid, count, jitter)
+    middle, half = (border[..., 1:] + border[..., :-1]) / 2, border.diff(dim=-1) / 2
+    owner = torch.searchsorted(laid[..., 1:].contiguous(), middle.contiguous()).clamp(
+        max=length.shape[-1] - 1
+    )
+    at = samples.starts.gather(-1, owner) + (middle - laid.gather(-1, owner))
+    starts, ends = at - half, at + half
+    # Rounding, and intervals that reach over a gap, must not make two of them overlap.
+    between = (ends[..., :-1] + starts[..., 1:]) / 2
+    starts = torch.cat([starts[..., :1], torch.maximum(starts[..., 1:], between)], dim=-1)
+    ends = torch.cat([torch.minimum(ends[..., :-1], between), ends[..., -1:]], dim=-1)
+    return RaySamples(starts, torch.maximum(starts, ends), (half > 0) & samples.valid.any(-1, keepdim=True))
+
+
+def _borders(
+    weights: Float[Tensor, "*r s"], length: Float[Tensor, "*r s"], laid: Float[Tensor, "*r b"], count: int,
+    jitter: Generator | None,
+) -> Float[Tensor, "*r n"]:  # fmt: skip
+    """Return the ``count + 1`` borders in the coordinate of the intervals laid end to end: equal weight, and equal length."""
+    blurred = max_pool1d(weights.reshape(-1, 1, weights.shape[-1]), 3, stride=1, padding=1).view_as(weights)
+    mass = torch.where(length > 0, blurred, 0) + 1e-5 * length / laid[..., -1:].clamp(min=1e-30)
+    cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=1e-30), (1, 0))
+    even = max(2, round(EVEN_SHARE * (count + 1)))
+    dense = TAIL + (1 - 2 * TAIL) * _levels(count + 1 - even, laid, jitter)
+    by_weight = _interpolated(dense, cdf, laid)
+    by_length = _levels(even, laid, jitter) * laid[..., -1:]
+    return torch.cat([by_weight, by_length], dim=-1).sort(dim=-1).values
+
+
+def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -> Float[Tensor, "*r n"]:
+    """Return ``count`` numbers from 0 to 1 at equal steps; with jitter, those between move at random within half a step."""
+    levels = torch.linspace(0, 1, count, dtype=like.dtype, device=like.device).repeat(*like.shape[:-1], 1)
+    if jitter is not None and count > 2:
+        shift = torch.rand((*like.shape[:-1], count - 2), generator=jitter, device=jitter.device) - 0.5
+        levels[..., 1:-1] += shift.to(levels) / (count - 1)
+    return levels
+
+
+def _interpolated(
+    at: Float[Tensor, "*r n"], x: Float[Tensor, "*r s"], y: Float[Tensor, "*r s"]
+) -> Float[Tensor, "*r n"]:
+    """Return the piecewise linear function through the points (x, y), x ascending, at ``at``."""
+    right = torch.searchsorted(x.contiguous(), at.contiguous(), right=True).clamp(1, x.shape[-1] - 1)
+    x0, x1, y0, y1 = (part.gather(-1, index) for part in (x, y) for index in (right - 1, right))
+    slope = (y1 - y0) / (x1 - x0).clamp(min=torch.finfo(x.dtype).tiny)
+    return torch.minimum(torch.maximum(y0 + (at - x0) * slope, y0), y1)
 
 
 def inverse_transform(

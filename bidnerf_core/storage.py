@@ -10,7 +10,6 @@ import contextlib
 import json
 import re
 import secrets
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -24,35 +23,30 @@ from bidnerf_core.backend import Backend
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
-from bidnerf_core.files import write_file
-from bidnerf_core.frames import View
-from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
-from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
+from bidnerf_core.files import read_file, write_file
+from bidnerf_core.map_cameras import StoredCamera
+from bidnerf_core.map_parts import load_landmarks, load_surface
+from bidnerf_core.mapping import SurfaceMap, surface_tensors
+from bidnerf_core.mapping.capture_report import CaptureReport
+from bidnerf_core.mapping.landmark_tensors import landmark_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.registry import load_backend
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
-from bidnerf_core.tensor_files import check_weights, load_part, packed, read_tensors
+from bidnerf_core.tensor_files import checked_weights, packed, read_tensors
 from bidnerf_core.training import TrainingState
 
 FORMAT = "bidnerf map"
 VERSION = 1
 DESCRIPTION = "map.json"
-TENSORS = r"(weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors"
-OURS = re.compile(rf"{TENSORS}|\.({TENSORS}|map\.json)\.[0-9a-f]{{8}}")
+PARTS = (
+    r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
+)
+OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 """Names of files that a save may leave behind; other files in the folder are never removed."""
 
 
 LandmarkSource = Literal["photos", "rendered images"]
-
-
-@dataclass(frozen=True)
-class StoredCamera:
-    """Camera and pose of a training image, from which the scene is known to be visible."""
-
-    name: str
-    intrinsics: Intrinsics
-    T_world_camera: tuple[tuple[float, float, float, float], ...]  # 4x4, rows
 
 
 @dataclass(frozen=True)
@@ -73,6 +67,7 @@ class MapInfo:
     surface: str | None = None  # baked from these weights
     landmarks: str | None = None
     landmark_source: LandmarkSource | None = None  # what they were built from, where that is recorded
+    capture: str | None = None  # record of the photos that gave the landmarks
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
@@ -98,16 +93,6 @@ class Map:
         return self.info.colour_noise
 
 
-def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
-    """Return the cameras of training views in the form that ``map.json`` holds."""
-    return tuple(
-        StoredCamera(
-            v.frame.name, v.frame.intrinsics, tuple(tuple(r) for r in v.T_ref_camera.matrix().tolist())
-        )
-        for v in views
-    )
-
-
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
     """Return an untrained field (an ``nn.Module``) and its config, as ``info`` describes them."""
     config: Any = from_plain(backend.config_type, info.config, f"{where}: config")
@@ -121,6 +106,17 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
     return field, config
 
 
+def _outline(backend: Backend, info: MapInfo, where: str) -> RadianceField | None:
+    """Return the field with the shapes of its tensors only, or None where its backend needs real ones to build it."""
+    try:
+        with torch.device("meta"):
+            return build_field(backend, info, where)[0]
+    except InputError:
+        raise
+    except Exception:  # whatever a backend does with the numbers that it does not get
+        return None
+
+
 def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     """Write a map, and remove the files of an earlier one once the new one is complete."""
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
@@ -132,6 +128,7 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
         surface=None,
         landmarks=None,
         landmark_source=None,
+        capture=None,
         colour_noise=None,
     )
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
@@ -151,7 +148,7 @@ def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
 
     Raises ``InputError`` where another training has replaced that map meanwhile.
     """
-    return _save_part(folder, of, "surface", surface_tensors(surface))
+    return _save_part(folder, of, "surface", tensors_to_bytes(surface_tensors(surface)))
 
 
 def save_landmarks(
@@ -163,21 +160,35 @@ def save_landmarks(
     ``source`` says which images the landmarks were built from. Raises ``InputError`` where another training has replaced
     that map meanwhile.
     """
-    tensors = landmark_tensors(landmarks)
-    return _save_part(folder, of, "landmarks", tensors, colour_noise=colour_noise, landmark_source=source)
+    content = tensors_to_bytes(landmark_tensors(landmarks))
+    return _save_part(folder, of, "landmarks", content, colour_noise=colour_noise, landmark_source=source)
+
+
+def save_capture(folder: Path, of: MapInfo, capture: CaptureReport) -> MapInfo:
+    """Add the record of its photos to map ``of``, in place of the one that it had.
+
+    Raises ``InputError`` where another training has replaced that map meanwhile.
+    """
+    content = json.dumps(to_plain(capture), indent=1, allow_nan=False).encode()
+    return _save_part(folder, of, "capture", content, "json")
 
 
 def _save_part(
-    folder: Path, of: MapInfo, part: str, tensors: dict[str, Tensor], **facts: float | str | None
+    folder: Path,
+    of: MapInfo,
+    part: str,
+    content: bytes,
+    ending: str = "safetensors",
+    **facts: float | str | None,
 ) -> MapInfo:
-    """Add a file of tensors to a map under the name of a part of its description."""
+    """Add a file to a map under the name of a part of its description."""
     if load_info(folder).weights != of.weights:
         raise InputError(f"{folder}: was trained anew while its {part} was made; bake it again")
-    name = f"{part}-{of.step:08d}-{secrets.token_hex(4)}.safetensors"
+    name = f"{part}-{of.step:08d}-{secrets.token_hex(4)}.{ending}"
     info = replace(load_info(folder), **{part: name}, **facts)  # type: ignore[arg-type]
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     try:
-        write_file(folder / name, tensors_to_bytes(tensors))
+        write_file(folder / name, content)
         write_file(folder / DESCRIPTION, description)
     finally:
         _sweep(folder)
@@ -198,10 +209,11 @@ def load_info(folder: Path) -> MapInfo:
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {what}, expected a map: a folder as written by 'bidnerf train'")
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"{folder}: no {DESCRIPTION} in it, expected a map as written by 'bidnerf train'")
+    content = read_file(path, "the description of a map")
     try:
-        found = json.loads(path.read_bytes())
+        found = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}), expected the description of a map") from error
     if not isinstance(found, dict) or found.get("format") != FORMAT:
@@ -211,7 +223,7 @@ def load_info(folder: Path) -> MapInfo:
         advice = "it was written by a newer bidnerf, update yours" if newer else "train the map anew"
         raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; {advice}")
     info = from_plain(MapInfo, found, str(path))
-    for name in (info.weights, info.training, info.surface, info.landmarks):
+    for name in (info.weights, info.training, info.surface, info.landmarks, info.capture):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
     for camera in info.cameras:
@@ -231,30 +243,25 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     """
     folder = Path(folder)
     info, tensors, surface, landmarks = _read(folder, baked)
-    field, _ = build_field(load_backend(info.backend, str(folder)), info, str(folder / DESCRIPTION))
-    check_weights(field, tensors, folder / info.weights)
+    backend, where = load_backend(info.backend, str(folder)), str(folder / DESCRIPTION)
+    outline = _outline(backend, info, where)
+    if outline is not None:  # before memory is taken for a field of any size that map.json describes
+        tensors = checked_weights(outline, tensors, folder / info.weights)
+    field, _ = build_field(backend, info, where)
+    if outline is None:
+        tensors = checked_weights(field, tensors, folder / info.weights)
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
     return Map(info, field, surface, landmarks)
 
 
-def load_surface(path: Path) -> SurfaceMap:
-    """Raises ``InputError`` where the file does not hold what ``surface_tensors`` gives."""
-    return load_part(path, surface_from_tensors, "a baked surface")
-
-
-def load_landmarks(path: Path) -> LandmarkMap:
-    """Raises ``InputError`` where the file does not hold what ``landmark_tensors`` gives."""
-    return load_part(path, landmarks_from_tensors, "landmarks")
-
-
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
     """Return the state from which the interrupted training of ``field`` can be resumed."""
     if info.training is None:
         raise InputError(f"{folder}: training is complete ({info.step} steps), nothing to resume")
-    weights = read_tensors(folder / info.weights)
-    check_weights(field, weights, folder / info.weights)
+    path = folder / info.weights
+    weights = checked_weights(field, read_tensors(path), path)
     return TrainingState(info.step, weights, read_tensors(folder / info.training))
 
 
@@ -279,7 +286,7 @@ def _sweep(folder: Path) -> None:
     """Remove files of earlier and of interrupted saves, which ``map.json`` does not name."""
     try:
         found = json.loads((folder / DESCRIPTION).read_bytes())
-        kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks")}
+        kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks", "capture")}
     except FileNotFoundError:
         kept = set()
     except (OSError, ValueError, AttributeError):  # damaged: which files are in use is unknown

@@ -2,27 +2,59 @@
 
 from __future__ import annotations
 
+import json
+import os
+import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import BinaryIO, TypeVar, cast
 
 from safetensors import SafetensorError
 from safetensors.torch import load as tensors_from_bytes
 from torch import Tensor, nn
 
+from bidnerf_core.backend import UpgradingField
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField
+from bidnerf_core.files import open_binary
 
 Part = TypeVar("Part")
+EXPECTED_FILE = "a safetensors file"
+LARGEST_HEADER = 16 * 2**20
+"""Bytes; a tensor takes about a hundred of them."""
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a file. Raises ``InputError`` where it is none, or has not the length that its header says."""
+    if not os.path.lexists(path):
+        raise InputError(f"{path}: no such file, but map.json names it; the map is incomplete")
     try:
-        return tensors_from_bytes(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file, but map.json names it; the map is incomplete") from error
-    except SafetensorError as error:
-        raise InputError(f"{path}: not readable ({error}), expected a safetensors file") from error
+        with open_binary(path, EXPECTED_FILE) as file:
+            _check_length(path, file)
+            return tensors_from_bytes(file.read())
+    except (SafetensorError, KeyError, ValueError, RuntimeError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not readable ({error}), expected {EXPECTED_FILE}") from error
+
+
+def _check_length(path: Path, file: BinaryIO) -> None:
+    """Compare the length of a file with what its header says, before memory is taken for the tensors."""
+    size = os.fstat(file.fileno()).st_size
+    length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
+    if not length <= min(size - 8, LARGEST_HEADER):
+        raise InputError(f"{path}: not readable (its header is cut off), expected {EXPECTED_FILE}")
+    try:
+        header = json.loads(file.read(length))
+        ends = [part["data_offsets"][1] for name, part in header.items() if name != "__metadata__"]
+        described = 8 + length + max(ends, default=0)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path}: not readable (its header is damaged), expected {EXPECTED_FILE}") from error
+    if described != size:
+        raise InputError(
+            f"{path}: has {size} bytes, its header describes {described}; expected {EXPECTED_FILE}"
+        )
+    file.seek(0)
 
 
 def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) -> Part:
@@ -35,8 +67,13 @@ def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) 
         raise InputError(f"{path}: not {what} ({why}); bake it anew with 'bidnerf bake'") from error
 
 
-def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> None:
-    """Compare names, shapes and values with what a field takes: torch's own message would run over many lines."""
+def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """Return the tensors that a field takes from a file, brought up to date where an earlier version stored them.
+
+    Their names, shapes and values are compared with the field's own: torch's own message would run over many lines.
+    """
+    if isinstance(field, UpgradingField):
+        tensors = field.upgraded_state(tensors)
     module = cast(nn.Module, field)
     expected = module.state_dict()
     for name, value in expected.items():
@@ -57,6 +94,7 @@ def check_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) 
     for name, _ in module.named_buffers():
         if name in tensors and bool(tensors[name].isnan().any()):
             raise InputError(f"{path}: tensor {name!r} holds NaN, expected numbers")
+    return tensors
 
 
 def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

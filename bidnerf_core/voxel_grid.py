@@ -23,10 +23,16 @@ class VoxelGrid:
     lower: tuple[float, float, float]  # metres, world: lower corner of the first cell
     cell: float  # metres: side of a cell
     shape: tuple[int, int, int]  # cells along x, y and z
+    # The scene whose contracted space the grid divides, in the coordinates of ``SceneBounds.normalized``; None: the world.
+    contracted: SceneBounds | None = None
 
     @staticmethod
     def cube(bounds: SceneBounds, resolution: int) -> VoxelGrid:
-        """Return the grid of the cube around the box's centre that has the box's longest side, ``resolution`` cells wide."""
+        """Return the grid of the modelled cube, ``resolution`` cells wide: the cube around the box's centre that has the
+        box's longest side or, where the scene is contracted, the cube that all space is drawn into.
+        """
+        if bounds.contracted:
+            return VoxelGrid((-1.0, -1.0, -1.0), 2 / resolution, (resolution,) * 3, bounds)
         side = max(bounds.size)
         x, y, z = (middle - side / 2 for middle in bounds.centre)
         return VoxelGrid((x, y, z), side / resolution, (resolution, resolution, resolution))
@@ -64,7 +70,7 @@ class VoxelGrid:
 
         Points that are not finite have the number of some cell.
         """
-        points, rate = points.detach(), 1 / self.cell
+        points, rate = self._own(points.detach()), 1 / self.cell
         x, y, z = (
             ((points[..., axis] - self.lower[axis]) * rate).nan_to_num_(0.0).clamp_(0, count - 1).long()
             for axis, count in enumerate(self.shape)
@@ -77,11 +83,16 @@ class VoxelGrid:
 
     def contains(self, points: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
         """Return whether each point (metres, world) lies within the grid or on its border."""
+        points = self._own(points)
         x, y, z = (
             (points[..., axis] >= low) & (points[..., axis] <= high)
             for axis, (low, high) in enumerate(zip(self.lower, self.upper, strict=True))
         )
         return x & y & z
+
+    def _own(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+        """Return points of the world in the coordinates of the grid."""
+        return points if self.contracted is None else self.contracted.normalized(points)
 
     def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
         """Return the half-lines (metres, world; unit directions), limited to the grid."""

@@ -11,9 +11,10 @@ from torch import Tensor
 
 import bidnerf_core.localization.auto as auto_module
 import textured_field
-from bidnerf_core import InputError, Localization, Localizer, Outcome, View
+from bidnerf_core import Localization, Localizer, Outcome, View
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.localization import AutoConfig
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 from bidnerf_core.localization.by_landmarks import (
     SHARPEST,
     LandmarkAnswer,
@@ -21,6 +22,7 @@ from bidnerf_core.localization.by_landmarks import (
     localization_by_landmarks,
 )
 from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization.search.landmarks import Confirmation
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.se3 import SE3
 from textured_field import CAMERA, MapWithLandmarks, textured_map, unseen
@@ -32,8 +34,10 @@ CHI2_99 = 16.8  # of six degrees of freedom
 
 @functools.cache
 def matcher() -> LandmarkMatcher:
-    assert textured_map().landmarks is not None
-    return LandmarkMatcher(textured_map().landmarks)
+    landmarks = textured_map().landmarks
+    assert landmarks is not None
+    scatter = torch.full((4,), 0.01, dtype=torch.float64)  # as a trial of these exact images would find
+    return LandmarkMatcher(replace(landmarks, calibration_scatter=scatter, correlation=1.0))
 
 
 def without_depth(view: View) -> View:
@@ -227,27 +231,33 @@ def test_a_covered_lens_is_not_found_by_rendering_either(grey: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("many", "settings", "expected"),
+    ("visible", "matches", "settings", "expected"),
     [
-        (10_000, {}, Outcome.CONVERGED),
-        (1, {}, Outcome.TOO_FEW_MATCHES),
-        (1, {"landmarks": False}, Outcome.CONVERGED),
+        (1000, 5, {}, Outcome.TOO_FEW_MATCHES),
+        (1000, 50, {}, Outcome.CONVERGED),
+        (10, 0, {}, Outcome.CONVERGED),
+        (1000, 5, {"landmarks": False}, Outcome.CONVERGED),
     ],
-    ids=["hardly any landmarks", "many", "not asked for"],
+    ids=["contradicted", "above chance", "hardly any landmarks", "not asked for"],
 )
-def test_what_the_landmarks_of_a_textured_scene_do_not_recognise_is_not_accepted(
-    many: int, settings: dict[str, bool], expected: Outcome, monkeypatch: pytest.MonkeyPatch
+def test_an_answer_of_the_surface_that_landmarks_contradict_is_not_accepted(
+    visible: int, matches: int, settings: dict[str, bool], expected: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whole images may look alike where no keypoint does."""
-    monkeypatch.setattr(auto_module, "MANY_LANDMARKS", many)
     monkeypatch.setattr(auto_module, "answer_by_landmarks", lambda *_: None)
+    monkeypatch.setattr(auto_module, "confirm", lambda *_: Confirmation(None, visible, matches, 8.0))
     localizer = Localizer(textured_map(surface=True), "auto", replace(QUICK, **settings))
     found = localizer(without_depth(unseen()).frame, start=TRUTH)
     assert found.outcome is expected
-    assert ("no landmarks were recognised" in found.reason) == (expected is Outcome.TOO_FEW_MATCHES)
+    assert ("by chance" in found.reason) == (expected is Outcome.TOO_FEW_MATCHES)
     assert_within(found.T_world_camera, 0.02, 0.5)
 
 
-def test_without_keypoints_and_surface_a_start_is_needed() -> None:
-    with pytest.raises(InputError, match=r"the map has no surface.*needs a start"):
-        localized(blank())
+def test_an_answer_of_the_surface_is_refined_by_landmarks_near_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(auto_module, "answer_by_landmarks", lambda *_: None)
+    found = localized(without_depth(unseen()), textured_map(surface=True), start=TRUTH)
+    assert found.outcome in (Outcome.CONVERGED, Outcome.UNCERTAIN)
+    assert found.reason.startswith("found on the surface; ")
+    assert_within(found.T_world_camera, 0.02, 0.5)
+    assert isinstance(found.diagnostics, LandmarkDiagnostics)
+    assert not found.diagnostics.searched

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -13,11 +16,16 @@ import torch
 import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli import bake as module
-from bidnerf_core.cli import main
+from bidnerf_core.cli import main, train
 from bidnerf_core.cli.common import read_views
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.frames import View
+from bidnerf_core.mapping.capture_report import CaptureReport, CoverageRecord
+from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
 from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.storage import Map, load_info, load_map
+from bidnerf_core.storage import Map, load_info, load_map, save_capture
+from bidnerf_hashgrid import HashGridConfig
+from bidnerf_hashgrid import backend as hashgrid
 from commands import Run
 from tiny import backends_listed_once  # noqa: F401
 
@@ -228,3 +236,75 @@ def test_damaged_landmarks_of_photos_are_replaced(with_photo_landmarks: Path, bi
     assert str(damaged) in err
     assert load_info(with_photo_landmarks).landmark_source == "rendered images"
     assert load_map(with_photo_landmarks).landmarks is not None
+
+
+def test_landmarks_of_photos_are_built_once_for_training_and_baking(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without depth or silhouettes, training takes distances from landmarks, and the map keeps those landmarks."""
+    monkeypatch.setattr(tiny, "CAMERA", Intrinsics(85.0, 85.0, 32.0, 32.0, 64, 64))
+    photos = [replace(v, frame=replace(v.frame, depth=None, alpha=None)) for v in tiny.views(24)]
+    built, seen = [], []
+
+    def tracked(views: Sequence[View], **options: Any) -> TrackedViews:
+        built.append(len(views))
+        return tracked_views(views, **options)
+
+    def trained(field: Any, views: Sequence[View], *rest: Any) -> None:
+        seen.append(sum(len(v.landmarks.distance) for v in views if v.landmarks is not None))
+        hashgrid.train(field, views, *rest)
+
+    for part in (module, train):
+        monkeypatch.setattr(part, "tracked_views", tracked)
+    monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
+    watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
+    config = tiny.config(4)
+    train.train_map(watched, "hashgrid", photos, config, tmp_path, "photos", tiny.BACKGROUND)  # type: ignore[arg-type]
+    stored = load_map(tmp_path)
+    assert built == [24]
+    assert seen[0] > 100
+    assert stored.landmarks is not None
+    assert stored.landmarks.trial.images == 3
+    assert stored.bounds.contracted
+
+
+def test_images_with_silhouettes_are_trained_on_without_landmarks() -> None:
+    bare = [replace(v, frame=replace(v.frame, depth=None)) for v in tiny.views(3)]
+    tracked, views = train.located(bare)
+    assert tracked is None
+    assert all(view.landmarks is None for view in views)
+
+
+def test_photos_leave_a_record_that_info_shows_and_draws(
+    shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
+    assert json.loads(bidnerf("info", folder, "--json")[1])["capture"] is None
+    status, _, err = bidnerf("info", folder, "--draw", folder / "capture.png")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "no record of its photos" in err
+    status, _, err = bidnerf("bake", folder, "--data", shared / "data")
+    assert status == 0
+    lines = [line for line in err.splitlines() if "24 photos, " in line and "horizon" in line]
+    assert len(lines) == 1
+    facts = json.loads(bidnerf("info", folder, "--json")[1])
+    assert len(facts["capture"]["photos"]) == 24
+    status, out, _ = bidnerf("info", folder, "--draw", folder / "capture.png")
+    assert (status, lines[0] in out) == (0, True)
+    assert (folder / "capture.png").read_bytes().startswith(b"\x89PNG")
+    status, _, err = bidnerf("info", folder, "--draw", folder / "capture.jpg")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "PNG" in err
+
+
+@pytest.mark.parametrize("content", ["", "{}", '{"photos": 3}'])
+def test_a_damaged_record_of_photos_is_named_in_a_line(folder: Path, content: str, bidnerf: Run) -> None:
+    save_capture(folder, load_info(folder), CaptureReport((), CoverageRecord()))
+    assert bidnerf("info", folder).status == 0
+    file = folder / str(load_info(folder).capture)
+    file.write_text(content)
+    status, _, err = bidnerf("info", folder)
+    assert (status, err.count("\n")) == (1, 1)
+    assert file.name in err
+    file.unlink()
+    assert "missing" in bidnerf("info", folder).err

@@ -47,7 +47,7 @@ TOO_SLOW = {"train", "demo", "evaluate", "compare", "report"}
 """Commands that are only parsed: they take minutes, or the results of one that does."""
 OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest"}
 """Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""
-LANGUAGES = {"python", "sh", "toml", "bibtex"}
+LANGUAGES = {"python", "sh", "toml", "bibtex", "text"}
 
 every_page = pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 

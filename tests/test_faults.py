@@ -14,7 +14,7 @@ from scipy.ndimage import label
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand, faulty, parse_faults
+from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults, faulty, parse_faults
 from bidnerf_core.evaluation.faults.camera import rolling_shutter
 from bidnerf_core.evaluation.protocols import random_units
 from bidnerf_core.frames import Frame, View
@@ -159,14 +159,14 @@ def test_every_fault_is_documented() -> None:
 
 def test_words_name_single_and_composed_faults() -> None:
     words = ["none", "depth-scale:0.98,1.020", "mirror", "exposure:.7+blur:3"]
-    assert expand(words) == (
+    assert expand_faults(words) == (
         "none",
         "depth-scale:0.98",
         "depth-scale:1.02",
         "mirror:1",
         "exposure:0.7+blur:3",
     )
-    assert expand([]) == ()
+    assert expand_faults([]) == ()
     assert [str(part) for part in parse_faults("exposure:0.7+blur:3")] == ["exposure:0.7", "blur:3"]
     assert parse_faults(NO_FAULT) == ()
 
@@ -189,7 +189,7 @@ def test_words_name_single_and_composed_faults() -> None:
 )
 def test_bad_words_are_explained(word: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        expand([word])
+        expand_faults([word])
 
 
 def test_composed_faults_are_applied_in_turn_with_the_same_random_choices(view: View) -> None:

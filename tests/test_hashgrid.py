@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -197,14 +197,19 @@ def test_peaks_rise_at_once_fade_when_visited_and_stay_when_not() -> None:
     grid = grid_of(torch.zeros((RESOLUTION,) * 3, dtype=torch.bool))
     grid.peak.fill_(0.5)
     here, there = cell_centres(grid.grid)[[3, 6], [4, 7], [5, 8]]
-    grid.observe(torch.stack([here, there, here, here]), torch.tensor([0.1, 0.9, 0.2, 0.0]), fade=0.8)
+    weights, densities = torch.tensor([0.1, 0.9, 0.2, 0.0]), torch.tensor([3.0, 8.0, 2.0, 1.0])
+    grid.observe(torch.stack([here, there, here, here]), weights, densities, fade=0.8)
+    assert float(grid.density[3, 4, 5]) == 3
+    assert float(grid.density[6, 7, 8]) == 8
+    assert int((grid.density != 0).sum()) == 2
     assert float(grid.peak[3, 4, 5]) == pytest.approx(0.4)
     assert float(grid.peak[6, 7, 8]) == pytest.approx(0.9)
     assert int((grid.peak != 0.5).sum()) == 2
-    grid.observe(here[None], torch.tensor([0.35]), fade=0.8)
+    grid.observe(here[None], torch.tensor([0.35]), torch.ones(1), fade=0.8)
+    assert float(grid.density[3, 4, 5]) == pytest.approx(2.4)
     assert float(grid.peak[3, 4, 5]) == pytest.approx(0.35)
     before = grid.peak.clone()
-    grid.observe(torch.zeros(0, 3), torch.zeros(0), fade=0.8)
+    grid.observe(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), fade=0.8)
     assert torch.equal(grid.peak, before)
 
 
@@ -273,7 +278,7 @@ def test_levels_are_coarse_and_fine(field: HashGridField) -> None:
     assert fine is field
     assert isinstance(coarse, RadianceField)
     assert coarse.sampler is field.coarse_sampler
-    assert coarse.sampler.grid.shape[0] * 2 == field.sampler.grid.shape[0]
+    assert coarse.sampler.grid.shape[0] * 2 == field.occupancy.grid.shape[0]
 
 
 @pytest.mark.parametrize("level", [0, 1])
@@ -373,3 +378,32 @@ def test_building_leaves_the_global_chance_alone() -> None:
     state = torch.get_rng_state()
     backend.build(HashGridConfig(encoding=tiny.ENCODING, grid_resolution=8), BOUNDS)
     assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_a_state_without_densities_is_taken_and_samples_as_it_did(field: HashGridField) -> None:
+    """Maps were stored when the occupancy grid was the sampler itself and observed no densities."""
+    stored = {
+        name.replace("occupancy.", "sampler."): value
+        for name, value in field.state_dict().items()
+        if not name.endswith("density")
+    }
+    loaded = copy.deepcopy(field)
+    loaded.load_state_dict(field.upgraded_state(stored))
+    assert loaded.sampler is loaded.occupancy
+    samples, before = loaded.sampler(random_rays()), field.occupancy(random_rays())
+    assert torch.equal(samples.starts, before.starts)
+
+
+def test_samples_are_concentrated_in_contracted_scenes_only(field: HashGridField) -> None:
+    assert field.sampler is field.occupancy
+    opened = backend.build(field.config, replace(BOUNDS, far=90.0, contracted=True))
+    rays = opened.bounds.rays(*(getattr(random_rays(), part).float() for part in ("origins", "directions")))
+    assert int(opened.occupancy(rays).valid.sum(-1).max()) > 32
+    assert int(opened.sampler(rays).valid.sum(-1).max()) <= 32
+
+
+def test_todays_state_is_taken_as_it_is(field: HashGridField) -> None:
+    state = field.state_dict()
+    upgraded = field.upgraded_state(state)
+    assert upgraded.keys() == state.keys()
+    assert all(torch.equal(upgraded[name], value) for name, value in state.items())

@@ -10,7 +10,7 @@ import torch
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.mapping.features import Sift
-from bidnerf_core.mapping.landmark_building import LandmarkConfig, build_landmarks
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, build_landmarks, tracked_views
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.pose_scatter import robust_covariance
 from bidnerf_core.mapping.tracks import Matches, joined_tracks
@@ -40,6 +40,20 @@ def test_errors_are_as_large_as_the_deviations_say() -> None:
     along = (off * found.directions).sum(-1) / found.deviations[:, 1]
     assert 0.7 < float(along.abs().median()) / 0.6745 < 1.4
     assert found.noise == pytest.approx(0.4, rel=0.25)
+
+
+def test_each_image_sees_landmarks_as_far_away_as_they_are() -> None:
+    points = Points(noise=0.4)
+    views = ring(points)
+    seen, off = tracked_views(views, points).seen(LandmarkConfig()), []
+    assert len(seen) == len(views)
+    for view, part in zip(views, seen, strict=True):
+        local = view.T_ref_camera.inverse().apply(points.positions)
+        nearest = (PINHOLE.project(local) - part.pixels.double()[:, None]).norm(dim=-1).min(dim=1)
+        assert float(nearest.values.max()) < 4
+        off.append((part.distance - local[nearest.indices].norm(dim=-1)) / part.deviation)
+    assert len(torch.cat(off)) > 0.9 * sum(len(found.pixels) for found in points.seen)
+    assert 0.7 < float(torch.cat(off).abs().median()) / 0.6745 < 1.4
 
 
 def test_a_lens_with_distortion_changes_nothing() -> None:

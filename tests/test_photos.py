@@ -125,7 +125,7 @@ def test_reducing_keeps_the_directions_of_pixels(tmp_path: Path, code: int) -> N
     assert small.depth is not None
     assert set(small.depth.flatten().tolist()) == {1.0, 4.0}  # never a mean over an edge
     assert Frame.open(path, camera=CAMERA, largest=40).intrinsics == whole.intrinsics
-    with pytest.raises(InputError, match="largest is 0, expected a positive number"):
+    with pytest.raises(InputError, match="largest is 0, expected a positive whole number"):
         Frame.open(path, camera=CAMERA, largest=0)
 
 

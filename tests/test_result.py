@@ -31,6 +31,7 @@ KEYS = [
     "loss",
     "method",
     "focal_factor",
+    "confidence",
 ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from torch import Generator
 
 from bidnerf_core.field import Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.rendering import render
-from bidnerf_core.sampling import AroundDepth, Importance, Resampled, Stratified
+from bidnerf_core.sampling import AroundDepth, Concentrated, Importance, Resampled, Stratified
 from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.testing import samples as laws
 from bidnerf_hashgrid.occupancy import OccupancyGrid
@@ -151,3 +152,68 @@ def test_a_window_that_misses_the_scene_has_no_samples() -> None:
     samples = AroundDepth(torch.tensor([0.5, 60.0]), 0.1, 8, Stratified(4))(rays)
     assert not bool(samples.valid.any())
     assert bool((samples.ends >= samples.starts).all())
+
+
+# Concentration.
+
+
+def fewer(sampler: RaySampler, count: int = COUNT) -> Concentrated:
+    return Concentrated(Resampled(GaussianBlobs.random(), sampler), count)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_the_contracts_laws_hold_of_concentrated_samples(name: str) -> None:
+    field = Resampled(GaussianBlobs.random(), fewer(SAMPLERS[name]()))
+    for law in (laws.check_intervals, laws.check_repeatable, laws.check_rays_alone, laws.check_background):
+        law(field)
+
+
+@pytest.mark.parametrize("jittered", [False, True])
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_concentrated_samples_are_few_and_as_long_as_those_they_replace(name: str, jittered: bool) -> None:
+    where = rays()
+    jitter = Generator().manual_seed(3) if jittered else None
+    rough = SAMPLERS[name]()(where, Generator().manual_seed(3) if jittered else None)
+    found = fewer(SAMPLERS[name]())(where, jitter)
+
+    def length(samples: RaySamples) -> torch.Tensor:
+        return torch.where(samples.valid, samples.ends - samples.starts, 0).sum(-1)
+
+    assert int(found.valid.sum(-1).max() if found.valid.numel() else 0) <= COUNT
+    # An interval that reaches over a gap may lose part of its length to its neighbour.
+    lost = (length(rough) - length(found)) / length(rough).clamp(min=1e-9)
+    assert float(lost.abs().mean()) < 0.02
+
+
+def test_few_samples_are_kept_as_they_are() -> None:
+    where, rough = rays(), Stratified(COUNT)
+    kept = fewer(rough)(where)
+    assert all(
+        torch.equal(getattr(kept, part), getattr(rough(where), part)) for part in ("starts", "ends", "valid")
+    )
+
+
+def test_a_surface_is_seen_where_it_is_with_few_samples() -> None:
+    ball = HomogeneousBall(0.6, 60.0, rgb=(0.9, 0.5, 0.2))
+    where = rays()
+    exact = render(Resampled(ball, Stratified(4000)), where)
+    even, near = (
+        render(Resampled(ball, sampler), where)
+        for sampler in (Stratified(12), Concentrated(Resampled(ball, Stratified(256)), 12))
+    )
+    errors = [float((found.distance - exact.distance).abs().mean()) for found in (even, near)]
+    assert errors[1] < 0.25 * errors[0]
+    assert float((near.opacity - exact.opacity).abs().mean()) < 0.05
+
+
+def test_stratified_samples_of_an_open_scene_are_even_in_its_coordinate() -> None:
+    bounds = replace(BOUNDS, far=300.0, contracted=True)
+    where = bounds.rays(
+        torch.zeros(5, 3),
+        torch.nn.functional.normalize(torch.randn(5, 3, generator=Generator().manual_seed(2)), dim=-1),
+    )
+    samples = Stratified(40, bounds)(where)
+    widths = bounds.spacing(where).place(samples.ends) - bounds.spacing(where).place(samples.starts)
+    torch.testing.assert_close(widths, widths.mean(-1, keepdim=True).expand_as(widths), rtol=1e-2, atol=1e-4)
+    torch.testing.assert_close(samples.starts[:, 0], where.near)
+    torch.testing.assert_close(samples.ends[:, -1], where.far, rtol=1e-3, atol=0)

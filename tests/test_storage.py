@@ -23,6 +23,7 @@ from bidnerf_core import storage
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.files import write_file
+from bidnerf_core.map_cameras import stored_cameras
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
 from bidnerf_core.registry import load_backend
 from bidnerf_core.scenes.fields import HomogeneousBall
@@ -34,7 +35,6 @@ from bidnerf_core.storage import (
     load_state,
     save_map,
     save_surface,
-    stored_cameras,
 )
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
@@ -108,11 +108,11 @@ def test_what_is_saved_is_what_is_loaded(complete: bool, tmp_path: Path) -> None
 
 def test_what_follows_from_the_occupancy_is_brought_up_to_date_on_loading(tmp_path: Path) -> None:
     sparse = field(0)
-    sparse.sampler.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
+    sparse.occupancy.restrict(torch.zeros(16, 16, 16, dtype=torch.bool))
     save_map(tmp_path, info(), TrainingState(5, sparse.state_dict(), {}))
     loaded = load_map(tmp_path).field
     assert isinstance(loaded, HashGridField)
-    assert not loaded.sampler.near_occupied.any()
+    assert not loaded.occupancy.near_occupied.any()
     assert loaded.coarse_sampler.occupied.any()
 
 
@@ -395,7 +395,7 @@ def _with_weights(folder: Path, name: str, value: Tensor) -> Path:
     ],
     ids=["int", "nan"],
 )
-@pytest.mark.parametrize("name", ["sampler.peak", "colour.0.bias"])
+@pytest.mark.parametrize("name", ["occupancy.peak", "colour.0.bias"])
 def test_weights_and_buffers_of_another_kind_are_refused(
     name: str, change: Callable[[Tensor], Tensor], said: str, tmp_path: Path
 ) -> None:

@@ -13,10 +13,12 @@ import tiny
 from bidnerf_adanerf import AdaNerfConfig
 from bidnerf_adanerf import backend as adanerf
 from bidnerf_core.field import Rays, RaySamples
-from bidnerf_core.frames import View
+from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.rendering import Rendering, render, rendering_weights
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training import RayBank, Silent, TrainingBatch, ray_termination, supervised_loss
+from bidnerf_core.training.loss import distortion, expected_distance
+from bidnerf_core.training.ray_bank import LANDMARK_SHARE
 from bidnerf_hashgrid import backend as hashgrid
 from bidnerf_vanilla import VanillaConfig
 from bidnerf_vanilla import backend as vanilla
@@ -143,3 +145,97 @@ def test_a_single_measured_pixel_and_none_are_fine(name: str) -> None:
         for carve in (True, False):
             field = trained(name, views, steps=4, depth_weight=1.0, carve=carve)
             assert all(bool(p.isfinite().all()) for p in field.parameters())
+
+
+# Landmarks.
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.4, 2.0])
+def test_the_expected_distance_is_the_mean_of_draws(sigma: float) -> None:
+    offset = torch.tensor([-3.0, -0.5, 0.0, 0.2, 1.7], dtype=torch.float64)
+    errors = sigma * torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = (offset + errors).abs().mean(0)
+    found = expected_distance(offset, torch.tensor(sigma, dtype=torch.float64).expand(5))
+    torch.testing.assert_close(found, expected, rtol=0, atol=4 * sigma / 200_000**0.5)
+
+
+def test_without_deviation_the_expected_distance_is_the_distance() -> None:
+    offset = torch.linspace(-4, 4, 41, dtype=torch.float64)
+    assert torch.equal(expected_distance(offset, torch.zeros(41, dtype=torch.float64)), offset.abs())
+    barely = expected_distance(offset, torch.full((41,), 1e-9, dtype=torch.float64))
+    torch.testing.assert_close(barely, offset.abs(), rtol=0, atol=1e-8)
+
+
+def test_the_expected_distance_has_the_derivative_that_differences_show() -> None:
+    offset = torch.tensor([-2.0, -0.3, 0.1, 0.9], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda o: expected_distance(o, torch.full_like(o, 0.5)), offset)
+
+
+def test_a_landmark_pulls_weight_to_itself_and_less_the_less_certain_it_is() -> None:
+    def slope(deviation: float) -> torch.Tensor:
+        density = torch.full((10,), 0.01, dtype=torch.float64, requires_grad=True)
+        rendering, batch = ray(density, 3.25)
+        batch = replace(batch, deviation=torch.full_like(batch.deviation, deviation))
+        return torch.autograd.grad(ray_termination(rendering, batch), density)[0]
+
+    sharp, vague = slope(0.1), slope(2.0)
+    assert int(sharp.argmin()) == int(vague.argmin()) == 6
+    assert float(vague[6] - vague[4]) > float(sharp[6] - sharp[4])  # both negative
+
+
+def seen(view: View, every: int) -> View:
+    """The view with the depth of some pixels as landmarks, and no depth."""
+    assert view.frame.depth is not None
+    rows, columns = (index[::every] for index in (view.frame.depth > 0).nonzero(as_tuple=True))
+    pixels = torch.stack([columns, rows], dim=-1) + 0.5
+    ray = view.frame.intrinsics.unproject(pixels)
+    distance = view.frame.depth[rows, columns] * torch.linalg.vector_norm(ray, dim=-1)
+    landmarks = SeenLandmarks(pixels, distance, torch.full_like(distance, 0.01))
+    return replace(view, frame=replace(view.frame, depth=None), landmarks=landmarks)
+
+
+def test_a_share_of_the_rays_ends_at_landmarks_where_they_are() -> None:
+    views = tiny.views()
+    batch = RayBank([seen(view, 7) for view in views], BOUNDS).draw(800, torch.Generator().manual_seed(1))
+    known = batch.observed.measured
+    assert int(known.sum()) == round(LANDMARK_SHARE * 800)
+    assert torch.equal(known, batch.deviation > 0)
+    exact = RayBank(views, BOUNDS)
+    points = batch.observed[known].points
+    surface = exact.draw(20_000, torch.Generator().manual_seed(2)).observed
+    off = torch.cdist(points, surface[surface.measured].points).amin(1)
+    assert (
+        float((off < 1e-3).float().mean()) > 0.95
+    )  # each is a pixel's point, and nearly all pixels were drawn
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_every_backend_heeds_landmarks(name: str) -> None:
+    dense = tiny.views()
+    with_them, without = (
+        trained(name, [seen(view, 10) for view in dense], depth_weight=weight) for weight in (1.0, 0.0)
+    )
+    assert misplaced(with_them, dense) < 0.9 * misplaced(without, dense)
+
+
+# Distortion.
+
+
+def random_rendering() -> Rendering:
+    density = torch.rand(10, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    return ray(density, 0.0)[0]
+
+
+def test_distortion_is_the_double_sum_of_its_definition() -> None:
+    rendering = random_rendering()
+    weights, middles = rendering.weights[0], rendering.samples.middles[0] / 2.5
+    width = (rendering.samples.ends - rendering.samples.starts)[0] / 2.5
+    pairs = (weights[:, None] * weights * (middles[:, None] - middles).abs()).sum()
+    expected = pairs + (weights**2 * width).sum() / 3
+    torch.testing.assert_close(distortion(rendering, 2.5), expected)
+
+
+def test_weight_in_one_place_has_the_least_distortion() -> None:
+    wall = torch.zeros(10, dtype=torch.float64)
+    wall[4] = 100.0
+    assert float(distortion(ray(wall, 0.0)[0], 5.0)) < 0.2 * float(distortion(random_rendering(), 5.0))

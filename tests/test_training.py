@@ -115,7 +115,7 @@ def test_a_training_that_was_stopped_comes_to_the_same_end(
 
 def test_occupancy_changed_on_the_way(uninterrupted: TrainingState) -> None:
     """Else the law above would say nothing of it."""
-    for name in ("sampler", "coarse_sampler"):
+    for name in ("occupancy", "coarse_sampler"):
         occupied = uninterrupted.field[f"{name}.occupied"]
         assert 0 < occupied.double().mean() < 1
         assert uninterrupted.field[f"{name}.peak"].unique().numel() > 5

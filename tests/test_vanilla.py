@@ -23,7 +23,7 @@ from bidnerf_core.storage import MapInfo, load_map, save_map
 from bidnerf_core.testing import BackendContract
 from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, SIDE, points, rgb_views, rgbd_views
-from bidnerf_core.training import RayBank, TrainingState, ray_termination, supervised_loss
+from bidnerf_core.training import RayBank, Supervision, TrainingState, ray_termination, supervised_loss
 from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.encoding import encoded_width, positional_encoding
@@ -155,7 +155,7 @@ def test_the_fine_level_is_asked_where_the_coarse_one_says() -> None:
     coarse, fine = levels(field)
     assert coarse is field.coarse
     assert fine is field
-    assert inner(coarse.sampler) == Stratified(24)
+    assert inner(coarse.sampler) == Stratified(24, BOUNDS)
     placed = inner(fine.sampler)
     assert isinstance(placed, Importance)
     assert placed.field is field.coarse
@@ -277,7 +277,8 @@ def test_without_depth_only_colour_is_compared() -> None:
 def test_both_levels_learn_from_a_step() -> None:
     field = built()
     generator = torch.Generator().manual_seed(0)
-    outcome = step_outcome(field, RayBank(rgbd_views(), BOUNDS).draw(64, generator), 0.1, generator)
+    supervision = Supervision(rgbd_views(), BOUNDS, SMALL)
+    outcome = step_outcome(field, supervision, supervision.draw(64, generator), generator)
     outcome.loss.backward()
     assert all(float(p.grad.abs().sum()) > 0 for p in field.parameters() if p.grad is not None)
     assert all(p.grad is not None for p in field.parameters())

@@ -69,7 +69,10 @@ def black_batch(rays: Rays, distance: torch.Tensor) -> TrainingBatch:
     """Black pixels with measured distances (r; metres, 0 for none), before black."""
     coloured = torch.ones(len(distance), dtype=torch.bool)
     black = torch.zeros_like(rays.origins)
-    return TrainingBatch(rays, Observations(rays.origins, rays.directions, black, distance, coloured), black)
+    observed = Observations(rays.origins, rays.directions, black, distance, coloured)
+    return TrainingBatch(
+        rays, observed, black, torch.zeros(len(black), dtype=torch.long), torch.zeros_like(distance)
+    )
 
 
 def write_dataset(folder: Path, train: int = 6, test: int = 3, depth: bool = True) -> Path:

@@ -26,7 +26,7 @@ class Bins:
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
-        whole = Stratified(self.count)(self.through(rays), jitter)
+        whole = Stratified(self.count, self.bounds)(self.through(rays), jitter)
         near, far = rays.near[..., None], rays.far[..., None]
         starts, ends = (torch.minimum(torch.maximum(x, near), far) for x in (whole.starts, whole.ends))
         return RaySamples(starts, ends, whole.valid & (starts < ends))
@@ -64,11 +64,11 @@ def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
     """Return the oracle's scores of the bins of rays, as logits; differentiable in the oracle's parameters."""
     shape = rays.near.shape
     whole = bins.through(rays)
-    ends = torch.stack([whole.near, whole.far], dim=-1)
-    lower, upper = (ends.new_tensor(corner) for corner in (bins.bounds.lower, bins.bounds.upper))
-    points = (whole.at(ends) - (lower + upper) / 2) * (2 / max(bins.bounds.size))
-    enter, leave = points.reshape(-1, 2, 3).to(oracle.places).unbind(1)
-    logits: Tensor = oracle(enter, leave)
+    spacing = bins.bounds.spacing(whole)
+    near, far = spacing.place(torch.stack([whole.near, whole.far], dim=-1)).split(1, dim=-1)
+    along = spacing.distance(torch.lerp(near, far, oracle.places.to(near)))
+    points = bins.bounds.normalized(whole.at(along)).reshape(shape.numel(), len(oracle.places), 3)
+    logits: Tensor = oracle(points.to(oracle.places))
     return logits.reshape(*shape, logits.shape[-1])
 
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.settings import Count, NotNegative, Range, Settings
+from bidnerf_core.settings import Count, NotNegative, Range
+from bidnerf_core.training import SupervisionConfig
 
 
 @dataclass(frozen=True)
-class AdaNerfConfig(Settings):
+class AdaNerfConfig(SupervisionConfig):
     """Settings of an AdaNeRF. With the defaults, training takes about ten minutes on one core of a small CPU."""
 
     # The shading network.
@@ -38,7 +39,6 @@ class AdaNerfConfig(Settings):
     samples_per_step: Count = 8192
     rays_at_most: Count = 4096  # largest number of rays a step
     learning_rate: NotNegative = 3e-3  # initial learning rate
-    depth_weight: NotNegative = 0.1  # weight of the depth term beside the colour term; 0 leaves depth out
     sparsity_weight: NotNegative = 0.01  # weight of the mean score, once the soft phase is half over
     # weight of the oracle's own loss, whose targets are measured depth and shaded bins
     oracle_weight: NotNegative = 0.1

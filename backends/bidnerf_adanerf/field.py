@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
@@ -27,14 +26,11 @@ class AdaNerfField(nn.Module):
     There are no coarser ``levels``: the shading network is trained at the oracle's samples, at one level of detail.
     """
 
-    centre: Float[Tensor, "3"]
-
     def __init__(self, config: AdaNerfConfig, bounds: SceneBounds) -> None:
         super().__init__()
         self.config = config
         self.bounds = bounds
-        self.side = max(bounds.size)
-        self.register_buffer("centre", torch.tensor(bounds.centre), persistent=False)
+        self.side = bounds.side
         self.shading = ShadingNetwork(
             config.width, config.layers, config.position_frequencies, config.direction_frequencies
         )
@@ -57,7 +53,7 @@ class AdaNerfField(nn.Module):
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return the values at positions that are scaled to the cube [-1, 1], so that the unit of length has no effect."""
         shape = positions.shape[:-1]
-        points = (positions.reshape(-1, 3) - self.centre) * (2 / self.side)
+        points = self.bounds.normalized(positions.reshape(-1, 3))
         raw, rgb = self.shading(points, directions.reshape(-1, 3))
         density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))

@@ -69,10 +69,8 @@ class Oracle(nn.Module):
         self.scores = nn.Linear(width, bins)
         nn.init.constant_(self.scores.bias, FULL)
 
-    def forward(self, enter: Float[Tensor, "r 3"], leave: Float[Tensor, "r 3"]) -> Float[Tensor, "r n"]:
-        """Return the logits of the scores of rays that enter and leave the scene at these points of the cube [-1, 1]."""
-        places = self.places[:, None]
-        points = torch.lerp(enter[:, None], leave[:, None], places)
+    def forward(self, points: Float[Tensor, "r k 3"]) -> Float[Tensor, "r n"]:
+        """Return the logits of the scores of rays that pass these points of the cube [-1, 1], at ``places`` of their segment."""
         return self.scores(self.trunk(encode(points, self.frequencies).flatten(1)))
 
 

@@ -18,7 +18,7 @@ from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import query_samples, render, rendering_weights
-from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
+from bidnerf_core.training import Report, StepOutcome, Supervision, TrainingBatch, fit
 from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 
 PROBE = 4096
@@ -49,11 +49,11 @@ def sparsity(step: int, config: AdaNerfConfig) -> float:
 def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     room = room_for_matter(views, field.bounds, config.room_resolution) if config.carve else None
-    bank = RayBank(views, field.bounds)
+    supervision = Supervision(views, field.bounds, config)
 
     @cache
     def rays_per_step(sparse: bool) -> int:  # constant in a phase, also where training resumes
-        probe = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
+        probe = supervision.draw(PROBE, Generator().manual_seed(config.seed)).rays
         generator = Generator().manual_seed(config.seed)
         samples = field.sampler(probe) if sparse else dense_samples(field, probe, room, generator)[0]
         evaluations = 1 + float(samples.valid.sum()) / PROBE  # the oracle costs about as much as a sample
@@ -61,13 +61,13 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
         phase = phase_at(step, config)
-        batch = bank.draw(rays_per_step(phase is Phase.SPARSE), generator)
+        batch = supervision.draw(rays_per_step(phase is Phase.SPARSE), generator)
         if phase is Phase.SPARSE:
-            return sparse_step(field, batch, config, generator)
-        return dense_step(field, batch, room, config, step, generator)
+            return sparse_step(field, supervision, batch, generator)
+        return dense_step(field, supervision, batch, room, config, step, generator)
 
-    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
-    fit(field, groups, outcome, config.steps, report, seed=config.seed)
+    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}, *supervision.groups()]
+    fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
 
 
 def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int) -> OccupancyMask:
@@ -78,7 +78,8 @@ def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int)
 
 
 def dense_step(
-    field: AdaNerfField, batch: TrainingBatch, room: OccupancyMask | None, config: AdaNerfConfig, step: int, generator: Generator
+    field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, room: OccupancyMask | None,
+    config: AdaNerfConfig, step: int, generator: Generator,
 ) -> StepOutcome:  # fmt: skip
     """Return the loss with all bins shaded, which count in full or, in the soft phase, according to their scores."""
     samples, empty = dense_samples(field, batch.rays, room, generator)
@@ -88,7 +89,7 @@ def dense_step(
     soft = phase_at(step, config) is Phase.SOFT
     counted = soft_student(scores, config.threshold) if soft else torch.ones_like(scores)
     rendering = render_softly(values, samples, counted, batch.background)
-    loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
+    loss, mse = supervision.loss(rendering, batch)
     loss = loss + config.empty_weight * opacity(values, samples, empty)
     whole = rendering_weights(values.density, samples)
     loss = loss + config.oracle_weight * oracle_loss(logits, samples, whole, batch)
@@ -98,9 +99,9 @@ def dense_step(
 
 
 def sparse_step(
-    field: AdaNerfField, batch: TrainingBatch, config: AdaNerfConfig, generator: Generator
+    field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, generator: Generator
 ) -> StepOutcome:
     """Return the loss of rendering as in localization: the oracle, which is not trained any more, chooses the samples."""
     rendering = render(field, batch.rays, batch.background, generator)
-    loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
+    loss, mse = supervision.loss(rendering, batch)
     return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated
 
@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.sampling import Concentrated
 from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
-from bidnerf_hashgrid.occupancy import OccupancyGrid
+from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
 
 LARGEST_LOG_DENSITY = 12.0
 
@@ -32,22 +33,20 @@ class FieldConfig(Settings):
     geometry_features: Count = 15
     # cells of the occupancy grid along the longest side of the scene
     grid_resolution: Annotated[int, Range(2, 1024)] = 128
+    # largest number where the scene is contracted; elsewhere, or with 0, all intervals in occupied cells
+    samples_per_ray: Annotated[int, Range(0)] = 32
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 
 
 class HashGridField(nn.Module):
     """Density and colour in a scene's box. Its ``levels`` are the field with its fine encoding levels masked, and itself."""
 
-    lower: Float[Tensor, "3"]
-
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
         super().__init__()
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        lower = [middle - self.side / 2 for middle in bounds.centre]
-        self.register_buffer("lower", torch.tensor(lower), persistent=False)
-        self.encoding = HashEncoding(config.encoding)
+        self.encoding = HashEncoding(_scaled(config.encoding, 2 if bounds.contracted else 1))
         self.geometry = nn.Sequential(
             nn.Linear(self.encoding.width, config.width),
             nn.ReLU(),
@@ -58,12 +57,29 @@ class HashGridField(nn.Module):
             nn.Linear(config.width, 3),
             nn.Sigmoid(),
         )
-        self.sampler = OccupancyGrid(bounds, config.grid_resolution)
+        self.occupancy = OccupancyGrid(bounds, config.grid_resolution)
         self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
+
+    @property
+    def sampler(self) -> RaySampler:
+        count = self.config.samples_per_ray
+        guided = self.bounds.contracted and count > 0
+        return Concentrated(GridDensity(self.occupancy), count) if guided else self.occupancy
 
     @property
     def levels(self) -> tuple[CoarseField, HashGridField]:
         return CoarseField(self), self
+
+    def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return a stored state with today's names. The occupancy grid was the sampler, and it observed no densities,
+        which only contracted scenes need: there were none.
+        """
+        old = "sampler."
+        state = {f"occupancy.{k.removeprefix(old)}" if k.startswith(old) else k: v for k, v in state.items()}
+        for name in ("occupancy", "coarse_sampler"):
+            if (peak := state.get(f"{name}.peak")) is not None:
+                state.setdefault(f"{name}.density", torch.zeros_like(peak))
+        return state
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         return self.query_levels(positions, directions, None)
@@ -80,8 +96,13 @@ class HashGridField(nn.Module):
         return FieldValues(density.reshape(shape), self.colour(seen).reshape(*shape, 3))
 
     def encode(self, positions: Float[Tensor, "p 3"], active: int | None) -> Float[Tensor, "p f"]:
-        encoded: Tensor = self.encoding((positions - self.lower) / self.side, active)
+        encoded: Tensor = self.encoding((self.bounds.normalized(positions) + 1) / 2, active)
         return encoded
+
+
+def _scaled(encoding: HashEncodingConfig, factor: int) -> HashEncodingConfig:
+    """Return an encoding with a finest level ``factor`` times as fine: the box is a part of a contracted cube."""
+    return replace(encoding, finest_resolution=factor * encoding.finest_resolution)
 
 
 def _hidden(widths: Sequence[int]) -> list[nn.Module]:
@@ -96,6 +117,10 @@ class CoarseField:
 
     @property
     def sampler(self) -> OccupancyGrid:
+        return self.fine.coarse_sampler
+
+    @property
+    def occupancy(self) -> OccupancyGrid:
         return self.fine.coarse_sampler
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:

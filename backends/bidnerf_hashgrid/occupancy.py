@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from bidnerf_core.field import Rays, RaySamples, SceneBounds
+from bidnerf_core.contraction import RaySpacing
+from bidnerf_core.field import FieldValues, Rays, RaySamples, SceneBounds
 from bidnerf_core.voxel_grid import VoxelGrid
 
 BLOCK = 8
@@ -23,17 +26,21 @@ class OccupancyGrid(nn.Module):
     """
 
     peak: Float[Tensor, "n n n"]
+    density: Float[Tensor, "n n n"]  # per metre: the largest seen lately in each cell
     samples_per_ray: Float[Tensor, ""]  # running mean over training rays
     occupied: Bool[Tensor, "n n n"]
     near_occupied: Bool[Tensor, "n n n"]
 
     def __init__(self, bounds: SceneBounds, resolution: int, steps_per_cell: int = 2) -> None:
         super().__init__()
+        self.bounds = bounds
         self.grid = VoxelGrid.cube(bounds, resolution)
-        self.step = max(bounds.size) / (resolution * steps_per_cell)  # metres
+        # Metres in the uncontracted cube, which is half as wide as a contracted grid.
+        self.step = bounds.side * (2 if bounds.contracted else 1) / (resolution * steps_per_cell)
         self._reach = -(-BLOCK // (2 * steps_per_cell))  # cells from the middle of a block to its ends
         shape = self.grid.shape
         self.register_buffer("peak", torch.ones(shape))
+        self.register_buffer("density", torch.zeros(shape))
         self.register_buffer("samples_per_ray", torch.full((), float(resolution)))
         self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool))
         self.register_buffer("near_occupied", torch.ones(shape, dtype=torch.bool), persistent=False)
@@ -46,12 +53,19 @@ class OccupancyGrid(nn.Module):
         self.prune(0.0)
 
     @torch.no_grad()
-    def observe(self, positions: Float[Tensor, "p 3"], weights: Float[Tensor, "p"], fade: float) -> None:
-        """Update peaks by the rendering weights of one batch's samples, at ``positions`` (metres, world)."""
+    def observe(
+        self,
+        positions: Float[Tensor, "p 3"],
+        weights: Float[Tensor, "p"],
+        density: Float[Tensor, "p"],
+        fade: float,
+    ) -> None:
+        """Update peaks and densities by the rendering weights and densities at one batch's samples, ``positions`` (metres, world)."""
         cells = self.grid.numbers(positions)
-        seen = torch.zeros_like(self.peak).view(-1).scatter_reduce_(0, cells, weights.to(self.peak), "amax")
-        flat = self.peak.view(-1)
-        flat[cells] = torch.maximum(flat[cells] * fade, seen[cells])
+        for known, values in ((self.peak, weights), (self.density, density)):
+            seen = torch.zeros_like(known).view(-1).scatter_reduce_(0, cells, values.to(known), "amax")
+            flat = known.view(-1)
+            flat[cells] = torch.maximum(flat[cells] * fade, seen[cells])
 
     @torch.no_grad()
     def prune(self, threshold: float, grow: bool = True) -> None:
@@ -61,53 +75,82 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        """Return the intervals of the rays in occupied cells, equally long in the coordinate of ``SceneBounds.spacing``."""
         shape = rays.near.shape
-        origins, directions = rays.origins.detach().reshape(-1, 3), rays.directions.detach().reshape(-1, 3)
-        near, far = rays.near.reshape(-1), rays.far.reshape(-1)
+        flat = Rays(*(part.detach().reshape(-1, *part.shape[len(shape) :]) for part in
+                      (rays.origins, rays.directions, rays.near, rays.far)))  # fmt: skip
+        spacing = self.bounds.spacing(flat)
+        limits = spacing.place(torch.stack([flat.near, flat.far], dim=-1))
+        near, far = limits.unbind(-1)
         offset = torch.full_like(near, 0.5)
         if jitter is not None:
             offset = torch.rand(near.shape, generator=jitter, device=jitter.device).to(near)
-        ray, start = self._busy_blocks(origins, directions, near, far)
+        ray, start = self._busy_blocks(flat, spacing, near, far)
         steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
-        distance = start[:, None] + steps + (offset[ray] * self.step)[:, None]
-        positions = origins[ray][:, None] + distance[..., None] * directions[ray][:, None]
+        place = start[:, None] + steps + (offset[ray] * self.step)[:, None]
+        positions = _at(flat, ray, RaySpacing(spacing.exit[ray], spacing.radius).distance(place))
         occupied = self.grid.at(self.occupied, positions) & self.grid.contains(positions)
-        kept = occupied & (distance < far[ray][:, None])
-        return self._padded(distance[kept], ray[:, None].expand_as(kept)[kept], near, far, shape)
+        kept = occupied & (place < far[ray][:, None])
+        samples = self._padded(place[kept], ray[:, None].expand_as(kept)[kept], near, far)
+        width = samples.valid.shape[-1]
+        starts, ends = (
+            spacing.distance(part).reshape(*shape, width) for part in (samples.starts, samples.ends)
+        )
+        return RaySamples(starts, ends, samples.valid.reshape(*shape, width))
 
     def _busy_blocks(
-        self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
+        self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the ray and the start of each run of ``BLOCK`` steps that passes near an occupied cell, in order."""
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
         starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
-        inside = starts < far[:, None]
-        ray, block = inside.nonzero(as_tuple=True)
-        start = starts[ray, block]
-        middle = origins[ray] + (start + length / 2)[:, None] * directions[ray]
-        busy = self.grid.at(self.near_occupied, middle)
-        return ray[busy], start[busy]
+        positions = rays.at(spacing.distance(starts + length / 2))
+        ray, block = ((starts < far[:, None]) & self.grid.at(self.near_occupied, positions)).nonzero(
+            as_tuple=True
+        )
+        return ray, starts[ray, block]
 
-    def _padded(
-        self, distance: Tensor, ray: Tensor, near: Tensor, far: Tensor, shape: torch.Size
-    ) -> RaySamples:
+    def _padded(self, place: Tensor, ray: Tensor, near: Tensor, far: Tensor) -> RaySamples:
         """Return the samples, gathered at the front of their ray's row; all rows are as long as the longest."""
         counts = torch.bincount(ray, minlength=len(near))
         width = int(counts.amax()) if len(near) else 0
         slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
         middles = far[:, None].expand(-1, width).clone()
-        middles[ray, slot] = distance
-        valid = torch.arange(width, device=ray.device) < counts[:, None]
+        middles[ray, slot] = place
+        number = torch.arange(width, device=ray.device)
+        valid = number < counts[:, None]
         half = self.step / 2
         starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
         ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)
-        return RaySamples(
-            starts.reshape(*shape, width), ends.reshape(*shape, width), valid.reshape(*shape, width)
-        )
+        if (
+            self.bounds.contracted
+        ):  # the rest of a step at the far end is short in the coordinate, but long in metres
+            rest = (number == counts[:, None] - 1) & (far[:, None] - ends < self.step)
+            ends = torch.where(rest, far[:, None], ends)
+        return RaySamples(starts, ends, valid)
 
     def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))
+
+
+@dataclass(frozen=True)
+class GridDensity:
+    """The densities that an occupancy grid has observed, as a coarse field without colours."""
+
+    grid: OccupancyGrid
+
+    @property
+    def sampler(self) -> OccupancyGrid:
+        return self.grid
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        density = self.grid.grid.at(self.grid.density, positions)
+        return FieldValues(density, torch.zeros_like(positions))
+
+
+def _at(rays: Rays, ray: Int[Tensor, "b"], distance: Float[Tensor, "b s"]) -> Float[Tensor, "b s 3"]:
+    return rays.origins[ray][:, None] + distance[..., None] * rays.directions[ray][:, None]
 
 
 def _dilated(cells: Bool[Tensor, "n n n"], reach: int) -> Bool[Tensor, "n n n"]:

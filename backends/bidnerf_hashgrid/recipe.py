@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from torch import Generator
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
+from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
 from bidnerf_core.settings import Count, NotNegative, Range
-from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch, fit
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 
 
 @dataclass(frozen=True)
-class HashGridConfig(FieldConfig):
+class HashGridConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
     steps: Count = 1600  # steps of the optimizer
@@ -27,7 +28,6 @@ class HashGridConfig(FieldConfig):
     learning_rate: NotNegative = 1e-2  # learning rate of the tables; the networks have a quarter of it
     # steps from one update of the coarse field to the next; 0: it is not trained
     coarse_every: Annotated[int, Range(0)] = 4
-    depth_weight: NotNegative = 0.1  # weight of the depth term beside the colour term; 0 leaves depth out
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
     rays_at_most: Count = 16384  # largest number of rays a step
     prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
@@ -50,42 +50,64 @@ class HashGridConfig(FieldConfig):
             )
 
 
+def pruning(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
+    """Return the config with slower pruning where the scene is contracted.
+
+    There a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a cell that is left out
+    too early is rarely found again.
+    """
+    if not bounds.contracted:
+        return config
+    return replace(
+        config, prune_fade=config.prune_fade**0.4, prune_threshold=config.prune_threshold / 5,
+        grow_until=max(config.grow_until, 0.9),
+    )  # fmt: skip
+
+
 def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve and report.resume() is None:
-        for grid in (field.sampler, field.coarse_sampler):
+        for grid in (field.occupancy, field.coarse_sampler):
             grid.restrict(occupied_voxels(views, grid.grid))
-    bank = RayBank(views, field.bounds)
+    supervision, pruned = Supervision(views, field.bounds, config), pruning(config, field.bounds)
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
         {
             "params": [*field.geometry.parameters(), *field.colour.parameters()],
             "lr": config.learning_rate / 4,
         },
+        *supervision.groups(),
     ]
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
         coarse = config.coarse_every > 0 and step % config.coarse_every == config.coarse_every - 1
         level: CoarseField | HashGridField = field.levels[0] if coarse else field
-        grid = level.sampler
+        grid = level.occupancy
         affordable = int(config.samples_per_step / float(grid.samples_per_ray.clamp(min=1)))
         count = max(1, min(config.rays_at_most, affordable))
-        batch = bank.draw(count, generator)
+        batch = supervision.draw(count, generator)
         rendering = render(level, batch.rays, batch.background, generator)
-        _update(grid, batch, rendering, step, config)
-        loss, mse = supervised_loss(rendering, batch, field.side, config.depth_weight)
+        _update(grid, batch, rendering, step, pruned)
+        loss, mse = supervision.loss(rendering, batch)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
-    fit(field, groups, outcome, config.steps, report, seed=config.seed)
+    fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
 
 
 def _update(
     grid: OccupancyGrid, batch: TrainingBatch, rendering: Rendering, step: int, config: HashGridConfig
 ) -> None:
     """Update the occupancy grid by one step's rendering."""
-    valid = rendering.samples.valid
-    positions = batch.rays.at(rendering.samples.middles)[valid]
-    grid.observe(positions.detach(), rendering.weights.detach()[valid], config.prune_fade)
+    samples, density = rendering.samples, rendering.density
+    assert density is not None  # it comes from ``render``
+    valid = samples.valid
+    # The weights that steps of the grid would have: samples are longer or shorter, as they are concentrated.
+    place = grid.bounds.spacing(batch.rays).place
+    weights = (
+        rendering.weights.detach() * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
+    )
+    positions = batch.rays.at(samples.middles).detach()
+    grid.observe(positions[valid], weights[valid].clamp(max=1), density.detach()[valid], config.prune_fade)
     grid.samples_per_ray.lerp_(valid.sum() / len(valid), 0.1 if step > 10 else 1.0)
     if step >= config.prune_from and step % config.prune_every in (0, config.coarse_every - 1):
         grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
@@ -35,21 +34,18 @@ class FieldConfig(NetworkConfig):
 class Level(nn.Module):
     """A network and its sampler."""
 
-    centre: Float[Tensor, "3"]
-
     def __init__(self, config: NetworkConfig, bounds: SceneBounds, sampler: RaySampler) -> None:
         super().__init__()
         self.sampler = sampler
-        self.side = max(bounds.size)
-        self.register_buffer("centre", torch.tensor(bounds.centre), persistent=False)
+        self.bounds = bounds
         self.network = NerfNetwork(config)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
         """Return the values at positions that are scaled to the cube [-1, 1], so that the unit of length has no effect."""
         shape = positions.shape[:-1]
-        points = (positions.reshape(-1, 3) - self.centre) * (2 / self.side)
+        points = self.bounds.normalized(positions.reshape(-1, 3))
         raw, rgb = self.network(points, directions.reshape(-1, 3))
-        density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
+        density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.bounds.side)
         return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
 
 
@@ -60,9 +56,11 @@ class VanillaField(nn.Module):
         super().__init__()
         self.config = config
         self.bounds = bounds
-        self.side = max(bounds.size)
+        self.side = bounds.side
         self.room = OccupancyMask(VoxelGrid.cube(bounds, config.room_resolution))
-        self.coarse = Level(config, bounds, OccupiedOnly(self.room, Stratified(config.coarse_samples)))
+        self.coarse = Level(
+            config, bounds, OccupiedOnly(self.room, Stratified(config.coarse_samples, bounds))
+        )
         self.fine = Level(
             config, bounds, OccupiedOnly(self.room, Importance(self.coarse, config.fine_samples))
         )

@@ -14,7 +14,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
 from bidnerf_core.settings import Count, NotNegative, Range
-from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingBatch, fit, supervised_loss
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch, fit
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
 PROBE = 4096
@@ -22,7 +22,7 @@ PROBE = 4096
 
 
 @dataclass(frozen=True)
-class VanillaConfig(FieldConfig):
+class VanillaConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes about forty minutes on a small CPU."""
 
     steps: Count = 20000  # steps of the optimizer
@@ -30,7 +30,6 @@ class VanillaConfig(FieldConfig):
     samples_per_step: Count = 4096
     rays_at_most: Count = 4096  # largest number of rays a step
     learning_rate: NotNegative = 3e-3  # initial learning rate
-    depth_weight: NotNegative = 0.1  # weight of the depth term beside the colour term; 0 leaves depth out
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
     carve: bool = True  # skip the cells that the views' depth and silhouettes show to be empty
 
@@ -52,30 +51,30 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve:
         field.room.cells.copy_(occupied_voxels(views, field.room.grid))
-    bank = RayBank(views, field.bounds)
-    rays_per_step = _rays_per_step(field, bank, config)
+    supervision = Supervision(views, field.bounds, config)
+    rays_per_step = _rays_per_step(field, supervision, config)
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        return step_outcome(field, bank.draw(rays_per_step, generator), config.depth_weight, generator)
+        return step_outcome(field, supervision, supervision.draw(rays_per_step, generator), generator)
 
-    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
-    fit(field, groups, outcome, config.steps, report, seed=config.seed)
+    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}, *supervision.groups()]
+    fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
 
 
 def step_outcome(
-    field: VanillaField, batch: TrainingBatch, depth_weight: float, generator: Generator
+    field: VanillaField, supervision: Supervision, batch: TrainingBatch, generator: Generator
 ) -> StepOutcome:
     """Return the loss of both levels (eq. 6), and the colour error and the samples of the fine one."""
     coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
-    rough, _ = supervised_loss(coarse, batch, field.side, depth_weight)
-    loss, mse = supervised_loss(fine, batch, field.side, depth_weight)
+    rough, _ = supervision.loss(coarse, batch)
+    loss, mse = supervision.loss(fine, batch)
     return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch)))
 
 
 @torch.no_grad()
-def _rays_per_step(field: VanillaField, bank: RayBank, config: VanillaConfig) -> int:
+def _rays_per_step(field: VanillaField, supervision: Supervision, config: VanillaConfig) -> int:
     """Return the number of rays of a step: the fewer samples a ray takes, the more rays."""
-    rays = bank.draw(PROBE, Generator().manual_seed(config.seed)).rays
+    rays = supervision.draw(PROBE, Generator().manual_seed(config.seed)).rays
     coarse = field.coarse.sampler(rays).valid
     samples = float(coarse.sum() + config.fine_samples * coarse.any(-1).sum()) / PROBE
     return max(1, min(config.rays_at_most, int(config.samples_per_step / max(samples, 1.0))))

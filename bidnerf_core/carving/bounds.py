@@ -21,6 +21,10 @@ FAR_MARGIN = 1.1  # a camera may be a little farther away than any of the views
 LEAST_NEAR = 0.01  # of far, where cameras are inside the box and nothing was measured
 LEAST_SPREAD = 0.01  # mean squared sine of the angles between optical axes and their mean: about 6 degrees
 INWARD = 0.8  # fraction of the cameras that must see the point that all of them look at
+FAR_BEYOND = 2.0  # times the farthest that is known of, where there is matter beyond the box
+LEAST_LANDMARKS = 50  # sightings of landmarks in all views, for a box around them
+LANDMARKS_BEYOND = 0.05  # fraction of the landmarks, at either end of each axis, that may lie beyond the box
+LANDMARKS_NEARER = 0.01  # fraction of the landmarks that is disregarded where the nearest one is sought
 ROOM = 4.0  # assumed range of a hand-held camera's view, in multiples of the extent of its positions
 
 
@@ -30,10 +34,12 @@ def estimate_bounds(
     """Return the box that holds what ``views`` (poses in the world) show, and its range of distances from their cameras.
 
     With depth (dense in half of the views, or any where there are no silhouettes) the box holds the middle 99.8 % of the
-    measured points along each axis. With silhouettes (alpha) it is that of the visual hull. With colour only it is a guess:
-    for cameras that look inward, a cube around the point they look at, as large as what an image shows there; for others (a
-    room), the box of the cameras and of what they see within ``ROOM`` times the extent of their positions. Raises
-    ``InputError`` where there is only colour and all cameras are in one place.
+    measured points along each axis. With silhouettes (alpha) it is that of the visual hull. With colour only, it holds the
+    middle 90 % of the landmarks that the views see. Without landmarks it is a guess: for cameras that look inward, a cube
+    around the point they look at, as large as what an image shows there; for others (a room), the box of the cameras and of
+    what they see within ``ROOM`` times the extent of their positions. Unless half of the views have dense depth or
+    silhouettes, there may be matter beyond the box, and the scene is contracted. Raises ``InputError`` where there is only
+    colour and all cameras are in one place.
     """
     if not views:
         raise InputError("scene bounds: no views to estimate them from")
@@ -42,14 +48,50 @@ def estimate_bounds(
     outlined = [view for view in views if has_outline(view)]
     if measured and (2 * len(dense) >= len(views) or not outlined):
         box, near = _measured_box(measured, MARGIN if dense else SPARSE_MARGIN)
-        far = _farthest(views, box)
-    else:
-        box = _guessed_box(views)
-        if 2 * len(outlined) >= len(views):
-            box = carved_box(box, outlined)
-        far = _farthest(views, box)
-        near = max(_nearest(views, box) / 2, LEAST_NEAR * far)
-    return SceneBounds(corner(box[0]), corner(box[1]), near, FAR_MARGIN * far, background)
+        return _with_far(views, box, near, background, 2 * len(dense) < len(views))
+    if 2 * len(outlined) < len(views) and sum(_landmarks_of(view) for view in views) >= LEAST_LANDMARKS:
+        return _around_landmarks([view for view in views if _landmarks_of(view)], background)
+    box = _guessed_box(views)
+    if 2 * len(outlined) >= len(views):
+        box = carved_box(box, outlined)
+    least = LEAST_NEAR * _farthest(views, box)
+    near = max(_nearest(views, box) / 2, least)
+    return _with_far(views, box, near, background, 2 * len(outlined) < len(views))
+
+
+def _with_far(
+    views: Sequence[View], box: AxisBox, near: float, background: tuple[float, float, float], contracted: bool
+) -> SceneBounds:
+    """Return bounds that reach to the box's farthest corner or, where the scene is contracted, well beyond it."""
+    far = _farthest(views, box) * (FAR_BEYOND if contracted else FAR_MARGIN)
+    return SceneBounds(corner(box[0]), corner(box[1]), near, far, background, contracted)
+
+
+def _around_landmarks(views: Sequence[View], background: tuple[float, float, float]) -> SceneBounds:
+    """Return the bounds of a scene from the landmarks that the views see."""
+    points = torch.cat([_landmark_points(view) for view in views]).sort(dim=0).values
+    distances = (
+        torch.cat([view.landmarks.distance for view in views if view.landmarks is not None]).sort().values
+    )
+    last, cut = len(points) - 1, round(LANDMARKS_BEYOND * (len(points) - 1))
+    box = grown(points[cut], points[last - cut], distances[0].item() / 100)
+    near = distances[round(LANDMARKS_NEARER * last)].item() / 2
+    far = max(distances[round((1 - OUTLIERS) * last)].item(), _farthest(views, box)) * FAR_BEYOND
+    return SceneBounds(corner(box[0]), corner(box[1]), near, far, background, True)
+
+
+def _landmarks_of(view: View) -> int:
+    return 0 if view.landmarks is None else len(view.landmarks.distance)
+
+
+def _landmark_points(view: View) -> Float[Tensor, "n 3"]:
+    """Return the landmarks that a view sees (metres, world)."""
+    seen = view.landmarks
+    if seen is None:
+        return torch.zeros(0, 3, dtype=torch.float64)
+    ray = view.frame.intrinsics.unproject(seen.pixels.double())
+    points = ray * (seen.distance.double() / torch.linalg.vector_norm(ray, dim=-1))[:, None]
+    return view.T_ref_camera.to(torch.float64).apply(points)
 
 
 def _measured_box(views: Sequence[View], margin: float) -> tuple[AxisBox, float]:

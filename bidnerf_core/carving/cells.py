@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.carving.boxes import Corner
 from bidnerf_core.carving.free_space import FreeSpace
+from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
 from bidnerf_core.voxel_grid import VoxelGrid
@@ -25,8 +27,22 @@ SENSOR_TOLERANCE = 0.05
 def occupied_voxels(
     views: Sequence[View], grid: VoxelGrid, tolerance: float = SENSOR_TOLERANCE
 ) -> Bool[Tensor, "x y z"]:
-    """Return which cells of ``grid`` may hold matter, see ``occupied_cells``."""
+    """Return which cells of ``grid`` may hold matter, see ``occupied_cells``. Contracted cells are not judged: they may."""
+    if grid.contracted is not None:
+        return _within_contraction(views, grid, grid.contracted, tolerance)
     return occupied_cells(views, grid.lower, grid.upper, grid.shape, tolerance)
+
+
+def _within_contraction(
+    views: Sequence[View], grid: VoxelGrid, bounds: SceneBounds, tolerance: float
+) -> Bool[Tensor, "x y z"]:
+    """Judge the inner half of a grid of contracted space, which is the cube around the box. Its shape is divisible by 4."""
+    held = torch.ones(grid.shape, dtype=torch.bool)
+    inner = VoxelGrid.cube(replace(bounds, contracted=False), grid.shape[0] // 2)
+    quarter = grid.shape[0] // 4
+    middle = slice(quarter, quarter + inner.shape[0])
+    held[middle, middle, middle] = occupied_voxels(views, inner, tolerance)
+    return held
 
 
 def occupied_cells(
@@ -47,7 +63,7 @@ def occupied_cells(
     votes = torch.zeros(grid.blocks.shape[1], BLOCK**3, dtype=torch.uint8)
     needed = 1 if len(views) < 2 else 2
     undecided = torch.ones(len(votes), dtype=torch.bool)
-    for view in views:
+    for view in (view for view in views if view.frame.has_depth or view.frame.alpha is not None):
         space = FreeSpace.seen_by(view, tolerance, footprint)
         firsts, within = grid.middles(view.T_ref_camera)
         seen = space.may_free(firsts + within.mean(dim=1, keepdim=True), grid.block_radius)

@@ -7,22 +7,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bidnerf_core.cli.common import Flag, MapFolder, UsageError, option, parse, read_views, say
+from bidnerf_core.cli.common import Flag, MapFolder, UsageError, locked, option, parse, read_views, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
+from bidnerf_core.localization.capture_survey import surveyed
+from bidnerf_core.localization.landmark_trial import tried_landmarks
+from bidnerf_core.map_parts import load_landmarks
 from bidnerf_core.mapping import BakeConfig, bake
+from bidnerf_core.mapping.capture_advice import summary
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
-from bidnerf_core.mapping.landmark_building import build_landmarks
+from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
+from bidnerf_core.mapping.landmarks import HeldOutTrial
 from bidnerf_core.storage import (
     LandmarkSource,
     Map,
     MapInfo,
     cameras_of,
     load_info,
-    load_landmarks,
     load_map,
+    save_capture,
     save_landmarks,
     save_surface,
 )
@@ -59,14 +64,16 @@ def _bake(
     if rendered_landmarks and data is not None:
         raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
     background = load_info(map).bounds.background
-    views = [] if data is None else read_views(open_dataset(data, background), split)
-    bake_map(map, views, config, rendered_landmarks)
+    with locked(map):
+        views = [] if data is None else read_views(open_dataset(data, background), split)
+        bake_map(map, views, config, rendered_landmarks)
 
 
 def bake_map(
-    folder: Path, views: Sequence[View], config: BakeConfig, rendered_landmarks: bool = False
-) -> None:
-    """Bake the surface and the landmarks of the map in ``folder``.
+    folder: Path, views: Sequence[View], config: BakeConfig, rendered_landmarks: bool = False,
+    tracked: TrackedViews | None = None,
+) -> None:  # fmt: skip
+    """Bake the surface and the landmarks of the map in ``folder``; ``tracked`` if the views' keypoints were tracked already.
 
     Views with measured depth take the place of rendered ones for the surface, and all ``views`` give landmarks. Without
     views, landmarks come from images that the field renders, unless the map has landmarks of photos, which are kept where
@@ -87,7 +94,7 @@ def bake_map(
     noise = colour_noise(stored.field, stored.bounds, views) if views else stored.colour_noise
     source: LandmarkSource = "photos" if views else "rendered images"
     images = views or rendered_views(stored.field, stored.bounds, cameras)
-    _bake_landmarks(folder, stored, images, noise, source)
+    _bake_landmarks(folder, stored, images, noise, source, tracked)
 
 
 def _has_photo_landmarks(folder: Path, info: MapInfo) -> bool:
@@ -120,18 +127,38 @@ def _bake_surface(
 
 
 def _bake_landmarks(
-    folder: Path, stored: Map, views: Sequence[View], noise: float | None, source: LandmarkSource
-) -> None:
-    """Build landmarks of the views; a scene without texture has none, and the surface alone then serves."""
+    folder: Path, stored: Map, views: Sequence[View], noise: float | None, source: LandmarkSource,
+    tracked: TrackedViews | None,
+) -> None:  # fmt: skip
+    """Build landmarks of the views, and record what photos are fit for.
+
+    A scene without texture has no landmarks, and the surface alone then serves.
+    """
     began = time.monotonic()
-    try:
+    if tracked is None:
         with counted("landmarks", "steps") as report:
-            landmarks = build_landmarks(views, progress=report, report=say)
+            tracked = tracked_views(views, progress=report)
+    trial = HeldOutTrial()
+    try:
+        landmarks = tried_landmarks(tracked, views, report=say)
     except InputError as error:
         say(f"{folder}: no landmarks: {error}")
-        return
-    save_landmarks(folder, stored.info, landmarks, noise, source)
-    say(
-        f"{folder}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(views)} {source},"
-        f" {time.monotonic() - began:.1f} s"
-    )
+    else:
+        trial = landmarks.trial
+        save_landmarks(folder, stored.info, landmarks, noise, source)
+        say(
+            f"{folder}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(views)} {source},"
+            f" {time.monotonic() - began:.1f} s"
+        )
+    if source == "photos":
+        _record_capture(folder, stored.info, tracked, views, trial)
+
+
+def _record_capture(
+    folder: Path, info: MapInfo, tracked: TrackedViews, views: Sequence[View], trial: HeldOutTrial
+) -> None:
+    """Store what the photos are fit for, and summarise it."""
+    capture = surveyed(tracked, views, trial=trial)
+    save_capture(folder, info, capture)
+    for line in summary(capture):
+        say(line)

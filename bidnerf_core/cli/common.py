@@ -22,8 +22,9 @@ from rich.table import Table
 from rich.text import Text
 
 from bidnerf_core.cli.help_page import Page, without_expert_settings
-from bidnerf_core.cli.text import printable
+from bidnerf_core.cli.text import PrintableStream, printable
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import is_temporary, temporary
 
 if sys.platform != "win32":
     import fcntl
@@ -86,7 +87,12 @@ def parse(command: str, function: Callable[..., _T], arguments: list[str]) -> _T
 
 
 def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
-    return tyro.cli(function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,))
+    odd = any(printable(word) != word for word in arguments)
+    # The parser repeats the arguments in its messages, and may colour them; words that could control the terminal must not.
+    with contextlib.redirect_stderr(PrintableStream(sys.stderr)) if odd else contextlib.nullcontext():
+        return tyro.cli(
+            function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,)
+        )
 
 
 def _show_help(command: str, function: Callable[..., _T], hidden: int) -> _T:
@@ -197,7 +203,7 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[None]:
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         _make_writable(out)
-        with _locked(out):
+        with locked(out):
             _check_free(out, overwrite)  # another process may have finished meanwhile
             yield
     except FolderInUse:  # the folder is the other's to remove
@@ -210,7 +216,7 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """Hold a lock on a folder, which the system releases even where the process is killed.
 
     Raises ``FolderInUse`` where another process holds it. File systems without locks, and Windows, do without.
@@ -236,14 +242,22 @@ def _locked(folder: Path) -> Iterator[None]:
 def _check_free(out: Path, overwrite: bool) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected the name of a folder")
-    if out.is_dir() and not overwrite and any(out.iterdir()):
+    if out.is_dir() and not overwrite and not all(map(_is_leftover, out.iterdir())):
         raise InputError(f"{out}: exists already and is not empty; name another --out or pass --overwrite")
+
+
+def _is_leftover(file: Path) -> bool:
+    """Return whether a process that was killed left the file behind before there was a whole map."""
+    from bidnerf_core.storage import DESCRIPTION, OURS
+
+    of_map = OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
+    return of_map or is_temporary(file.name)
 
 
 def _make_writable(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
+        probe = temporary(out / "writable")
         probe.write_bytes(b"")
         probe.unlink()
     except OSError as error:

@@ -25,6 +25,7 @@ from bidnerf_core.cli.common import (
     print_table,
     require,
     say,
+    show,
     wrong_usage,
 )
 from bidnerf_core.errors import InputError
@@ -156,7 +157,7 @@ def _print(found: Comparison) -> None:
     size = ":".join(f"{x:g}" for x in found.size)
     trials = f"{found.trials} trials" if found.protocol == "none" else f"{found.trials} starts of"
     start = "without a start" if found.protocol == "none" else f"{found.protocol} {size}".rstrip()
-    print(f"{trials} {start} on {found.data}/{found.split}, method {found.method}")
+    show(f"{trials} {start} on {found.data}/{found.split}, method {found.method}")
     table = Table("", *(row.map for row in found.rows), box=None, pad_edge=False)
     for column in table.columns[1:]:
         column.justify = "right"

@@ -36,6 +36,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.figures import convergence_plot, save_gif
 from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.files import write_file
 from bidnerf_core.frames import View
 from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.registry import load_backend
@@ -147,7 +148,8 @@ def _shown(error: PoseError, digits: int, digits_of_angle: int) -> tuple[str, st
 def _draw(stored: Map, trials: Sequence[DemoTrial], out: Path) -> None:
     for trial in trials:
         painter = Painter(stored, trial.view.frame)
-        iio.imwrite(out / f"overlay-{trial.view.frame.name}.png", _overlay(painter, trial))
+        picture = iio.imwrite("<bytes>", _overlay(painter, trial), extension=".png")
+        write_file(out / f"overlay-{trial.view.frame.name}.png", bytes(picture))
     first = trials[0]
     painter, path = Painter(stored, first.view.frame), first.from_start.poses
     with console.status("drawing the animation"):

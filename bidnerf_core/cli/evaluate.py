@@ -23,6 +23,7 @@ from bidnerf_core.cli.common import (
     require,
     require_different,
     say,
+    show,
     wrong_usage,
 )
 from bidnerf_core.cli.trial_progress import TrialProgress
@@ -38,7 +39,7 @@ from bidnerf_core.evaluation.bench import (
     shard_of,
 )
 from bidnerf_core.evaluation.cluster import dask_executor
-from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand
+from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.provenance import command_line, note_run, provenance
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -142,7 +143,7 @@ def _evaluate(trials: list[Trial], out: Path, workers: int | None, dask: str | N
                 note_run(out, provenance(command, what))
                 _run(todo, file, executor, at_once)
         file.put_in_order(trials)
-    print(f"{len(trials)} trials in {out}; 'bidnerf report {out}' shows them")
+    show(f"{len(trials)} trials in {out}; 'bidnerf report {out}' shows them")
 
 
 def _note_unchecked(trials: list[Trial], file: ResultsFile, out: Path) -> None:
@@ -206,7 +207,7 @@ def _sizes(given: tuple[str, ...]) -> tuple[Size, ...] | None:
 def _faults(given: Names) -> tuple[str, ...]:
     """Return the faults to try; images as they are where none is given."""
     with wrong_usage():
-        return expand(word for group in given for word in group) or (NO_FAULT,)
+        return expand_faults(word for group in given for word in group) or (NO_FAULT,)
 
 
 def _own_data(map: str) -> str:

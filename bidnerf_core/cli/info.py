@@ -6,28 +6,57 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json, show
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.capture_figure import draw_capture
 from bidnerf_core.field import levels
+from bidnerf_core.map_parts import load_capture
+from bidnerf_core.mapping.capture_advice import sentences
+from bidnerf_core.mapping.capture_report import CaptureReport
 from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import load_map
+from bidnerf_core.storage import Map, load_map
 
 
 def run(arguments: list[str]) -> None:
     parse("info", info, arguments)
 
 
-def info(map: MapFolder, json: Annotated[Flag, option(None, "print one JSON object", "")] = False) -> None:
-    """Describe a map. It is loaded whole, so that damage is found here."""
-    facts = describe(map)
+def info(
+    map: MapFolder,
+    json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
+    draw: Annotated[
+        Path | None, option("PNG", "picture of the capture from above, to be written", "no picture")
+    ] = None,
+) -> None:
+    """Describe a map and the photos that it was made of. It is loaded whole, so that damage is found here."""
+    stored = load_map(map)
+    capture = None if stored.info.capture is None else load_capture(map / stored.info.capture)
+    if draw is not None:
+        _draw(map, stored, capture, draw)
+    facts = describe(map, stored)
     if json:
-        print_json(facts)
+        print_json(facts | {"capture": None if capture is None else to_plain(capture)})
         return
     for key, value in facts.items():
         show(f"{key + ':':<12} {_shown(value)}")
+    for line in [] if capture is None else sentences(capture):
+        show(f"- {line}")
 
 
-def describe(folder: Path) -> dict[str, Any]:
-    """Return what ``bidnerf info`` shows of the map in ``folder``."""
-    stored = load_map(folder)
+def _draw(folder: Path, stored: Map, capture: CaptureReport | None, out: Path) -> None:
+    """Draw the capture from above. Raises ``InputError`` where the map has no record of it."""
+    if capture is None:
+        raise InputError(
+            f"{folder}: has no record of its photos to draw; 'bidnerf bake MAP --data DATA' makes one"
+        )
+    if out.suffix.lower() != ".png":
+        raise InputError(f"{out}: expected the name of a PNG file")
+    seen_by = None if stored.landmarks is None else stored.landmarks.views
+    points = None if stored.landmarks is None else stored.landmarks.positions
+    draw_capture(capture, points, seen_by, out)
+
+
+def describe(folder: Path, stored: Map) -> dict[str, Any]:
+    """Return what ``bidnerf info`` shows of the map in ``folder``, beside the record of its photos."""
     info = stored.info
     parameters = sum(p.numel() for p in stored.field.parameters())  # type: ignore[attr-defined]
     return {
@@ -41,6 +70,8 @@ def describe(folder: Path) -> dict[str, Any]:
         "levels": len(levels(stored.field)),
         "parameters": parameters,
         "surfels": 0 if stored.surface is None else len(stored.surface.surfels),
+        "landmarks": 0 if stored.landmarks is None else len(stored.landmarks),
+        "trial": None if stored.landmarks is None else to_plain(stored.landmarks.trial),
         "bytes": sum(file.stat().st_size for file in folder.iterdir() if file.is_file()),
         "bounds": to_plain(info.bounds),
         "config": info.config,

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from bidnerf_core.cli.answers import Answer, Answers, OutputSpec
+from bidnerf_core.cli.camera_options import CameraFile, FieldOfView, FocalLength
 from bidnerf_core.cli.common import (
     LARGEST_SEED,
     Flag,
@@ -38,9 +39,6 @@ from bidnerf_core.localization.methods import require_use_of_depth
 from bidnerf_core.storage import Map, load_map
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
-one_camera = tyro.conf.create_mutex_group(
-    required=False, title="the camera of photos (default: as EXIF has it)"
-)
 
 
 def run(arguments: list[str]) -> None:
@@ -59,19 +57,9 @@ def run(arguments: list[str]) -> None:
             tuple[Path, ...],
             option("FILE...", "depth images or .npy of the photos, in their order or by their names", ""),
         ] = (),
-        camera: Annotated[
-            Path | None,
-            one_camera,
-            option(
-                "CAMERA.json", "file with intrinsics: transforms.json, cameras.json, COLMAP's cameras.txt", ""
-            ),
-        ] = None,
-        focal: Annotated[
-            float | None, one_camera, option("PX", "focal length in pixels of the image file", "")
-        ] = None,
-        hfov: Annotated[
-            float | None, one_camera, option("DEG", "horizontal field of view of the upright image", "")
-        ] = None,
+        camera: CameraFile = None,
+        focal: FocalLength = None,
+        hfov: FieldOfView = None,
         depth_unit: Annotated[
             float | None,
             option("METRES", "length of one unit of --depth", "0.001 for integers, 1 for floats"),

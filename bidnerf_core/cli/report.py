@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from bidnerf_core.cli.common import UsageError, console, option, output_folder, parse, print_table
+from bidnerf_core.cli.common import UsageError, console, option, output_folder, parse, print_table, show
 from bidnerf_core.errors import InputError
 
 if TYPE_CHECKING:  # the rest is imported when a report is made: help pages do without it
@@ -19,6 +19,7 @@ FAULT_CAPTION = (
     "Trials by fault of the images and its size, with Wilson's 95 % intervals: right (within 5 degrees and 0.05 units), "
     "converged by the method's own judgement, and converged but wrong."
 )
+LENGTH_OF_HEAD = 4096  # bytes of a page in which the mark of a report stands
 CriterionName = Literal["10%", "5deg 0.05", "1deg 0.02"]
 
 
@@ -65,7 +66,7 @@ def report(
         text = page(title, groups, draw_figures(groups, out, chosen), runs, chosen)
         write_file(out / "index.html", text.encode())
     _print(groups)
-    print(f"look at {out / 'index.html'}")
+    show(f"look at {out / 'index.html'}")
 
 
 def _criterion(asked: str | None, groups: Sequence[Group]) -> str:
@@ -85,12 +86,14 @@ def _criterion(asked: str | None, groups: Sequence[Group]) -> str:
 def _check_ours(out: Path) -> None:
     """Raise ``InputError`` where ``out`` holds something else than a report, which a newer report may replace."""
     from bidnerf_core.evaluation.page import MARK
+    from bidnerf_core.files import is_temporary, open_binary
 
     try:
-        written = MARK in (out / "index.html").read_text(errors="replace")
-    except OSError:
+        with open_binary(out / "index.html", "the page of a report") as file:
+            written = MARK.encode() in file.read(LENGTH_OF_HEAD)
+    except InputError:
         written = False
-    if out.is_dir() and any(out.iterdir()) and not written:
+    if out.is_dir() and not written and not all(is_temporary(file.name) for file in out.iterdir()):
         raise InputError(
             f"{out}: holds something that is no report of bidnerf's; name another --out or remove it"
         )

@@ -11,7 +11,7 @@ import torch
 from bidnerf_core.cli.common import UsageError
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
-from bidnerf_core.files import open_binary
+from bidnerf_core.files import read_file
 from bidnerf_core.localization import pose_from_matrix
 from bidnerf_core.se3 import SE3
 
@@ -49,12 +49,10 @@ def read_pose(path: Path) -> SE3:
 
     Raises ``InputError`` where the file holds no rigid transform by rows.
     """
+    content = read_file(path, "a pose file")
     try:
-        with open_binary(path, "a pose file") as file:
-            found = json.loads(file.read())
+        found = json.loads(content)
     except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path}: not JSON ({error}), {EXPECTED_POSE}") from error
     rows = found.get("T_world_camera") if isinstance(found, dict) else found
     try:

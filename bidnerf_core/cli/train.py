@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf_core.backend import Backend
-from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.carving import estimate_bounds, has_outline
 from bidnerf_core.cli.bake import bake_map
 from bidnerf_core.cli.common import (
     DEFAULT_BACKEND,
@@ -24,16 +25,18 @@ from bidnerf_core.cli.common import (
     value_of,
     wrong_usage,
 )
-from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
+from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining, counted
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.images import background_colour
+from bidnerf_core.map_cameras import stored_cameras
 from bidnerf_core.mapping import BakeConfig
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import MapInfo, build_field, load_info, load_state, stored_cameras
+from bidnerf_core.storage import MapInfo, build_field, load_info, load_state
 from bidnerf_core.training import TrainingStopped
 
 
@@ -137,12 +140,29 @@ def train_map(
     sparse_depth: int = 0,
 ) -> None:  # fmt: skip
     """Train a new map into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
+    tracked, views = located(views)
     bounds = estimate_bounds(views, background)
     settings = to_plain(config, "config")
     info = MapInfo(
         name, settings, bounds, 0, False, data, cameras=stored_cameras(views), sparse_depth=sparse_depth
     )
-    _run(backend, info, out, views, checkpoint_seconds, baked)
+    _run(backend, info, out, views, tracked, checkpoint_seconds, baked)
+
+
+def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:
+    """Track the keypoints of the views, unless all have dense depth or a silhouette: training takes distances from landmarks.
+
+    Return the tracks, of which ``bake_map`` makes the map's landmarks, and the views with the landmarks that each shows.
+    """
+    if all(view.frame.has_dense_depth or has_outline(view) for view in views):
+        return None, list(views)
+    began = time.monotonic()
+    with counted("landmarks", "steps") as report:
+        tracked = tracked_views(views, progress=report)
+    seen = tracked.seen(LandmarkConfig())
+    count = sum(len(part.distance) for part in seen)
+    say(f"{count} sightings of landmarks in {len(views)} views, {time.monotonic() - began:.1f} s")
+    return tracked, [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
 
 
 def load_interrupted(out: Path, baking: bool) -> MapInfo:
@@ -218,11 +238,13 @@ def _resume(
         say(f"{out}: training is complete ({info.step} steps); baking its surface")
         bake_map(out, views, BakeConfig())
         return
-    _run(load_backend(info.backend, str(out)), info, out, views, checkpoint_seconds, baked)
+    tracked, views = located(views)  # the same as when the training began
+    _run(load_backend(info.backend, str(out)), info, out, views, tracked, checkpoint_seconds, baked)
 
 
 def _run(
-    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], checkpoint_seconds: float, baked: bool
+    backend: Backend, info: MapInfo, out: Path, views: Sequence[View], tracked: TrackedViews | None,
+    checkpoint_seconds: float, baked: bool,
 ) -> None:  # fmt: skip
     field, config = build_field(backend, info, str(out))
     state = load_state(out, info, field) if info.step else None
@@ -233,7 +255,7 @@ def _run(
         report.finish(field)
     if baked:
         try:
-            bake_map(out, views, BakeConfig())
+            bake_map(out, views, BakeConfig(), tracked=tracked)
         except InputError as error:  # the map itself is sound
             say(f"{out}: no surface baked: {error}")
     say(f"{out}: map of {info.data}, {sum(f.stat().st_size for f in out.iterdir()) / 2**20:.1f} MiB")

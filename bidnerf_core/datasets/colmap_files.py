@@ -26,7 +26,7 @@ from bidnerf_core.camera_sources import (
     read_text_cameras,
 )
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
+from bidnerf_core.files import read_file
 from bidnerf_core.se3 import SE3
 
 _Item = TypeVar("_Item")
@@ -36,6 +36,7 @@ NAMES = ("images", "points3D")
 COUNT, IMAGE, POINT = struct.Struct("<Q"), struct.Struct("<I7dI"), struct.Struct("<q3d3BdQ")
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 CAMERA = struct.Struct("<IiQQ")
+LARGEST_MODEL = 2**30  # bytes of a file of a model
 TRACK_BYTES = 8  # an image and one of its key points, 4 bytes each
 
 
@@ -269,5 +270,4 @@ def _lines(path: Path) -> list[str]:
 
 
 def _content(path: Path) -> bytes:
-    with open_binary(path, "a file of a COLMAP sparse model") as file:
-        return file.read()
+    return read_file(path, "a file of a COLMAP sparse model", LARGEST_MODEL)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
+from bidnerf_core.arrays import read_archive, read_array
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
+from bidnerf_core.files import read_file
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
@@ -38,16 +38,15 @@ def read_depth_points(path: Path) -> Observations:
 
 def _read(path: Path) -> tuple[np.ndarray, SE3]:
     """Return the array in a file, and the pose of the sensor that it belongs to."""
-    with open_binary(path, "a file of points") as file:
-        try:
-            if path.suffix not in (".npz", ".npy"):
-                return _from_text(file.read().decode()), SE3.identity()
-            found = np.load(file, allow_pickle=False)
-            return (found, SE3.identity()) if isinstance(found, np.ndarray) else _from_archive(path, found)
-        except InputError:
-            raise
-        except (OSError, ValueError, EOFError, BadZipFile) as error:
-            raise InputError(f"{path}: not a file of points ({error}), {EXPECTED_POINTS}") from error
+    if path.suffix == ".npz":
+        return _from_archive(path)
+    if path.suffix == ".npy":
+        return read_array(path, "a .npy file of points"), SE3.identity()
+    content = read_file(path, "a file of points")
+    try:
+        return _from_text(content.decode()), SE3.identity()
+    except ValueError as error:
+        raise InputError(f"{path}: not a file of points ({error}), {EXPECTED_POINTS}") from error
 
 
 def _from_text(text: str) -> np.ndarray:
@@ -58,17 +57,15 @@ def _from_text(text: str) -> np.ndarray:
     return np.array([[float(word) for word in row] for row in rows], dtype=np.float64)
 
 
-def _from_archive(path: Path, archive: np.lib.npyio.NpzFile) -> tuple[np.ndarray, SE3]:
-    with archive:
-        if "points" not in archive:
-            raise InputError(f"{path}: holds {', '.join(archive) or 'nothing'}, expected an array 'points'")
-        arrays = [archive[name] for name in ("points", "T_camera_sensor") if name in archive]
-        if not all(isinstance(array, np.ndarray) for array in arrays):  # others come as bytes
-            raise InputError(f"{path}: holds something that is not an array, {EXPECTED_POINTS} in 'points'")
-        if len(arrays) == 1:
-            return arrays[0], SE3.identity()
-        matrix = torch.from_numpy(arrays[1].astype(np.float64))
-        pose = SE3.from_matrix(matrix) if matrix.shape == (4, 4) else None
-        if pose is None or not bool(pose.is_rigid()):
-            raise InputError(f"{path}: T_camera_sensor is not a rigid transform, expected 4x4")
-        return arrays[0], pose.normalized()
+def _from_archive(path: Path) -> tuple[np.ndarray, SE3]:
+    arrays = read_archive(path, ("points", "T_camera_sensor"), "a .npz file of points")
+    if "points" not in arrays:
+        raise InputError(f"{path}: no array 'points' in it, expected one with {EXPECTED_POINTS[9:]}")
+    if "T_camera_sensor" not in arrays:
+        return arrays["points"], SE3.identity()
+    given = arrays["T_camera_sensor"]
+    matrix = torch.from_numpy(given.astype(np.float64)) if given.dtype.kind in "fiu" else torch.empty(0)
+    pose = SE3.from_matrix(matrix) if matrix.shape == (4, 4) else None
+    if pose is None or not bool(pose.is_rigid()):
+        raise InputError(f"{path}: T_camera_sensor is not a rigid transform, expected 4x4")
+    return arrays["points"], pose.normalized()

@@ -36,6 +36,7 @@ from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.depth_images import DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import read_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, decode, over, read_header, read_image, reduced
 from bidnerf_core.orientation import UPRIGHT
@@ -95,8 +96,8 @@ class ScannerAppReader:
         """Return whether the first ``frame_N.json`` has a pose of ARKit; a broken one is left to other readers."""
         first = next(iter(sorted(path.glob("frame_*.json"))), None)
         try:
-            return first is not None and POSE in first.read_bytes().decode(errors="replace")
-        except OSError:
+            return first is not None and POSE.encode() in read_file(first, "JSON")
+        except InputError:
             return False
 
     def open(self, path: Path, background: Background | None) -> Dataset:

@@ -34,13 +34,13 @@ from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
+from bidnerf_core.files import read_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.photos import natural_order
 from bidnerf_core.se3 import SE3
 
-MILLIMETRE = 0.001
+DEPTH_UNIT = 0.001
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
 COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)
 T_COLOUR_DEPTH = SE3(
@@ -154,7 +154,7 @@ class SevenScenesDataset(OpaqueDataset[SceneFrame]):
         colour, alpha = read_image(frame.image)
         depth = None
         if frame.depth.is_file():
-            depth = self._read_depth(frame.depth, MILLIMETRE).metres
+            depth = self._read_depth(frame.depth, DEPTH_UNIT).metres
             if depth.shape != colour.shape[:2]:
                 raise InputError(
                     f"{frame.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
@@ -181,8 +181,7 @@ def _splits(path: Path) -> dict[str, list[SceneFrame]]:
 
 def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
     """Return the numbers of the sequences that a split file lists. Raises ``InputError``."""
-    with open_binary(file, "a list of sequences") as opened:
-        lines = opened.read().decode("utf-8-sig", "replace").split("\n")
+    lines = read_file(file, "a list of sequences").decode("utf-8-sig", "replace").split("\n")
     numbers = list[int]()
     for number, line in enumerate(map(str.strip, lines), start=1):
         if not line:

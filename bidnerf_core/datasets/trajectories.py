@@ -16,7 +16,7 @@ from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows
 from bidnerf_core.errors import InputError
 from bidnerf_core.se3 import SE3
 
-COLUMNS = "tx ty tz qx qy qz qw"
+NUMBERS_A_LINE = "tx ty tz qx qy qz qw"
 UNIT_TO = 0.01
 """How far the length of a quaternion may be from 1, as rounding to four decimals causes it."""
 LARGEST_GAP = 0.1
@@ -60,7 +60,7 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises ``InputError`` with the file and its line where a row is cut off, a number is not finite, a quaternion is not of
     length 1, or two rows have one time and different poses.
     """
-    rows = read_timed_rows(path, COLUMNS)
+    rows = read_timed_rows(path, NUMBERS_A_LINE)
     numbers = [_pose_numbers(row) for row in rows]
     kept = list[int]()
     for place, row in enumerate(rows):
@@ -82,9 +82,9 @@ def _pose_numbers(row: TimedRow) -> list[float]:
     try:
         numbers = [float(word) for word in row.words[:7]]
     except ValueError as error:
-        raise InputError(f"{row.where}: {error}, expected timestamp {COLUMNS}") from error
+        raise InputError(f"{row.where}: {error}, expected timestamp {NUMBERS_A_LINE}") from error
     if not all(map(math.isfinite, numbers)):
-        raise InputError(f"{row.where}: the pose is not finite, expected timestamp {COLUMNS}")
+        raise InputError(f"{row.where}: the pose is not finite, expected timestamp {NUMBERS_A_LINE}")
     length = math.hypot(*numbers[3:])
     if abs(length - 1) > UNIT_TO:
         raise InputError(f"{row.where}: the quaternion has length {length:.3g}, expected 1 (qx qy qz qw)")

@@ -38,7 +38,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.se3 import SE3
 
-COLOURS, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
+COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 METRES_PER_STEP = 1 / 5000
 LARGEST_DIFFERENCE = 0.02
 """Seconds between a colour image and its depth image, as the benchmark's own association has it."""
@@ -86,7 +86,7 @@ class TumReader:
     expected = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
 
     def recognises(self, path: Path) -> bool:
-        return (path / COLOURS).is_file()
+        return (path / COLOUR_LIST).is_file()
 
     def with_camera(self, camera: Intrinsics | Path) -> TumReader:
         return replace(self, camera=camera)
@@ -98,7 +98,7 @@ class TumReader:
         posed = [frame for frame in tum_frames(path) if frame.truth is not None]
         if not posed:
             raise InputError(
-                f"{path / TRUTH}: covers no image of {COLOURS}, expected samples before and after their times, "
+                f"{path / TRUTH}: covers no image of {COLOUR_LIST}, expected samples before and after their times, "
                 f"at most {LARGEST_GAP:g} s apart"
             )
         return TumDataset(Splits(path, hold_out(posed)), self._camera(path), background)
@@ -155,7 +155,7 @@ def published_camera(folder: Path) -> Intrinsics | None:
 
 def tum_frames(folder: Path) -> list[TumFrame]:
     """Read the lists of a folder and associate them by time; no image is opened. Raises ``InputError``."""
-    colours = _listed(folder / COLOURS)
+    colours = _listed(folder / COLOUR_LIST)
     depths = _listed(folder / DEPTHS) if (folder / DEPTHS).is_file() else []
     path = read_trajectory(folder / TRUTH) if (folder / TRUTH).is_file() else None
     partners = associate([row.time for row in colours], [row.time for row in depths], LARGEST_DIFFERENCE)

@@ -16,6 +16,7 @@ from bidnerf_core.evaluation.plot_style import (
     line_look,
     new_figure,
     styled,
+    write_figure,
 )
 from bidnerf_core.evaluation.summary import seconds_to_success, usual_criterion
 
@@ -41,7 +42,7 @@ def comparison_figure(paths: Sequence[Path], comparison: Comparison) -> None:
             _draw_cost(figure.add_subplot(grid[1, place]), comparison.rows, name, cost, place == 0)
         figure.suptitle(_title(comparison), fontsize="medium")
         for path in paths:
-            figure.savefig(path, dpi=130)
+            write_figure(figure, path, dpi=130)
 
 
 def _title(comparison: Comparison) -> str:

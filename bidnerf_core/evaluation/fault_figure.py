@@ -16,8 +16,8 @@ from bidnerf_core.evaluation.groups import Group, Situation, situation_titles
 from bidnerf_core.evaluation.plot_style import COLOURS, new_figure, save_figure, styled
 from bidnerf_core.evaluation.summary import ABSOLUTE, Summary, summarize
 
-COLUMNS, PANEL = 3, (3.6, 2.7)  # inches
-LINES: dict[str, tuple[Callable[[Summary], int], str]] = {
+FIGURE_COLUMNS, FAULT_PANEL = 3, (3.6, 2.7)  # inches
+DRAWN_SHARES: dict[str, tuple[Callable[[Summary], int], str]] = {
     "right": (lambda s: found.rate.successes if (found := s.criteria[ABSOLUTE]) else 0, COLOURS[2]),
     "converged": (lambda s: s.converged, COLOURS[0]),
     "converged, but wrong": (lambda s: s.converged_but_wrong, COLOURS[1]),
@@ -66,17 +66,17 @@ def draw_faults(groups: Sequence[Group], folder: Path) -> Path | None:
         return None
     titles = situation_titles([curve.situation for curve in curves])
     labels = {curve.label for curve in curves}
-    rows = math.ceil(len(curves) / COLUMNS)
+    rows = math.ceil(len(curves) / FIGURE_COLUMNS)
     with styled():
-        figure = new_figure(COLUMNS * PANEL[0], rows * PANEL[1] + 0.3)
-        axes = figure.subplots(rows, COLUMNS, squeeze=False).flatten()
+        figure = new_figure(FIGURE_COLUMNS * FAULT_PANEL[0], rows * FAULT_PANEL[1] + 0.3)
+        axes = figure.subplots(rows, FIGURE_COLUMNS, squeeze=False).flatten()
         for panel, curve in zip(axes, curves, strict=False):
             places = [titles[curve.situation]] + ([curve.label] if len(labels) > 1 else [])
             _draw(panel, curve, f"{curve.name}\n{', '.join(places)}")
         for panel in axes[len(curves) :]:
             panel.set_axis_off()
         handles, names = axes[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=len(LINES))
+        figure.legend(handles, names, loc="outside lower center", ncols=len(DRAWN_SHARES))
         return save_figure(figure, folder, "faults")
 
 
@@ -85,7 +85,7 @@ def _draw(panel: Any, curve: FaultCurve, title: str) -> None:
     fault = find_fault(curve.name)
     summaries = [summarize(group.results) for _, group in curve.points]
     places = np.arange(len(curve.points))
-    for turn, (label, (count, colour)) in enumerate(LINES.items()):
+    for turn, (label, (count, colour)) in enumerate(DRAWN_SHARES.items()):
         rates = [success_rate(count(s), s.trials) for s in summaries]
         middle = np.array([rate.rate for rate in rates])
         ends = np.array([[r.low for r in rates], [r.high for r in rates]])

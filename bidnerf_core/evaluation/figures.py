@@ -16,7 +16,8 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import PoseError
-from bidnerf_core.evaluation.plot_style import line_look, new_figure, styled
+from bidnerf_core.evaluation.plot_style import line_look, new_figure, styled, write_figure
+from bidnerf_core.files import write_file
 
 TILE = 240  # pixels: smaller images are enlarged to about this, so that captions fit
 CAPTION, GAP = 22, 6  # pixels
@@ -148,7 +149,8 @@ def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float 
         raise InputError(f"{path}: an animation of no frames")
     _require_same_size(pictures, [f"frame {i}" for i in range(len(pictures))])
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(path, np.stack(pictures), extension=".gif", duration=1000 / fps, loop=0)
+    content = iio.imwrite("<bytes>", np.stack(pictures), extension=".gif", duration=1000 / fps, loop=0)
+    write_file(Path(path), bytes(content))
 
 
 def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
@@ -169,7 +171,7 @@ def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
         )
         left.legend(fontsize="small")
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=130)
+        write_figure(figure, Path(path), dpi=130)
 
 
 def _array(values: ArrayLike | Tensor) -> np.ndarray:

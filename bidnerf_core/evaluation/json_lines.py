@@ -13,10 +13,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import Any, BinaryIO
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary, write_file
+from bidnerf_core.files import open_binary, read_file, read_open_file, write_file
+
+LARGEST_LINES = 512 * 2**20
+"""Bytes. A trial takes some kilobytes, so a file holds a hundred thousand of them."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,7 @@ class LineFormat:
 
     def read(self, path: Path) -> list[tuple[str, Any]]:
         """Return the place and the object of each whole line of ``path``. Raises ``InputError`` where it cannot be read."""
-        with open_binary(path, self.expected) as file:
-            content = file.read()
-        return self.parse(path, content)[0]
+        return self.parse(path, read_file(path, self.expected, LARGEST_LINES))[0]
 
 
 class JsonLinesFile:
@@ -57,13 +58,13 @@ class JsonLinesFile:
 
     def __init__(self, path: Path, kind: LineFormat) -> None:
         self.path, self._kind = path, kind
-        self._file: IO[bytes] | None = None
+        self._file: BinaryIO | None = None
 
     def open(self) -> list[tuple[str, Any]]:
         """Create, lock and repair the file; return the place and the object of each line."""
         self._file = self._locked()
         try:
-            content = self._file.read()
+            content = read_open_file(self._file, self.path, self._kind.expected, LARGEST_LINES)
             found, whole = self._kind.parse(self.path, content)
         except BaseException:
             self.close()
@@ -112,12 +113,12 @@ class JsonLinesFile:
                 "begin again, or move the file back where it was"
             )
 
-    def _opened(self) -> IO[bytes]:
+    def _opened(self) -> BinaryIO:
         if self._file is None:
             raise RuntimeError(f"{self.path} is not open")
         return self._file
 
-    def _locked(self) -> IO[bytes]:
+    def _locked(self) -> BinaryIO:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
             open_binary(self.path, self._kind.expected).close()  # not a pipe, which would wait for a reader

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import write_file
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 """The colour-blind-safe palette of Okabe and Ito (2008), with brown for its yellow, which white paper swallows."""
@@ -59,9 +61,16 @@ def new_figure(width: float, height: float) -> Any:
 def save_figure(figure: Any, folder: Path, name: str) -> Path:
     """Save a figure as SVG, whose path is returned, and as PNG beside it."""
     folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"{name}.png", dpi=160)
-    figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+    write_figure(figure, folder / f"{name}.png", dpi=160)
+    write_figure(figure, folder / f"{name}.svg", metadata={"Date": None})
     return folder / f"{name}.svg"
+
+
+def write_figure(figure: Any, path: Path, **options: Any) -> None:
+    """Write a figure in the format of the path's suffix, whole or not at all."""
+    file = io.BytesIO()
+    figure.savefig(file, format=path.suffix.lstrip("."), **options)
+    write_file(path, file.getvalue())
 
 
 def line_look(place: int) -> dict[str, Any]:

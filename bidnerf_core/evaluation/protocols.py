@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, unknown_name
 from bidnerf_core.evaluation import parallel_inversion
 from bidnerf_core.se3 import SE3
 
@@ -142,9 +141,7 @@ def five_of_each(frames: int, trials: int, seed: int) -> list[Case]:
 def find_protocol(name: str) -> Protocol:
     """Return a protocol by name. Raises ``InputError`` for an unknown name."""
     if name not in PROTOCOLS:
-        near = difflib.get_close_matches(name, PROTOCOLS, n=1)
-        hint = f", did you mean {near[0]!r}?" if near else f", expected one of {', '.join(PROTOCOLS)}"
-        raise InputError(f"no protocol {name!r}{hint}")
+        raise unknown_name("protocol", name, PROTOCOLS)
     return PROTOCOLS[name]
 
 

@@ -18,7 +18,7 @@ import torch
 
 import bidnerf_core
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import write_file
+from bidnerf_core.files import read_file, write_file
 from bidnerf_core.serialization import from_plain, to_plain
 
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
@@ -83,11 +83,12 @@ def read_runs(results: Path) -> list[Provenance]:
     path = beside(results)
     if not path.is_file():
         return []
-    expected = "expected what 'bidnerf evaluate' writes beside its results"
+    what = "what 'bidnerf evaluate' writes beside its results"
+    content, expected = read_file(path, what), f"expected {what}"
     try:
-        found: Any = json.loads(path.read_bytes())
+        found: Any = json.loads(content)
         json.dumps(found, ensure_ascii=False).encode()  # half of a surrogate pair cannot be written again
-    except (OSError, ValueError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}), {expected}") from error
     if not isinstance(found, dict) or not isinstance(found.get("runs"), list):
         raise InputError(f"{path}: no list of runs, {expected}")

@@ -106,6 +106,7 @@ class TrialResult:
     trial: Trial  # with folders' names instead of paths
     outcome: str = ""  # the kind of the method's judgement; empty in results of earlier versions
     focal_factor: float = 1.0  # true focal length over the given one, where it was estimated along
+    confidence: float | None = None  # probability that the pose is right, where a model of it was learned
     inputs: InputDigests | None = None  # none in results of earlier versions
 
     def __post_init__(self) -> None:

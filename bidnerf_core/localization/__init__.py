@@ -9,6 +9,8 @@ from bidnerf_core.localization.localizer import Localizer, pose_from_matrix
 from bidnerf_core.localization.methods import METHODS, Method, find_method, settings_of
 from bidnerf_core.localization.problem import window
 from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.localization.tracker import Tracker
+from bidnerf_core.localization.tracking.settings import TrackerConfig
 
 __all__ = [
     "METHODS",
@@ -21,6 +23,8 @@ __all__ = [
     "Localizer",
     "Method",
     "Outcome",
+    "Tracker",
+    "TrackerConfig",
     "find_method",
     "pose_from_matrix",
     "settings_of",

@@ -16,7 +16,7 @@ from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.localization.search.landmarks import LandmarkPose
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.mapping.casting import trace
 from bidnerf_core.se3 import SE3
 
@@ -90,6 +90,43 @@ def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDia
 
 
 @dataclass(frozen=True)
+class LandmarkDiagnostics:
+    """Measures of how well a pose explains the features of an image. None of them has a unit of length."""
+
+    inliers: int  # correspondences within three standard deviations
+    matches: int  # by descriptors alone
+    agreeing: int  # of these, those that agree with the pose
+    log10_nfa: float  # logarithm of the number of such agreements expected by chance
+    chance: float  # correspondences at a wrong pose
+    visible: int  # landmarks that should be visible
+    keypoints: int  # in the images
+    spread: float  # share of the image's cells that hold a correspondence
+    noise_ratio: float  # reprojection noise over that of the map's own images
+    miscalibration: float  # probability that the given intrinsics are wrong
+    precision: float  # standard deviation of the position over the landmarks' distance
+    estimated_calibration: bool  # whether the intrinsics were estimated along with the pose
+    searched: bool  # whether landmarks found the pose, or only confirm one that was found on the surface
+    on_surface: float | None = None  # share of the measured points that lie on the surface
+    colour_inliers: float | None = None  # share that lies there and has its colour
+
+
+def landmark_diagnostics(
+    found: LandmarkPose, searched: bool = True, judge: SurfaceCost | None = None, T: SE3 | None = None
+) -> LandmarkDiagnostics:
+    """Return the diagnostics of a pose by landmarks; ``judge`` holds measured points, if any, which ``T`` places."""
+    wrong = 0.0 if found.estimates_calibration else found.miscalibration.worst[1]
+    near = both = None
+    if judge is not None and T is not None:
+        near_points, alike = judge.inliers(judge.correspondences(T[None]))
+        near, both = float(near_points.mean()), float((near_points * alike).mean())
+    return LandmarkDiagnostics(
+        found.inliers, found.matches, found.agreeing, found.log10_nfa, found.chance, found.visible,
+        found.keypoints, found.spread, found.noise_ratio, wrong, found.position_deviation / found.distance,
+        found.estimates_calibration, searched, near, both,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class LandmarkThresholds:
     """Thresholds for accepting a pose by landmarks. They have no units, so they suit every scene and image."""
 
@@ -97,6 +134,10 @@ class LandmarkThresholds:
     inliers: int = 15  # correspondences within three standard deviations, at least
     above_chance: float = 3.0  # times as many as at a wrong pose, at least
     spread: float = 0.06  # share of the image's cells that hold one, at least
+    miscalibration: float = 0.1  # probability that the given intrinsics are wrong, at most
+    precision: float = (
+        0.03  # standard deviation of the position, as a share of the landmarks' distance, at most
+    )
 
 
 def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = LandmarkThresholds()) -> Verdict:
@@ -110,6 +151,15 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         return Verdict(Outcome.UNDETERMINED, f"{share}, all in {found.spread:.0%} of the image")
     if not bool(found.covariance.isfinite().all()):
         return Verdict(Outcome.UNDETERMINED, f"{share}, but do not determine the pose")
+    wrong = found.miscalibration
+    if not found.estimates_calibration and wrong.worst[1] > thresholds.miscalibration:
+        return Verdict(Outcome.MISCALIBRATED, f"{share}, but they suggest {wrong.sentence}")
+    deviation = found.position_deviation
+    if not deviation <= thresholds.precision * found.distance:
+        return Verdict(
+            Outcome.IMPRECISE,
+            f"{share}, but the position is uncertain by {deviation / found.distance:.1%} of the distance",
+        )
     return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px")
 
 

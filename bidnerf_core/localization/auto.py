@@ -17,6 +17,7 @@ from torch import Generator
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.acceptance import (
+    LandmarkThresholds,
     SurfaceDiagnostics,
     landmark_verdict,
     surface_diagnostics,
@@ -28,7 +29,13 @@ from bidnerf_core.localization.by_colour import (
     localization_of,
     refine_by_colour,
 )
-from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
+from bidnerf_core.localization.by_landmarks import (
+    answer_by_landmarks,
+    fused_answer,
+    is_sharp,
+    localization_by_landmarks,
+)
+from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import surface_covariance
@@ -45,6 +52,8 @@ from bidnerf_core.localization.search.by_images import ImageSearch
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
+from bidnerf_core.localization.search.landmarks import confirm
+from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import EXPERT, Range, Settings
@@ -54,7 +63,11 @@ LEAST_POINTS = 50
 WORSE = 0.05
 """Largest increase of the cost on the surface by refinement; with more, field and surface contradict each other."""
 MANY_LANDMARKS = 500
-"""The number of landmarks from which on a scene is textured: an image that matches none of them shows something else."""
+"""The number of landmarks from which on a scene is textured."""
+WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
+"""Thresholds for landmarks that match near a pose that was not found by them."""
+SUPPORTED = 0.45
+"""Least confidence of landmarks in a pose that the surface accepts on its own grounds."""
 LOSS_POINTS = 200
 """Number of points on which the losses along the path are computed."""
 
@@ -63,13 +76,17 @@ LOSS_POINTS = 200
 class AutoConfig(Settings):
     """Settings of method ``auto``."""
 
-    points: Annotated[int, Range(LEAST_POINTS, 10**6)] = 2000  # of the measured pixels, at most
-    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # with which each round of the search begins
-    rounds: Annotated[int, Range(1, 100)] = 3  # of search with fresh hypotheses, until an answer is accepted
-    refine_steps: Annotated[int, Range(0, 1000)] = 2  # on rendered rays, of an answer by depth; 0: none
-    refine_rays: Annotated[int, Range(64, 10**6)] = 512
+    # largest number of measured points that are aligned
+    points: Annotated[int, Range(LEAST_POINTS, 10**6)] = 2000
+    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # number of poses with which a round of search begins
+    # largest number of rounds of search, each with fresh hypotheses, until an answer is accepted
+    rounds: Annotated[int, Range(1, 100)] = 3
+    # steps on rendered rays that refine an answer by depth; 0: none
+    refine_steps: Annotated[int, Range(0, 1000)] = 2
+    refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for each of these steps
     landmarks: bool = True  # match image features with the map's landmarks first, where it has some
-    fused_rays: Annotated[int, Range(0, 10**6)] = 1024  # rendered, and fused with landmarks; 0: none
+    # number of rendered rays that are fused with landmarks; 0: none
+    fused_rays: Annotated[int, Range(0, 10**6)] = 1024
     by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
 
 
@@ -78,18 +95,53 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
 
     Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
     """
-    began, answer = time.perf_counter(), None
-    if problem.matcher is not None and config.landmarks:
-        answer = answer_by_landmarks(problem, problem.matcher, config.fused_rays, seed)
-    if answer is not None and landmark_verdict(answer.found).accepted:
+    began, answer, matcher = time.perf_counter(), None, problem.matcher if config.landmarks else None
+    if matcher is not None:
+        answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
+    has_points = _measured_points(problem) >= LEAST_POINTS
+    if answer is not None and _is_final(answer.verdict.outcome, has_points):
         return localization_by_landmarks(problem, answer, began)
     if answer is not None and problem.start is None:
         problem = replace(problem, start=answer.T)  # one more place to look
     if problem.surface is None:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
-    if _measured_points(problem) >= LEAST_POINTS:
-        return _by_points(problem, problem.surface, config, seed)
-    return _by_images(problem.without_depth(), problem.surface, config, seed)
+    if has_points:
+        found = _by_points(problem, problem.surface, config, seed)
+    else:
+        found = _by_images(problem.without_depth(), problem.surface, config, seed)
+    return (
+        found if matcher is None else _compared_with_landmarks(found, problem, matcher, config, seed, began)
+    )
+
+
+def _is_final(outcome: Outcome, has_points: bool) -> bool:
+    """Whether the surface has nothing to add to what landmarks found."""
+    if outcome is Outcome.UNCERTAIN:
+        return not has_points
+    # With wrong intrinsics, the surface is not found at the right place either.
+    return outcome in (Outcome.CONVERGED, Outcome.MISCALIBRATED)
+
+
+def _compared_with_landmarks(
+    found: Localization,
+    problem: Problem,
+    matcher: LandmarkMatcher,
+    config: AutoConfig,
+    seed: int,
+    began: float,
+) -> Localization:
+    """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not."""
+    near = confirm(matcher, problem.views, found.T_world_camera)
+    if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
+        answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
+        refined = localization_by_landmarks(problem, answer, began)
+        supported = found.converged and answer.confidence is not None and answer.confidence >= SUPPORTED
+        outcome = Outcome.CONVERGED if supported else refined.outcome
+        return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
+    if found.converged and near.contradicts:
+        why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
+        return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
+    return replace(found, seconds=time.perf_counter() - began)
 
 
 def _measured_points(problem: Problem) -> int:
@@ -111,14 +163,14 @@ def _by_points(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
         found, inliers = _refined(problem, search, found, config, generator)
     with torch.no_grad():
         diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers)
-        verdict = diagnostics.verdict()
+        judgement = judged(diagnostics.verdict(), diagnostics)
         path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
         losses = search.judge(LOSS_POINTS).cost(path)
         covariance = surface_covariance(search.judge(), found.T[0], len(problem.views))
     return Localization(
         T_world_camera=found.T[0].normalized(),
-        outcome=verdict.outcome,
-        reason=verdict.reason,
+        outcome=judgement.verdict.outcome,
+        reason=judgement.verdict.reason,
         steps=len(losses) - 1,
         seconds=time.perf_counter() - began,
         loss=float(found.scores[0]),
@@ -126,6 +178,8 @@ def _by_points(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
         poses=path,
         losses=losses[:-1],
         covariance=covariance,
+        confidence=judgement.confidence,
+        diagnostics=diagnostics,
     )
 
 
@@ -171,29 +225,40 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
     search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
     # Images with a plain background were rendered and are as bright as the map; photos may have another exposure.
-    refinement = replace(config.by_colour.refinement, exposure=not search.has_background)
+    exposure = config.by_colour.refinement.exposure or not search.has_background
+    refinement = replace(config.by_colour.refinement, exposure=exposure)
     by_colour = replace(config.by_colour, refinement=refinement)
     known = Surroundings(SE3.from_matrix(surface.keyframes), surface.extent, torch.zeros(3), search.middle)
     while True:
         with torch.no_grad():
             found = search(hypotheses_for_images(known, problem.start, config.hypotheses, generator))
+        if config.landmarks and _is_hopeless(problem):
+            return _unrecognised(found, began)
         answers.append(refine_by_colour(problem, found, by_colour, generator))
         best = min(answers, key=lambda answer: answer.refined.loss)
         if best.verdict.accepted or len(answers) == config.rounds:
-            answer = localization_of(problem, best, by_colour, began, "auto")
-            return _doubted(answer) if config.landmarks and _has_texture(problem) else answer
+            return localization_of(problem, best, by_colour, began, "auto")
 
 
-def _has_texture(problem: Problem) -> bool:
-    return problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
+def _is_hopeless(problem: Problem) -> bool:
+    """Whether an image without recognised landmarks cannot be found: the scene is textured, and its field blurred."""
+    textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
+    return textured and not is_sharp(problem)
 
 
-def _doubted(found: Localization) -> Localization:
-    """Return the answer as rejected: in a map with this many landmarks, some should have matched the image."""
-    if not found.converged:
-        return found
-    why = f"no landmarks were recognised; {found.reason}"
-    return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=why)
+def _unrecognised(found: SearchResult, began: float) -> Localization:
+    """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
+    return Localization(
+        T_world_camera=found.T[0].normalized(),
+        outcome=Outcome.TOO_FEW_MATCHES,
+        reason="no landmarks were recognised, and the field is too blurred to compare images with its renderings",
+        steps=len(found.losses),
+        seconds=time.perf_counter() - began,
+        loss=float(found.scores[0]),
+        method="auto",
+        poses=found.path,
+        losses=found.losses,
+    )
 
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass, replace
 
@@ -10,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_diagnostics, landmark_verdict
+from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
@@ -24,35 +24,28 @@ from bidnerf_core.localization.method_settings import (
 from bidnerf_core.localization.normal_equations import Cost, Scaled, Sum
 from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.search.landmarks import LandmarkPose, propose
+from bidnerf_core.localization.result import Localization, Verdict
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
 POINTS = 2000
 """Largest number of measured points that are fused."""
 SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
 """Numbers of independent measurements that a view's points on the surface and its rendered rays count as."""
-FUSION_STEPS = 6
+FUSION_STEPS = 2
 """Number of second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
-INFLATION = 3.0
-"""Factor on the covariance of a pose by landmarks, which treats the errors of keypoints and of the map's poses as
-independent, although they are correlated within an image. It was set by the normalised errors of a fifth of the test images
-of four scenes.
+DEPTH_SCALE_PRIOR, DEPTH_SCALE_NOISE = 0.02, 0.01
+"""Relative standard deviations of a depth sensor's scale, and of the scale that a few landmarks give."""
+DEPTH_CELLS, RENDERED_DEPTH_SHARE = 6.0, 0.01
+"""Depth difference at which outliers begin in rendered rays: in cells of the surface's grid, or without a surface as a share
+of the scene's extent.
 """
-FOCAL_OFF, FOCAL_NOISE = 0.03, 2.0
-"""Limits beyond which the given focal length is taken to be wrong: the logarithm of the estimated factor, and the ratio of
-the reprojection noise with the given focal length to that with the estimated one.
-"""
-FOCAL_PRIOR, FOCAL_ESTIMATED = 0.003, 0.01
-"""Relative standard deviations of a calibrated focal length and of one that was estimated with the pose. The random error of
-the latter is part of the fit's covariance, but errors of the lens model and the landmarks bias it by a percent or more.
-"""
-DEPTH_SCALE_PRIOR = 0.02
-"""Relative standard deviation of a depth sensor's scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,88 +63,98 @@ class FusedTerm:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkAnswer:
-    """A pose by landmarks, and the pose after fusing it with the other measurements."""
+    """A pose by landmarks, the pose after fusing it with the other measurements, and whether to accept it."""
 
     found: LandmarkPose
+    verdict: Verdict
     T: SE3
     covariance: Float[Tensor, "6 6"]
-    terms: tuple[str, ...]  # what was fused with the landmarks
+    diagnostics: LandmarkDiagnostics
+    terms: tuple[str, ...] = ()  # what was fused with the landmarks
+    confidence: float | None = None  # probability that the pose is right
 
 
 def answer_by_landmarks(
     problem: Problem, matcher: LandmarkMatcher, rays: int, seed: int
 ) -> LandmarkAnswer | None:
-    """Find the pose by landmarks and refine it on all terms at once. Returns None if too few features match.
+    """Find the pose by landmarks and, if it is accepted, refine it on all terms at once.
 
-    ``rays`` is the number of rays rendered for the refinement; 0 leaves rendering out.
+    Returns None if too few features match. ``rays`` is the number of rays rendered for the refinement; 0 leaves rendering
+    out.
     """
-    found = _found(problem, matcher, seed)
-    if found is None:
-        return None
-    problem = replace(problem, start=found.T_world_camera)
-    about, terms = pivot("scene", problem), dict[str, FusedTerm]()
-    generator = Generator().manual_seed(seed)
-    if abs(found.focal_factor - 1) < 1e-3:  # other terms would need the corrected camera
-        if problem.surface is not None and problem.has_depth:
-            terms["depth"] = _surface_term(problem, found, generator)
-        if rays and matcher.landmarks is not None and _is_sharp(problem):
-            terms["rendering"] = _rendered_term(problem, rays, about, generator)
-    return _fused(found, terms, about)
+    found = propose(matcher, problem.views, seed=seed)
+    return None if found is None else fused_answer(problem, found, landmark_verdict(found), rays, seed)
 
 
-def _found(problem: Problem, matcher: LandmarkMatcher, seed: int) -> LandmarkPose | None:
-    """Find the pose with the given focal length, or estimate the focal length if it is only nominal or does not fit."""
-    views = problem.views
-    if len(views) == 1 and views[0].frame.focal_is_approximate:
-        return propose(matcher, views, seed=seed, unknown_focal=True)
-    found = propose(matcher, views, seed=seed)
-    check = None if found is None else found.focal_check
-    if found is None or check is None:
-        return found
-    if abs(math.log(check.factor)) <= FOCAL_OFF or found.noise <= FOCAL_NOISE * check.noise:
-        return found
-    return propose(matcher, views, seed=seed, unknown_focal=True) or found
+def fused_answer(
+    problem: Problem, found: LandmarkPose, verdict: Verdict, rays: int, seed: int, searched: bool = True
+) -> LandmarkAnswer:
+    """Return a pose by landmarks, refined on all terms at once if it is accepted.
+
+    ``searched`` is false if landmarks only confirm a pose that was found by other means.
+    """
+    diagnostics = landmark_diagnostics(found, searched)
+    answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.full_covariance, diagnostics)
+    if not verdict.accepted or found.estimates_calibration:
+        return _judged(answer)  # the other terms would need intrinsics as exact as the landmarks'
+    problem = _from(problem, found)
+    about, generator = pivot("scene", problem), Generator().manual_seed(seed)
+    terms = dict[str, FusedTerm]()
+    if problem.surface is not None and problem.has_depth:
+        terms["depth"], judge = _surface_term(problem, problem.surface, generator)
+        diagnostics = landmark_diagnostics(found, searched, judge, found.T_world_camera)
+        answer = replace(answer, diagnostics=diagnostics)
+    if rays and is_sharp(problem):
+        terms["rendering"] = _rendered_term(problem, rays, about, generator)
+    return _judged(_fused(answer, terms, about) if terms else answer)
 
 
-def _pose_covariance(found: LandmarkPose) -> Float[Tensor, "6 6"]:
-    """Return the covariance of a pose by landmarks, including the uncertainty of the focal length."""
-    covariance = INFLATION * found.map_covariance
-    if found.focal_check is None:
-        return covariance
-    sigma = FOCAL_PRIOR if found.focal_factor == 1 else FOCAL_ESTIMATED
-    slope = found.focal_check.slope
-    return covariance + sigma**2 * slope[:, None] * slope
+def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
+    """Return the answer with its confidence, which can turn its verdict into a rejection."""
+    judgement = judged(answer.verdict, answer.diagnostics)
+    return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
 
 
-def _is_sharp(problem: Problem) -> bool:
-    return problem.colour_noise is None or problem.colour_noise <= SHARPEST
+def _from(problem: Problem, found: LandmarkPose) -> Problem:
+    """Return the problem from the pose found, with measured depth on the map's scale."""
+    scale, views = shrunk_depth_scale(found), []
+    for view in problem.views:
+        depth = None if view.frame.depth is None else view.frame.depth * scale
+        views.append(replace(view, frame=replace(view.frame, depth=depth)))
+    return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 
-def _surface_term(problem: Problem, found: LandmarkPose, generator: Generator) -> FusedTerm:
-    """Return the term of measured points on the surface, after correcting the scale of measured depth."""
-    assert problem.surface is not None
-    cloud = PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator)
-    cloud = replace(cloud, points=cloud.origins + _depth_scale(found) * (cloud.points - cloud.origins))
-    scales = PointScales(FINEST * problem.surface.cell)
-    cost = SurfaceCost(problem.surface, cloud, scales)
-    variance = max(float(cost.residual_variance(found.T_world_camera[None])[0]), LEAST_VARIANCE)
-    return FusedTerm(cost, variance, SURFACE_MEASUREMENTS * len(problem.views))
-
-
-def _depth_scale(found: LandmarkPose) -> float:
+def shrunk_depth_scale(found: LandmarkPose) -> float:
     """Return the factor on measured depth that landmarks give, shrunk towards 1 by the prior; 1 if they give none."""
     if found.depth_scale is None:
         return 1.0
-    # This is about the variance of a median over a few landmarks.
-    variance = 0.01**2
-    weight = DEPTH_SCALE_PRIOR**2 / (DEPTH_SCALE_PRIOR**2 + variance)
+    weight = DEPTH_SCALE_PRIOR**2 / (DEPTH_SCALE_PRIOR**2 + DEPTH_SCALE_NOISE**2)
     return 1 + weight * (found.depth_scale - 1)
+
+
+def is_sharp(problem: Problem) -> bool:
+    """Whether the field is sharp enough for rendered rays to add to what landmarks tell."""
+    return problem.colour_noise is None or problem.colour_noise <= SHARPEST
+
+
+def _surface_term(
+    problem: Problem, surface: SurfaceMap, generator: Generator
+) -> tuple[FusedTerm, SurfaceCost]:
+    """Return the term of measured points on the surface, and the cost itself."""
+    cloud = PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator)
+    cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
+    assert problem.start is not None
+    variance = max(float(cost.residual_variance(problem.start[None])[0]), LEAST_VARIANCE)
+    return FusedTerm(cost, variance, SURFACE_MEASUREMENTS * len(problem.views)), cost
 
 
 def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator) -> FusedTerm:
     """Return the term that compares rendered rays with the images."""
-    cell = 0.01 if problem.surface is None else problem.surface.cell
-    stage = RefinementStage(FUSION_STEPS, rays, depth_scale=6 * cell)
+    surface = problem.surface
+    outlier = (
+        DEPTH_CELLS * surface.cell if surface is not None else RENDERED_DEPTH_SHARE * max(problem.bounds.size)
+    )
+    stage = RefinementStage(FUSION_STEPS, rays, depth_scale=outlier)
     depth = DepthSettings() if problem.has_depth else None
     settings = RenderedCostSettings(
         ColourSettings(), depth, RefinementSettings(exposure=problem.exposure_varies)
@@ -162,37 +165,34 @@ def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generat
     return FusedTerm(cost, variance, RENDERED_MEASUREMENTS * len(problem.views))
 
 
-def _fused(found: LandmarkPose, terms: dict[str, FusedTerm], about: Pivot) -> LandmarkAnswer:
+def _fused(answer: LandmarkAnswer, terms: dict[str, FusedTerm], about: Pivot) -> LandmarkAnswer:
     """Minimize the sum of the landmarks' Gaussian prior and the other terms, and return the fused pose.
 
     The covariance counts each additional term as only ``INDEPENDENT`` measurements, because its errors are correlated over
     large parts of an image.
     """
-    covariance = _pose_covariance(found)
-    if not terms:
-        return LandmarkAnswer(found, found.T_world_camera, covariance, ())
-    prior = GaussianPrior(found.T_world_camera, covariance, about)
+    prior = GaussianPrior(answer.T, answer.covariance, about)
     cost = Sum((prior, *(term.scaled for term in terms.values())))
-    done = descend(cost, found.T_world_camera[None], FUSION_STEPS, about.moved)
+    done = descend(cost, answer.T[None], FUSION_STEPS, about.moved)
     T = done.T[0].normalized()
     information = prior(T[None]).hessian[0]
     for term in terms.values():
         information = information + term.cost(T[None]).hessian[0] * (INDEPENDENT / term.variance)
     covariance = about.at_camera(T, torch.linalg.inv(information))
-    return LandmarkAnswer(found, T, (covariance + covariance.mT) / 2, tuple(terms))
+    return replace(answer, T=T, covariance=(covariance + covariance.mT) / 2, terms=tuple(terms))
 
 
 def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
     """Return an answer as a localization of method ``auto``."""
-    found, verdict = answer.found, landmark_verdict(answer.found)
+    found = answer.found
     poses = [found.T_world_camera, answer.T]
     if problem.start is not None:
         poses = [problem.start, *poses]
     fused = f", fused with {' and '.join(answer.terms)}" if answer.terms else ""
     return Localization(
         T_world_camera=answer.T,
-        outcome=verdict.outcome,
-        reason=verdict.reason + fused,
+        outcome=answer.verdict.outcome,
+        reason=answer.verdict.reason + fused,
         steps=len(poses) - 1,
         seconds=time.perf_counter() - began,
         loss=found.noise,
@@ -201,4 +201,6 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
         losses=torch.full((len(poses) - 1,), found.noise, dtype=torch.float64),
         covariance=answer.covariance,
         focal_factor=found.focal_factor,
+        confidence=answer.confidence,
+        diagnostics=answer.diagnostics,
     )

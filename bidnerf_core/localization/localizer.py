@@ -59,7 +59,7 @@ class Localizer:
         self.map: SceneMap = map if device is None else _on_device(map, torch.device(device))
         self.config = _checked_config(find_method(method), method, config)
         landmarks = getattr(self.map, "landmarks", None)
-        self._matcher = None if landmarks is None or method != "auto" else LandmarkMatcher(landmarks)
+        self.matcher = None if landmarks is None or method != "auto" else LandmarkMatcher(landmarks)
         if warm_up:
             self._warm_up()
 
@@ -81,7 +81,7 @@ class Localizer:
         if depth_rays is not None:
             require_use_of_depth(self.method)
         problem = rig(
-            self.map, _views(query), None if start is None else _pose(start), depth_rays, self._matcher
+            self.map, _views(query), None if start is None else start_pose(start), depth_rays, self.matcher
         )
         return METHODS[self.method].run(problem, self.config, seed)
 
@@ -142,7 +142,7 @@ def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
     )
 
 
-def _pose(start: Start) -> SE3:
+def start_pose(start: Start) -> SE3:
     """Return a start given in any form as a rigid transform; float64."""
     if isinstance(start, SE3):
         if start.translation.ndim > 1:

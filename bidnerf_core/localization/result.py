@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -28,7 +28,17 @@ class Outcome(StrEnum):
     NOT_SETTLED = "not settled"  # fresh rays still ask for a long step
     HIGH_LOSS = "high loss"  # a descent ended above the loss that counts as converged
     DIVERGED = "diverged"  # the loss or the pose became infinite or not a number
+    MISCALIBRATED = "miscalibrated"  # the image contradicts the camera's intrinsics
+    IMPRECISE = "imprecise"  # the pose is too uncertain, compared with the distance of what is in view
+    UNCERTAIN = "uncertain"  # the diagnostics together make a wrong pose too likely
     TOO_FEW_MATCHES = "too few matches"  # of image features with the map's landmarks
+
+
+@runtime_checkable
+class Diagnostics(Protocol):
+    """The measures by which a pose is judged: a dataclass of numbers, whose fields depend on how the pose was found."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -59,6 +69,9 @@ class Localization:
     # Covariance of a right update at the camera: translation (metres) before rotation (radians). None if unknown.
     covariance: Float[Tensor, "6 6"] | None = None
     focal_factor: float = 1.0  # true over given focal length; 1 if it was not estimated
+    # Probability that the pose is right, from the diagnostics; None where no model of it was learned.
+    confidence: float | None = None
+    diagnostics: Diagnostics | None = None  # the measures by which the pose was judged
 
     @property
     def converged(self) -> bool:
@@ -82,6 +95,7 @@ class Localization:
             "loss": self.loss if self.loss == self.loss and abs(self.loss) != float("inf") else None,
             "method": self.method,
             "focal_factor": self.focal_factor,
+            "confidence": self.confidence,
         }
 
     def save(self, path: str | Path) -> None:

@@ -24,7 +24,7 @@ FIRST_CENTRE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one image. Descriptors are compared by Euclidean distance."""
+    """Keypoints of one image, the strongest first. Descriptors are compared by Euclidean distance."""
 
     pixels: Float[Tensor, "n 2"]  # (u, v), the centre of the first pixel at (0.5, 0.5)
     sizes: Float[Tensor, "n"]  # pixels: diameter of the keypoint's neighbourhood, as OpenCV defines it
@@ -65,13 +65,14 @@ class Sift(Settings):
         sift = cv2.SIFT.create(
             nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True
         )
-        grey, scale = _reduced(_grey(rgb), self.largest)
+        grey, scale = _reduced(grey_image(rgb), self.largest)
         found, descriptors = sift.detectAndCompute(grey, None)
         if descriptors is None or not len(found):
             return Keypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros((0, 128), dtype=torch.uint8))
-        pixels = (np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32) + FIRST_CENTRE) / scale
-        sizes = np.array([keypoint.size for keypoint in found], dtype=np.float32) / scale.mean()
-        root = root_normalized(torch.from_numpy(np.asarray(descriptors, dtype=np.float32)))
+        order = np.argsort([-keypoint.response for keypoint in found], kind="stable")
+        pixels = (np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32) + FIRST_CENTRE)[order] / scale
+        sizes = np.array([found[i].size for i in order], dtype=np.float32) / scale.mean()
+        root = root_normalized(torch.from_numpy(np.asarray(descriptors, dtype=np.float32)[order]))
         return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantized(root))
 
 
@@ -109,7 +110,7 @@ def paired_squared_distances(
     return (a[rows].float() - b[columns].float()).square_().sum(-1)
 
 
-def _grey(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
+def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
     clean = rgb.detach().cpu().float().nan_to_num(0.0).clamp(0, 1)
     return cv2.cvtColor((clean * 255).round().to(torch.uint8).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
 

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
+from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.mapping.keypoint_depth import depth_noise, measured_depth, placed
-from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks, seen_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
 from bidnerf_core.mapping.pose_scatter import pose_scatter
 from bidnerf_core.mapping.tracks import PosedKeypoints, epipolar_matches, joined_tracks
@@ -64,6 +64,51 @@ def build_landmarks(
     ``progress`` is called with the number of images and image pairs done and their total, and ``report`` with a sentence if
     landmarks had to be dropped. Raises ``InputError`` if no landmark was found.
     """
+    return tracked_views(views, features, config, progress).landmarks(config, report)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedViews:
+    """The keypoints of posed images, joined into tracks, with the depth that was measured at each keypoint."""
+
+    observations: TrackedKeypoints
+    depth: Float[Tensor, "k"]  # metres, of all keypoints by number; 0 where none was measured
+
+    def landmarks(
+        self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None
+    ) -> LandmarkMap:
+        """Return the landmarks that the tracks give. Raises ``InputError`` if there are none."""
+        found = _located(self.observations, self.depth, config)
+        if not len(found):
+            images = len(self.observations.images)
+            raise InputError(
+                f"no landmark found in {images} images: expected texture that several images show from different places"
+            )
+        return _bounded(found, config.most, report)
+
+    def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
+        """Return the triangulated landmarks that each image shows, whose depth training takes where none was measured."""
+        kept, positions, covariance = _triangulated(self.observations, radians(config.parallax))
+        return seen_landmarks(kept, positions, noise(kept.sightings, positions) ** 2 * covariance)
+
+    def triangulated(self, config: LandmarkConfig) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"]]:
+        """Return the keypoints that agree on a triangulated point, and those points (metres, world)."""
+        kept, positions, _ = _triangulated(self.observations, radians(config.parallax))
+        return kept, positions
+
+    def without(self, images: Sequence[int]) -> TrackedViews:
+        """Return the tracks without the keypoints of some images."""
+        left = ~torch.isin(self.observations.image, torch.tensor(images))
+        return replace(self, observations=self.observations[left])
+
+
+def tracked_views(
+    views: Sequence[View],
+    features: Features = SIFT,
+    config: LandmarkConfig = LandmarkConfig(),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TrackedViews:
+    """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks."""
     if not views:
         raise InputError("nothing to build landmarks from: expected at least one view")
     pairs = likely_pairs(views, config.neighbours).tolist() if len(views) > 1 else []
@@ -73,16 +118,8 @@ def build_landmarks(
     label = joined_tracks(
         [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)], [len(p.keypoints) for p in images]
     )
-    observations = TrackedKeypoints(images, label, torch.arange(len(label)))
-    depth = torch.cat(
-        [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
-    )
-    found = _located(observations, depth, config)
-    if not len(found):
-        raise InputError(
-            f"no landmark found in {len(views)} images: expected texture that several images show from different places"
-        )
-    return _bounded(found, config.most, report)
+    depth = [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
+    return TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), torch.cat(depth))
 
 
 def _detected(view: View, features: Features) -> PosedKeypoints:
@@ -94,11 +131,10 @@ def _detected(view: View, features: Features) -> PosedKeypoints:
 
 
 def _located(
-    observations: TrackedKeypoints, depth: Float[Tensor, "m"], config: LandmarkConfig
+    observations: TrackedKeypoints, depth: Float[Tensor, "k"], config: LandmarkConfig
 ) -> LandmarkMap:
     """Return the triangulated landmarks, then those that measured depth places, made from the remaining keypoints."""
-    tracked = torch.bincount(observations.point)[observations.point] > 1
-    kept, positions, covariance = _triangulated(observations[tracked], radians(config.parallax))
+    kept, positions, covariance = _triangulated(observations, radians(config.parallax))
     sightings = kept.sightings
     pixel_noise = noise(sightings, positions)
     triangulated = replace(
@@ -106,10 +142,15 @@ def _located(
         pose_covariance=pose_scatter(kept, positions, pixel_noise),
     )
     relative = depth_noise(sightings, positions, depth[kept.number])
-    left = torch.ones_like(tracked).index_fill_(0, kept.number, False)
-    left &= tracked | config.singles
-    rest, positions, covariance = placed(observations[left], depth[left], relative, pixel_noise)
+    left = ~torch.isin(observations.number, kept.number)
+    rest = observations[left & (_tracked(observations) | config.singles)]
+    rest, positions, covariance = placed(rest, depth[rest.number], relative, pixel_noise)
     return concatenated([triangulated, fused_landmarks(rest, positions, covariance, pixel_noise)])
+
+
+def _tracked(observations: TrackedKeypoints) -> Bool[Tensor, "m"]:
+    """Return which keypoints show a point that another keypoint shows too."""
+    return torch.bincount(observations.point)[observations.point] > 1
 
 
 def _triangulated(
@@ -119,7 +160,7 @@ def _triangulated(
 
     ``least`` is the smallest parallax (radians) of a point.
     """
-    observations, _ = observations.compacted()
+    observations, _ = observations[_tracked(observations)].compacted()
     count = observations.count
     points = intersected(observations.sightings, count)
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.tracks import PosedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
@@ -88,6 +89,20 @@ def fused_landmarks(
         noise,
         torch.zeros((6, 6), dtype=torch.float64),
     )
+
+
+def seen_landmarks(
+    observations: TrackedKeypoints, positions: Float[Tensor, "n 3"], covariance: Float[Tensor, "n 3 3"]
+) -> list[SeenLandmarks]:
+    """Return the landmarks at ``positions`` (metres, world) that each image shows, with the deviation of their distance."""
+    sightings, image = observations.sightings, observations.image
+    away = positions[sightings.point] - sightings.centre
+    distance = torch.linalg.vector_norm(away, dim=-1)
+    ray = away / distance[:, None].clamp(min=1e-300)
+    variance = (ray[:, None] @ covariance[sightings.point] @ ray[..., None])[:, 0, 0]
+    pixels = torch.cat([p.keypoints.pixels for p in observations.images])[observations.number]
+    parts = pixels.float(), distance.float(), variance.clamp(min=0).sqrt().float()
+    return [SeenLandmarks(*(part[image == i] for part in parts)) for i in range(len(observations.images))]
 
 
 def _across_and_along(

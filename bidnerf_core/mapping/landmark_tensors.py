@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from bidnerf_core.mapping.landmarks import PER_LANDMARK, LandmarkMap
+from bidnerf_core.mapping.landmarks import PER_LANDMARK, HeldOutTrial, LandmarkMap
 
 LANDMARK_KINDS = {
     "positions": ((-1, 3), torch.float32),
@@ -22,13 +23,21 @@ LANDMARK_KINDS = {
     "pose_covariance": ((6, 6), torch.float64),
 }
 """Shape (-1: any length) and dtype of each tensor."""
+LATER_KINDS = {
+    "correlation": ((), torch.float64),
+    "calibration_scatter": ((4,), torch.float64),
+    "trial": ((4,), torch.float64),  # the fields of ``HeldOutTrial`` in order
+}
+"""Shape and dtype of the tensors that maps of earlier versions lack."""
 
 
 def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
     """Return copies of the tensors of ``landmarks``, by name and in the dtypes of ``LANDMARK_KINDS``."""
+    values = {name: getattr(landmarks, name) for name in LANDMARK_KINDS | LATER_KINDS}
+    values["trial"] = astuple(landmarks.trial)
     found = {
-        name: torch.as_tensor(getattr(landmarks, name), dtype=kind)
-        for name, (_, kind) in LANDMARK_KINDS.items()
+        name: torch.as_tensor(values[name], dtype=kind)
+        for name, (_, kind) in (LANDMARK_KINDS | LATER_KINDS).items()
     }
     return {name: value.contiguous().clone() for name, value in found.items()}
 
@@ -38,7 +47,8 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """
-    for name, (shape, kind) in LANDMARK_KINDS.items():
+    present = LANDMARK_KINDS | {name: kind for name, kind in LATER_KINDS.items() if name in tensors}
+    for name, (shape, kind) in present.items():
         value = tensors[name]
         fits = value.dim() == len(shape) and all(
             a in (-1, b) for a, b in zip(shape, value.shape, strict=True)
@@ -48,8 +58,13 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
         if value.is_floating_point() and not bool(value.isfinite().all()):
             raise ValueError(f"{name} holds NaN or infinity")
     _check_contents(tensors)
-    parts: dict[str, Any] = {name: tensors[name] for name in LANDMARK_KINDS}
-    return LandmarkMap(**parts | {"noise": float(tensors["noise"])})
+    parts: dict[str, Any] = {name: tensors[name] for name in present}
+    for name in {"noise", "correlation"} & present.keys():
+        parts[name] = float(tensors[name])
+    if "trial" in parts:
+        images, found, translation, rotation_deg = parts["trial"].tolist()
+        parts["trial"] = HeldOutTrial(int(images), int(found), translation, rotation_deg)
+    return LandmarkMap(**parts)
 
 
 def _check_contents(tensors: dict[str, Tensor]) -> None:
@@ -61,6 +76,12 @@ def _check_contents(tensors: dict[str, Tensor]) -> None:
         raise ValueError("descriptors have no channels")
     if not float(tensors["noise"]) > 0:
         raise ValueError(f"noise is {float(tensors['noise'])}, expected a positive number of pixels")
+    if "correlation" in tensors and not float(tensors["correlation"]) > 0:
+        raise ValueError(f"correlation is {float(tensors['correlation'])}, expected a positive number")
+    if "calibration_scatter" in tensors and not bool((tensors["calibration_scatter"] > 0).all()):
+        raise ValueError(
+            f"calibration_scatter is {tensors['calibration_scatter'].tolist()}, expected positive"
+        )
     for name, least, most in (
         ("deviations", 0.0, math.inf),
         ("sizes", 0.0, math.inf),

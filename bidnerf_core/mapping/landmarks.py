@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class HeldOutTrial:
+    """How images of the map were localized by landmarks that were built without them."""
+
+    images: int = 0
+    found: int = 0  # of these images
+    translation: float = 0.0  # metres: median error
+    rotation_deg: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +35,14 @@ class LandmarkMap:
     # Covariance of the right updates (translation in metres first) from the given poses of the map's images to those that
     # the landmarks imply: the error that the source of the poses adds to a pose found by landmarks.
     pose_covariance: Float[Tensor, "6 6"]  # float64
+    # The number of keypoints of an image that count as one measurement, because their errors are correlated.
+    correlation: float = 10.0
+    # Standard deviations of the corrections of intrinsics that images of the map seem to need, although their intrinsics are
+    # right: logarithm of the focal length, principal point (u, v) as a share of it, radial distortion. Float64.
+    calibration_scatter: Float[Tensor, "4"] = field(
+        default_factory=lambda: torch.full((4,), 0.02, dtype=torch.float64)
+    )
+    trial: HeldOutTrial = HeldOutTrial()
 
     def __len__(self) -> int:
         return len(self.positions)

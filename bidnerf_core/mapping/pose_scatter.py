@@ -8,7 +8,8 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.resection import ObservedPoints, resect
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.resection import resect
 from bidnerf_core.mapping.triangulation import Sightings
 
 LEAST_VISIBLE_POINTS = 20
@@ -28,19 +29,30 @@ def pose_scatter(
     them towards its own error. This is corrected for: if a point has k views, resection shows the factor 1 - 1/k of the pose
     variance, whereas the pose of a new image would show 1 + 1/k.
     """
+    updates = list(pose_updates(tracked, positions, noise).values())
+    if len(updates) < ENOUGH_IMAGES:
+        return torch.zeros((6, 6), dtype=torch.float64)
+    return robust_covariance(torch.stack(updates))
+
+
+def pose_updates(
+    tracked: TrackedKeypoints, positions: Float[Tensor, "n 3"], noise: float
+) -> dict[int, Float[Tensor, "6"]]:
+    """Return the right updates from given to resected poses of the images with enough points, by number of the image.
+
+    They are corrected for the part that each image has in its points, see ``pose_scatter``.
+    """
     sightings, image = tracked.sightings, tracked.image
     seen = torch.bincount(sightings.point)[sightings.point].double()
-    updates = []
+    updates = {}
     for number in (torch.bincount(image) >= LEAST_VISIBLE_POINTS).nonzero()[:, 0].tolist():
         own = (image == number).nonzero()[:, 0]
         T = tracked.images[number].T_world_camera
         views = float(seen[own].mean())
         found = resect(_observed_points(sightings[own], positions), T, noise)
         update = (T.inverse() @ found.T_world_rig).log()
-        updates.append(update * ((1 + 1 / views) / (1 - 1 / views)) ** 0.5)
-    if len(updates) < ENOUGH_IMAGES:
-        return torch.zeros((6, 6), dtype=torch.float64)
-    return robust_covariance(torch.stack(updates))
+        updates[number] = update * ((1 + 1 / views) / (1 - 1 / views)) ** 0.5
+    return updates
 
 
 def _observed_points(sightings: Sightings, positions: Float[Tensor, "n 3"]) -> ObservedPoints:

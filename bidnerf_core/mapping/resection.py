@@ -1,211 +1,245 @@
-"""Resection: estimate the pose of a camera or a rig from known points, by robust Levenberg-Marquardt in pixels."""
+"""Resection: estimate the pose of a camera or a rig from known points, by robust Levenberg-Marquardt in pixels.
+
+The calibration of the camera may be estimated along with the pose, as far as a prior leaves it open. The arrays
+are small and the steps many, so everything is NumPy; the general solver on batches of poses is
+``localization/solvers/levenberg_marquardt``.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+import math
+from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.se3 import SE3, skew
+from bidnerf_core.mapping.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.se3 import SE3
+
+Array = np.ndarray
 
 RESECTION_STEPS = 20
 """Largest number of steps; from a good start, four or five suffice."""
-FIRM = 1e-6
-"""Squared length of a step, in standard deviations of the pose, below which the iteration has converged."""
-SETTLED = 0.01
+SMALL_STEP = 1e-4
+"""Squared length of a step, in standard deviations of the unknowns, below which the iteration has converged."""
+NOISE_TOLERANCE = 0.01
 """Relative change of the estimated noise below which it has converged."""
 LEAST_NOISE = 0.05
 """Lower limit of the estimated noise, pixels: no detector is more accurate."""
 SCALE = 2.0
 """Scale of the Cauchy loss: the residual, in standard deviations, whose weight is one half."""
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedPoints:
-    """Points of the world and their observations by the cameras of a rig. Float64."""
-
-    points: Float[Tensor, "m 3"]  # metres, world
-    deviations: Float[Tensor, "m 2"]  # metres, of the points, across and along ``directions``
-    directions: Float[Tensor, "m 3"]  # unit, world
-    image: Float[Tensor, "m 2"]  # observed, on the plane z = 1 of the camera
-    focal: Float[Tensor, "m"]  # pixels
-    depth: Float[Tensor, "m"]  # metres, 0 where none was measured
-    rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
-    translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def __getitem__(self, index: Tensor) -> ObservedPoints:
-        return ObservedPoints(*(getattr(self, name)[index] for name in (f.name for f in fields(self))))
-
-    def with_focal(self, factor: float) -> ObservedPoints:
-        """Return the same pixels, seen by cameras whose focal lengths are ``factor`` times as long."""
-        return replace(self, image=self.image / factor, focal=self.focal * factor)
-
-    def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
-        """Return each point in the frame of the camera that observed it."""
-        rig = T_world_rig.inverse().apply(self.points)
-        return (self.rotation @ rig[..., None])[..., 0] + self.translation
-
-    def residuals(self, T_world_rig: SE3) -> Float[Tensor, "m 2"]:
-        """Return projection minus observation, pixels; infinite for points behind the camera."""
-        local = self.in_camera(T_world_rig)
-        z = local[:, 2:]
-        off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
-        return torch.where(z > 0, off, torch.inf)
-
-    def normalized_residuals(self, T_world_rig: SE3, noise: float) -> Float[Tensor, "m 2"]:
-        """Return the residuals in standard deviations, which combine the keypoints' ``noise`` (pixels) with the points'."""
-        z = self.in_camera(T_world_rig)[:, 2]
-        deviation = _deviation(self, T_world_rig, self.focal / torch.where(z > 0, z, 1), noise)
-        return self.residuals(T_world_rig) / deviation[:, None]
+BEHIND = 30.0
+"""Residual of a point behind the camera, in standard deviations; its weight is 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReprojectionFit:
-    """A pose with its uncertainty and, if it was estimated, a factor on the focal length."""
+    """A pose with its uncertainty, and the calibration that was estimated with it."""
 
     T_world_rig: SE3
-    focal_factor: float  # true over given focal length; 1 if it was not estimated
+    calibration: Calibration
     noise: float  # pixels: standard deviation of a residual along each axis, robustly
     covariance: Float[
-        Tensor, "p p"
-    ]  # of the right update (translation, rotation) and of the logarithm of the factor
+        Tensor, "6 6"
+    ]  # of the right update (translation, rotation), with the uncertainty of the calibration
+    calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
+    slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each parameter of the calibration
 
 
 def resect(
-    data: ObservedPoints, start: SE3, noise: float, free_focal: bool = False, focal_factor: float = 1.0
+    data: ObservedPoints,
+    start: SE3,
+    noise: float,
+    prior: CalibrationPrior = FIXED,
+    calibration: Calibration = GIVEN,
+    correlation: float = 1.0,
 ) -> ReprojectionFit:
     """Minimize the Cauchy loss of the reprojection errors in standard deviations of keypoint and landmark together.
 
     ``noise`` is a first guess at the keypoints' noise (pixels), which is re-estimated after every accepted step until it
-    settles. ``focal_factor`` multiplies the focal lengths; with ``free_focal`` it is estimated too, from that start.
+    settles. ``calibration`` is where its estimation starts; parameters that ``prior`` leaves out stay there.
+    ``correlation`` is the number of observations that count as one, because their errors are correlated: it weighs them
+    against the prior and scales the covariance.
     """
-    T, log_factor, damping = start, torch.tensor(focal_factor, dtype=torch.float64).log(), 1e-4
-    system = _linearized(data, T, log_factor, noise, free_focal)
+    residuals, free = _Residuals(data, start), prior.deviations.numpy().nonzero()[0]
+
+    def equations(state: _State, noise: float) -> _System:
+        return residuals(state, noise, free).weighted(1 / correlation).with_prior(state, prior)
+
+    state = _State.of(start, calibration)
+    system, damping = equations(state, noise), 1e-6
     for _ in range(RESECTION_STEPS):
         step = -_solved(system.hessian, damping, system.gradient)
-        T_new = T.retract(step[:6]).normalized()
-        factor_new = log_factor + step[6] if free_focal else log_factor
-        tried = _linearized(data, T_new, factor_new, noise, free_focal)
-        if tried.cost <= system.cost:
-            size = float(step @ system.hessian @ step)
-            T, log_factor, damping, system = T_new, factor_new, max(1e-10, damping / 10), tried
-            better = max(LEAST_NOISE, noise * system.spread)
-            settled = abs(better / noise - 1) < SETTLED
-            if not settled:
-                noise = better
-                system = _linearized(data, T, log_factor, noise, free_focal)
-            elif size < FIRM:
+        moved = state.retracted(step, free)
+        tried = equations(moved, noise)
+        size = float(step @ system.hessian @ step)
+        if not tried.cost <= system.cost:
+            damping = max(10 * damping, 1e-4)
+            if size < SMALL_STEP or damping > 1e8:
                 break
-        else:
-            damping *= 10
-            if damping > 1e8:
-                break
-    covariance = _sandwich(system)
-    return ReprojectionFit(T, float(log_factor.exp()), noise, covariance)
+            continue
+        state, system, damping = moved, tried, damping / 10
+        better = max(LEAST_NOISE, noise * tried.spread)
+        settled = abs(better / noise - 1) < NOISE_TOLERANCE
+        if not settled:
+            noise = better
+            system = equations(state, noise)
+        elif size < SMALL_STEP:
+            break
+    covariance = system.covariance()
+    deviations = np.zeros(4)
+    deviations[free] = np.sqrt(np.diag(covariance)[6:].clip(min=0))
+    return ReprojectionFit(
+        state.pose(),
+        Calibration(*state.calibration.tolist()),
+        noise,
+        torch.from_numpy(covariance[:6, :6].copy()),
+        torch.from_numpy(deviations),
+        torch.from_numpy(residuals.slope(state, noise)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """The unknowns: the rig's pose and the calibration."""
+
+    rotation: Array  # (3, 3) R_world_rig
+    position: Array  # (3,) metres
+    calibration: Array  # (4,) in the order of ``Calibration``
+
+    @staticmethod
+    def of(T: SE3, calibration: Calibration) -> _State:
+        numbers = [getattr(calibration, f.name) for f in fields(calibration)]
+        return _State(T.rotation.numpy(), T.translation.numpy(), np.array(numbers))
+
+    def retracted(self, step: Array, free: Array) -> _State:
+        calibration = self.calibration.copy()
+        calibration[free] += step[6:]
+        # To first order, moving along the camera's axes equals the exponential map's translation.
+        position = self.position + self.rotation @ step[:3]
+        return _State(self.rotation @ Rotation.from_rotvec(step[3:6]).as_matrix(), position, calibration)
+
+    def pose(self) -> SE3:
+        return SE3(torch.from_numpy(self.rotation), torch.from_numpy(self.position)).normalized()
 
 
 @dataclass(frozen=True, eq=False)
 class _System:
     cost: float
-    gradient: Float[Tensor, "p"]
-    hessian: Float[Tensor, "p p"]
-    curvature: Float[
-        Tensor, "p p"
-    ]  # of the robust cost itself; the Hessian is that of the reweighted squares
-    scatter: Float[Tensor, "p p"]  # of the single gradients
+    gradient: Array  # (p,)
+    hessian: Array  # (p, p)
+    curvature: Array  # (p, p) of the robust cost itself; the Hessian is that of the reweighted squares
+    scatter: Array  # (p, p) of the gradients of single observations and priors
     spread: float  # residuals in standard deviations, robustly: 1 where the noise is right
 
+    def weighted(self, share: float) -> _System:
+        return _System(
+            share * self.cost, share * self.gradient, share * self.hessian, share * self.curvature,
+            share * self.scatter, self.spread,
+        )  # fmt: skip
 
-def _linearized(data: ObservedPoints, T: SE3, log_factor: Tensor, noise: float, free_focal: bool) -> _System:
-    """Linearize the residuals, in standard deviations, about ``T`` and the focal factor."""
-    local = data.in_camera(T)
-    front = local[:, 2] > 1e-9
-    z = torch.where(front, local[:, 2], 1)
-    focal = data.focal * log_factor.exp()
-    # The observations are pixels, hence their image coordinates are multiplied by the given focal length, not the new one.
-    off = local[:, :2] / z[:, None] * focal[:, None] - data.image * data.focal[:, None]
-    deviation = _deviation(data, T, focal / z, noise)
-    residual = torch.where(front[:, None], off / deviation[:, None], 30.0)
-    squared = residual.square().sum(-1)
-    weight = front / (1 + squared / SCALE**2)
-    jacobian = _jacobian(data, T, local, z, focal, free_focal) / deviation[:, None, None]
-    weighted = jacobian * weight[:, None, None]
-    single = (weighted.mT @ residual[..., None])[..., 0]
-    cost = 0.5 * SCALE**2 * torch.log1p(squared / SCALE**2).sum()
-    hessian = (weighted.mT @ jacobian).sum(0)
-    # d(w r)/dr = w I - 2 w^2 r r^T / c^2 for w = 1 / (1 + r^2 / c^2).
-    curvature = hessian - 2 / SCALE**2 * (single.mT @ single)
-    return _System(
-        float(cost),
-        single.sum(0),
-        hessian,
-        curvature,
-        single.mT @ single,
-        _spread(residual, hessian.shape[0]),
-    )
+    def with_prior(self, state: _State, prior: CalibrationPrior) -> _System:
+        """Add the prior of the free parameters, which is Gaussian."""
+        deviations = prior.deviations.numpy()
+        free = deviations.nonzero()[0]
+        if not len(free):
+            return self
+        precision = deviations[free] ** -2
+        value = state.calibration[free]
+        information, gradient = np.zeros_like(self.hessian), self.gradient.copy()
+        information[6:, 6:] = np.diag(precision)
+        gradient[6:] += precision * value
+        cost = self.cost + 0.5 * float((precision * value**2).sum())
+        return _System(
+            cost, gradient, self.hessian + information, self.curvature + information,
+            self.scatter + information, self.spread,
+        )  # fmt: skip
 
-
-def _deviation(data: ObservedPoints, T: SE3, pixels_per_metre: Tensor, noise: float) -> Float[Tensor, "m"]:
-    """Return the standard deviation (pixels) of each residual along an axis, from the keypoint's and the point's noise."""
-    return (noise**2 + _landmark_variance(data, T) * pixels_per_metre**2).sqrt()
-
-
-def _landmark_variance(data: ObservedPoints, T: SE3) -> Tensor:
-    """Return the variance (square metres) of the points perpendicular to the line of sight, averaged over both axes.
-
-    Along the axis perpendicular to both the line of sight and ``directions``, this is the point's variance across. Along the
-    other axis it is a mixture of the variances across and along, by the squared cosine and sine of the angle between the
-    line of sight and ``directions``.
-    """
-    sight = data.points - T.apply(_centres(data))
-    cosine = (sight * data.directions).sum(-1) / torch.linalg.vector_norm(sight, dim=-1).clamp(min=1e-12)
-    across, along = data.deviations.square().unbind(-1)
-    seen = cosine.square().clamp(max=1)
-    return (across * (1 + seen) + along * (1 - seen)) / 2
+    def covariance(self) -> Array:
+        """Return the covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3)."""
+        # With few residuals or many outliers the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
+        unit = 1 / np.sqrt(np.diag(self.hessian).clip(min=1e-300))
+        values, vectors = np.linalg.eigh(unit[:, None] * self.curvature * unit)
+        least = 0.2 * np.linalg.eigvalsh(unit[:, None] * self.hessian * unit)
+        inverse = vectors @ np.diag(1 / np.maximum(values, least).clip(min=1e-12)) @ vectors.T
+        inverse = unit[:, None] * inverse * unit
+        found: Array = inverse @ self.scatter @ inverse
+        return (found + found.T) / 2
 
 
-def _centres(data: ObservedPoints) -> Tensor:
-    """Return the centres of the cameras in the frame of the rig, metres."""
-    return -(data.rotation.mT @ data.translation[..., None])[..., 0]
+class _Residuals:
+    """Reprojection errors in standard deviations, linearized about a state."""
+
+    def __init__(self, data: ObservedPoints, start: SE3) -> None:
+        self._points = data.points.numpy()
+        self._rotation, self._translation = data.rotation.numpy(), data.translation.numpy()
+        self._focal = data.focal.numpy()[:, None]
+        self._observed = data.image.numpy() * self._focal
+        self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
+
+    def __call__(self, state: _State, noise: float, free: Array) -> _System:
+        rig = (self._points - state.position) @ state.rotation
+        local = np.einsum("mij,mj->mi", self._rotation, rig) + self._translation
+        front = local[:, 2] > 1e-9
+        z = np.where(front, local[:, 2], 1)[:, None]
+        flat = local[:, :2] / z
+        deviation = np.sqrt(noise**2 + self._variance)[:, None]
+        log_focal, shift, radial = state.calibration[0], state.calibration[1:3], state.calibration[3]
+        bend = radial * (flat**2).sum(1, keepdims=True)
+        scale = self._focal * math.exp(log_focal)
+        projected = flat * (1 + bend) * scale + self._focal * shift
+        residual = np.where(front[:, None], (projected - self._observed) / deviation, BEHIND)
+        squared = (residual**2).sum(1)
+        weight = front / (1 + squared / SCALE**2)
+        jacobian = self._jacobian(rig, flat, z, scale, radial, bend, free) / deviation[..., None]
+        single = ((weight[:, None] * residual)[:, None] @ jacobian)[:, 0]
+        weighted = (jacobian * np.sqrt(weight)[:, None, None]).reshape(-1, jacobian.shape[-1])
+        hessian, scatter = weighted.T @ weighted, single.T @ single
+        cost = 0.5 * SCALE**2 * float(np.log1p(squared / SCALE**2).sum())
+        # d(w r)/dr = w I - 2 w^2 r r^T / c^2 for w = 1 / (1 + r^2 / c^2).
+        curvature = hessian - 2 / SCALE**2 * scatter
+        spread = _spread(residual, jacobian.shape[-1])
+        return _System(cost, single.sum(0), hessian, curvature, scatter, spread)
+
+    def slope(self, state: _State, noise: float) -> Array:
+        """Return how the pose that fits best follows a change of the calibration, (6, 4)."""
+        hessian = self(state, noise, np.arange(4)).hessian
+        return -_solved(hessian[:6, :6], 1e-9, hessian[:6, 6:])
+
+    def _jacobian(
+        self, rig: Array, flat: Array, z: Array, scale: Array, radial: float, bend: Array, free: Array
+    ) -> Array:
+        """Return the derivative (m, 2, p) of the projection in pixels by a right update and by the free calibration."""
+        x, y = flat[:, 0], flat[:, 1]
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        bent = np.eye(2) * (1 + bend)[..., None] + 2 * radial * flat[:, :, None] * flat[:, None]
+        by_local = np.stack([one, zero, -x, zero, one, -y], axis=1).reshape(-1, 2, 3) / z[..., None]
+        by_rig = (scale[..., None] * bent) @ by_local @ self._rotation
+        # A point of the rig's frame moves by -rho + p x phi under T exp(rho, phi), and r (p x phi) = (r x p) phi.
+        by_pose = np.concatenate([-by_rig, np.cross(by_rig, rig[:, None])], axis=-1)
+        if not len(free):
+            return by_pose
+        focal = self._focal[:, 0]
+        by_calibration = [
+            flat * (1 + bend) * scale,
+            np.stack([focal, zero], axis=1),
+            np.stack([zero, focal], axis=1),
+            flat * (flat**2).sum(1, keepdims=True) * scale,
+        ]
+        return np.concatenate([by_pose, np.stack([by_calibration[i] for i in free], axis=-1)], axis=-1)
 
 
-def _jacobian(
-    data: ObservedPoints, T: SE3, local: Tensor, z: Tensor, focal: Tensor, free_focal: bool
-) -> Tensor:
-    """Return the derivative of the projection (pixels) by a right update of ``T`` and by the log of the focal length."""
-    x, y, zero, inverse = local[:, 0] / z, local[:, 1] / z, torch.zeros_like(z), focal / z
-    rows = torch.stack([inverse, zero, -x * inverse, zero, inverse, -y * inverse], dim=-1).unflatten(
-        -1, (2, 3)
-    )
-    rig = T.inverse().apply(data.points)
-    # A point of the rig's frame moves by -rho + [p]x phi under T exp(rho, phi).
-    moved = torch.cat([-torch.eye(3, dtype=z.dtype).expand(len(z), 3, 3), skew(rig)], dim=-1)
-    jacobian = rows @ data.rotation @ moved
-    if free_focal:
-        jacobian = torch.cat([jacobian, (local[:, :2] / z[:, None] * focal[:, None])[..., None]], dim=-1)
-    return jacobian
-
-
-def _spread(residual: Float[Tensor, "m 2"], unknowns: int) -> float:
+def _spread(residual: Array, unknowns: int) -> float:
     """Return a robust standard deviation along an axis, corrected for the number of unknowns that were fitted."""
-    spare = max(1.0, 2 * len(residual) - unknowns) / (2 * len(residual))
-    return 1.4826 * float(residual.abs().median()) / spare**0.5
+    spare = max(1.0, residual.size - unknowns) / residual.size
+    return 1.4826 * float(np.median(np.abs(residual))) / spare**0.5
 
 
-def _solved(hessian: Tensor, damping: float, gradient: Tensor) -> Tensor:
-    diagonal = hessian.diagonal().clamp(min=1e-12)
-    return torch.linalg.solve(hessian + torch.diag(damping * diagonal), gradient)
-
-
-def _sandwich(system: _System) -> Float[Tensor, "p p"]:
-    """Return the covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, section 6.3)."""
-    # With few residuals or many outliers the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
-    values, vectors = torch.linalg.eigh(system.curvature)
-    least = 0.2 * torch.linalg.eigvalsh(system.hessian)
-    inverse = vectors @ torch.diag(1 / values.maximum(least).clamp(min=1e-12)) @ vectors.mT
-    return inverse @ system.scatter @ inverse
+def _solved(hessian: Array, damping: float, right: Array) -> Array:
+    diagonal = np.diag(hessian).clip(min=1e-12)
+    found: Array = np.linalg.solve(hessian + np.diag(damping * diagonal), right)
+    return found

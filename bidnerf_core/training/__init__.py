@@ -1,21 +1,27 @@
 """What training recipes share: batches of rays, the loss, and the loop with its schedule, checkpoints and resumption."""
 
+from bidnerf_core.training.colour_transform import ColourTransforms, fitted_colours
 from bidnerf_core.training.loop import StepOutcome, cosine, fit
 from bidnerf_core.training.loss import ray_termination, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 from bidnerf_core.training.report import Progress, Report, Silent, TrainingState, TrainingStopped
+from bidnerf_core.training.supervision import Supervision, SupervisionConfig
 
 __all__ = [
+    "ColourTransforms",
     "Progress",
     "RayBank",
     "Report",
     "Silent",
     "StepOutcome",
+    "Supervision",
+    "SupervisionConfig",
     "TrainingBatch",
     "TrainingState",
     "TrainingStopped",
     "cosine",
     "fit",
+    "fitted_colours",
     "ray_termination",
     "supervised_loss",
 ]

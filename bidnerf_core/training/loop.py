@@ -14,6 +14,9 @@ from torch import Generator, Tensor, nn
 from bidnerf_core.errors import InputError
 from bidnerf_core.training.report import Progress, Report, TrainingState, TrainingStopped
 
+BESIDE = "beside."
+"""Prefix of the names under which a state holds what is learned beside the field."""
+
 
 @dataclass(frozen=True, eq=False)
 class StepOutcome:
@@ -41,17 +44,18 @@ def fit(
     report: Report,
     schedule: Callable[[int, int], float] = cosine,
     seed: int = 0,
+    beside: nn.Module | None = None,
 ) -> None:
     """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` of Adam.
 
-    Training resumes from ``report.resume()``, saves when ``report.due`` says so and, when ``report.stopping`` is set, saves
+    ``beside`` is what is learned with the field and not kept with it; its parameters are among the groups. Training resumes from ``report.resume()``, saves when ``report.due`` says so and, when ``report.stopping`` is set, saves
     and raises ``TrainingStopped``. A resumed run computes what an uninterrupted one would have. Raises ``InputError`` where
     the loss is not finite.
     """
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
     rates = [group["lr"] for group in optimizer.param_groups]
     generator = torch.Generator().manual_seed(seed)
-    first = _restore(report.resume(), field, optimizer, generator)
+    first = _restore(report.resume(), field, optimizer, generator, beside)
     for step in range(first, steps):
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * schedule(step, steps)
@@ -69,7 +73,7 @@ def fit(
         # Read once: it may change at any time, and a training that stops must have saved.
         stopping = report.stopping
         if stopping or report.due(step + 1):
-            report.save(_state(step + 1, field, optimizer, generator))
+            report.save(_state(step + 1, field, optimizer, generator, beside))
         if stopping and step + 1 < steps:
             raise TrainingStopped(step + 1)
 
@@ -79,9 +83,15 @@ def _parameters(optimizer: torch.optim.Optimizer) -> Iterator[Tensor]:
 
 
 def _state(
-    step: int, field: nn.Module, optimizer: torch.optim.Optimizer, generator: Generator
+    step: int,
+    field: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    generator: Generator,
+    beside: nn.Module | None,
 ) -> TrainingState:
     moments = {"generator": generator.get_state()}
+    if beside is not None:
+        moments |= {BESIDE + name: value for name, value in beside.state_dict().items()}
     for number, parameter in enumerate(_parameters(optimizer)):
         for name, value in optimizer.state.get(parameter, {}).items():
             moments[f"{number}.{name}"] = value
@@ -89,12 +99,15 @@ def _state(
 
 
 def _restore(
-    state: TrainingState | None, field: nn.Module, optimizer: torch.optim.Optimizer, generator: Generator
-) -> int:
+    state: TrainingState | None, field: nn.Module, optimizer: torch.optim.Optimizer, generator: Generator, beside: nn.Module | None
+) -> int:  # fmt: skip
     if state is None:
         return 0
     field.load_state_dict(state.field)
     generator.set_state(state.optimizer["generator"])
+    if beside is not None:
+        found = {k.removeprefix(BESIDE): v for k, v in state.optimizer.items() if k.startswith(BESIDE)}
+        beside.load_state_dict(found)
     for number, parameter in enumerate(_parameters(optimizer)):
         prefix = f"{number}."
         found = {k[len(prefix) :]: v.clone() for k, v in state.optimizer.items() if k.startswith(prefix)}

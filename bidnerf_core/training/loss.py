@@ -1,6 +1,8 @@
-"""The supervised loss: colour, and depth where it was measured."""
+"""The supervised loss: colour, and depth where it was measured or a landmark is."""
 
 from __future__ import annotations
+
+from math import pi, sqrt
 
 import torch
 from jaxtyping import Float
@@ -27,8 +29,31 @@ def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor,
 
     Like the ray termination loss of DS-NeRF (Deng et al. 2022) it is least where all weight is at the measured depth; an
     error of the mean depth would also be 0 with equal weight on both sides. Weight that a ray lacks counts as at the camera.
+    Where the distance comes from a landmark, the mean is also over its normal distribution, so that weight within its
+    deviation is hardly pulled.
     """
     distance, measured = batch.observed.distance, batch.observed.measured
-    away = (rendering.weights * (rendering.samples.middles - distance[:, None]).abs()).sum(-1)
+    off = rendering.samples.middles - distance[:, None]
+    away = (rendering.weights * expected_distance(off, batch.deviation[:, None])).sum(-1)
     missing = (1 - rendering.opacity) * distance
     return torch.where(measured, away + missing, 0).sum() / measured.sum().clamp(min=1)
+
+
+def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p"]) -> Float[Tensor, "*p"]:
+    """Return the mean of ``|offset + e|`` over normal errors ``e`` of a standard deviation: the mean of a folded normal."""
+    sigma = deviation.clamp(min=torch.finfo(offset.dtype).tiny)
+    ratio = (offset / sigma).clamp(-30, 30)
+    mean = sigma * sqrt(2 / pi) * torch.exp(-ratio.square() / 2) + offset * torch.erf(ratio / sqrt(2))
+    return torch.where(deviation > 0, mean, offset.abs())
+
+
+def distortion(rendering: Rendering, side: float) -> Float[Tensor, ""]:
+    """Return the mean distortion of the rays' weights (Barron et al. 2022, eq. 15), distances in units of ``side``.
+
+    It is least where a ray's weight is in one short interval. Sums over pairs are computed from cumulative sums.
+    """
+    samples, weights = rendering.samples, rendering.weights
+    middles, widths = samples.middles / side, (samples.ends - samples.starts) / side
+    before, moment = weights.cumsum(-1) - weights, (weights * middles).cumsum(-1) - weights * middles
+    pairs = 2 * (weights * (middles * before - moment)).sum(-1)
+    return (pairs + (weights.square() * widths).sum(-1) / 3).mean()

@@ -16,6 +16,8 @@ from bidnerf_core.observations import Observations
 MEASURED_SHARE = 0.25
 """Fraction of a batch's rays that are drawn from pixels with depth, where so few have any that hardly one would be drawn
 otherwise (in DS-NeRF: half)."""
+LANDMARK_SHARE = 0.125
+"""Fraction of a batch's rays that are drawn from pixels that show a landmark."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +27,8 @@ class TrainingBatch:
     rays: Rays  # world
     observed: Observations  # of the same rays, in the world; all of them have a colour
     background: Float[Tensor, "r 3"]
+    image: Int[Tensor, "r"]  # number of the view that shows the ray
+    deviation: Float[Tensor, "r"]  # metres: of a distance that a landmark gives; 0 where a sensor measured it
 
     def __len__(self) -> int:
         return len(self.observed)
@@ -53,6 +57,7 @@ class RayBank:
             zero = [torch.zeros(f.rgb.shape[:2]) if f.depth is None else f.depth for f in frames]
             self._depth = torch.cat([d.reshape(-1) for d in zero])
         self._few = self._few_measured()
+        self._landmarks = _landmark_pixels(views, self.offsets)
         self._rotation = torch.stack([view.T_ref_camera.rotation for view in views]).float()
         self._origin = torch.stack([view.T_ref_camera.translation for view in views]).float()
         kinds = list(dict.fromkeys(frame.intrinsics for frame in frames))
@@ -69,15 +74,23 @@ class RayBank:
         if len(self._few):
             some = round(MEASURED_SHARE * count)
             index[:some] = self._few[torch.randint(len(self._few), (some,), generator=generator)]
+        deviation, seen = torch.zeros(count), torch.zeros(0)
+        if len(self._landmarks):
+            some = round(LANDMARK_SHARE * count)
+            chosen = torch.randint(len(self._landmarks), (some,), generator=generator)
+            index[:some] = self._landmarks.pixel[chosen]
+            seen, deviation[:some] = self._landmarks.distance[chosen], self._landmarks.deviation[chosen]
         view = torch.searchsorted(self.offsets, index, right=True) - 1
         ray = self._camera_rays[self._camera_start[view] + index - self.offsets[view]]
         length = torch.linalg.vector_norm(ray, dim=-1)
         directions = (self._rotation[view] @ (ray / length[:, None])[..., None])[..., 0]
         distance = self._depth[index] * length if self.has_depth else torch.zeros(count)
+        distance[: len(seen)] = seen
         rgb, background = self._coloured(index, generator)
         origins, coloured = self._origin[view], torch.ones(count, dtype=torch.bool)
         observed = Observations(origins, directions, rgb, distance, coloured)
-        return TrainingBatch(self.bounds.rays(origins, directions), observed, background)
+        rays = self.bounds.rays(origins, directions)
+        return TrainingBatch(rays, observed, background, view, deviation)
 
     def _few_measured(self) -> Int[Tensor, "m"]:
         """Return the indices of the pixels with depth where it is sparse (structure from motion), and none otherwise."""
@@ -93,3 +106,30 @@ class RayBank:
             return self._rgb[index], usual
         background = torch.rand((len(index), 3), generator=generator)
         return self._rgb[index] + (1 - self._alpha[index])[:, None] * (background - usual), background
+
+
+@dataclass(frozen=True, eq=False)
+class _LandmarkPixels:
+    """The pixels of all views that show a landmark."""
+
+    pixel: Int[Tensor, "m"]  # number among the pixels of all views
+    distance: Float[Tensor, "m"]  # metres
+    deviation: Float[Tensor, "m"]  # metres
+
+    def __len__(self) -> int:
+        return len(self.pixel)
+
+
+def _landmark_pixels(views: Sequence[View], offsets: Int[Tensor, "v"]) -> _LandmarkPixels:
+    """Return the landmarks of the views without dense depth, whose own measurements are better."""
+    parts: list[tuple[Tensor, Tensor, Tensor]] = [
+        (torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))
+    ]
+    for view, first in zip(views, offsets.tolist(), strict=True):
+        seen, camera = view.landmarks, view.frame.intrinsics
+        if seen is None or view.frame.has_dense_depth:
+            continue
+        columns = seen.pixels[:, 0].long().clamp(0, camera.width - 1)
+        rows = seen.pixels[:, 1].long().clamp(0, camera.height - 1)
+        parts.append((first + rows * camera.width + columns, seen.distance.float(), seen.deviation.float()))
+    return _LandmarkPixels(*(torch.cat(part) for part in zip(*parts, strict=True)))

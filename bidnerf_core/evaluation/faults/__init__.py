@@ -5,7 +5,7 @@ from bidnerf_core.evaluation.faults.composition import (
     NO_FAULT,
     AppliedFault,
     check_depth,
-    expand,
+    expand_faults,
     faulty,
     parse_faults,
 )
@@ -17,7 +17,7 @@ __all__ = [
     "AppliedFault",
     "Fault",
     "check_depth",
-    "expand",
+    "expand_faults",
     "faulty",
     "find_fault",
     "parse_faults",

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.evaluation.faults.fault import uniform
+from bidnerf_core.evaluation.faults.fault import uniform_number
 
 WAVES = (2, 3, 4, 5)
 """Numbers of bulges around a blob's outline, of which its radius is composed."""
 BULGE = 0.35
 """Amplitude of each, in the logarithm of the radius, at most."""
-OCTAVES = (4, 8, 16, 32, 64, 128)
+BLOB_OCTAVES = (4, 8, 16, 32, 64, 128)
 """Cells along the longer side, of the noises that a texture is the sum of."""
 
 
@@ -23,7 +23,7 @@ def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Te
 
     A larger share with the same generator's state covers all that a smaller one does.
     """
-    centre = uniform(generator, 0.2, 0.8) * width, uniform(generator, 0.2, 0.8) * height
+    centre = uniform_number(generator, 0.2, 0.8) * width, uniform_number(generator, 0.2, 0.8) * height
     down = torch.arange(height, dtype=torch.float32)[:, None] + 0.5 - centre[1]
     across = torch.arange(width, dtype=torch.float32)[None, :] + 0.5 - centre[0]
     distance = torch.hypot(down, across) / _radius(torch.atan2(down, across), generator)
@@ -39,7 +39,8 @@ def _radius(angle: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, 
     Every point of the outline is seen from the centre, so that the blob is one piece.
     """
     waves = [
-        uniform(generator, -BULGE, BULGE) * torch.cos(n * angle + uniform(generator, 0, 2 * math.pi))
+        uniform_number(generator, -BULGE, BULGE)
+        * torch.cos(n * angle + uniform_number(generator, 0, 2 * math.pi))
         for n in WAVES
     ]
     return torch.stack(waves).sum(0).exp()
@@ -50,8 +51,8 @@ def texture(height: int, width: int, generator: Generator) -> Float[Tensor, "h w
     longer = max(height, width)
     layers = [
         torch.stack([smooth_noise(height, width, *_cells(height, width, n, longer), generator) for _ in range(3)], -1)
-        * (OCTAVES[0] / n) ** 0.5
-        for n in OCTAVES
+        * (BLOB_OCTAVES[0] / n) ** 0.5
+        for n in BLOB_OCTAVES
     ]  # fmt: skip
     noise = torch.stack(layers).sum(0)
     low, high = noise.flatten(0, 1).quantile(torch.tensor([0.02, 0.98]), dim=0)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 
 import torch
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import unknown_name
 from bidnerf_core.evaluation.faults import camera, colour, depth, scene, whole_image
 from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault, WholeNumbers
 from bidnerf_core.se3 import SE3
@@ -25,9 +24,7 @@ HALF_TURN = SE3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.pi], dtype=torch
 def find_fault(name: str) -> Fault:
     """Return a fault by name. Raises ``InputError`` for an unknown name."""
     if name not in FAULTS:
-        near = difflib.get_close_matches(name, FAULTS, n=1)
-        hint = f", did you mean {near[0]!r}?" if near else f", expected one of {', '.join(FAULTS)}"
-        raise InputError(f"no fault {name!r}{hint}")
+        raise unknown_name("fault", name, FAULTS)
     return FAULTS[name]
 
 
@@ -63,7 +60,7 @@ FAULTS: dict[str, Fault] = {
     ),
     "depth-window": Fault(
         "depth in a random square only", "pixels a side", WholeNumbers(1, LARGER_THAN_IMAGES), LARGER_THAN_IMAGES,
-        (25.0, 50.0, 100.0), depth.window, True,
+        (25.0, 50.0, 100.0), depth.square_window, True,
     ),
     "depth-rows": Fault(
         "depth in neighbouring rows only", "rows", WholeNumbers(1, LARGER_THAN_IMAGES), LARGER_THAN_IMAGES,

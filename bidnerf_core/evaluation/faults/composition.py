@@ -43,7 +43,7 @@ class AppliedFault:
         return View(fault.change(view.frame, self.size, generator), T_ref_camera)
 
 
-def expand(words: Iterable[str]) -> tuple[str, ...]:
+def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
     """Return every fault that the words of a command name, in a canonical form.
 
     A word is ``none``, ``NAME:SIZE``, ``NAME:SIZE,SIZE...`` for several faults, or faults of one size each joined by

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.evaluation.faults.fault import measured_depth, random_direction, random_pixel
+from bidnerf_core.evaluation.faults.fault import depth_of, random_direction, random_pixel
 from bidnerf_core.evaluation.faults.warp import nearest
 from bidnerf_core.frames import Frame
 
@@ -20,41 +20,41 @@ PLANE_TOLERANCE = 0.01
 
 def scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
     """Multiply the depth by ``factor``."""
-    return replace(frame, depth=measured_depth(frame) * factor)
+    return replace(frame, depth=depth_of(frame) * factor)
 
 
 def offset(frame: Frame, metres: float, generator: Generator) -> Frame:
     """Add a constant to the depth."""
-    return _remeasured(frame, measured_depth(frame) + metres)
+    return _remeasured(frame, depth_of(frame) + metres)
 
 
 def proportional_noise(frame: Frame, share: float, generator: Generator) -> Frame:
     """Add independent Gaussian noise whose standard deviation is ``share`` of the depth."""
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     return _remeasured(frame, depth + share * depth * _normal(depth, generator))
 
 
 def quadratic_noise(frame: Frame, per_metre: float, generator: Generator) -> Frame:
     """Add independent Gaussian noise of standard deviation ``per_metre * depth ** 2``, as triangulating sensors have."""
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     return _remeasured(frame, depth + per_metre * depth.square() * _normal(depth, generator))
 
 
 def quantised(frame: Frame, step: float, generator: Generator) -> Frame:
     """Round the depth to multiples of ``step`` (metres)."""
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     return frame if step == 0 else _remeasured(frame, (depth / step).round() * step)
 
 
 def random_holes(frame: Frame, share: float, generator: Generator) -> Frame:
     """Remove the depth of each pixel with probability ``share``, independently."""
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     return _kept(frame, torch.rand(depth.shape, generator=generator) >= share)
 
 
 def one_hole(frame: Frame, share: float, generator: Generator) -> Frame:
     """Remove ``share`` of the measured pixels in one piece: all that lie on one side of a line of random direction."""
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     across, down = random_direction(generator)
     rows, columns = torch.meshgrid(*map(torch.arange, depth.shape), indexing="ij")
     along = across * columns + down * rows
@@ -65,23 +65,23 @@ def one_hole(frame: Frame, share: float, generator: Generator) -> Frame:
 
 def misregistered(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """Move the depth by ``pixels`` relative to the colour image, in a random direction."""
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     move = depth.new_tensor(random_direction(generator)) * pixels
     return replace(frame, depth=nearest(depth, frame.intrinsics.pixel_centres() - move))
 
 
-def window(frame: Frame, pixels: float, generator: Generator) -> Frame:
+def square_window(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """Keep the depth inside a square of ``pixels`` by ``pixels`` around a random measured pixel only."""
-    row, column = random_pixel(measured_depth(frame) > 0, generator)
-    height, width = measured_depth(frame).shape
+    row, column = random_pixel(depth_of(frame) > 0, generator)
+    height, width = depth_of(frame).shape
     rows, columns = _interval(row, height, int(pixels)), _interval(column, width, int(pixels))
     return _kept(frame, rows[:, None] & columns[None, :])
 
 
 def few_rows(frame: Frame, count: float, generator: Generator) -> Frame:
     """Keep the depth of ``count`` neighbouring rows around a random measured pixel only, as a line scanner measures it."""
-    row, _ = random_pixel(measured_depth(frame) > 0, generator)
-    height, width = measured_depth(frame).shape
+    row, _ = random_pixel(depth_of(frame) > 0, generator)
+    height, width = depth_of(frame).shape
     return _kept(frame, _interval(row, height, int(count))[:, None].expand(height, width))
 
 
@@ -89,7 +89,7 @@ def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
     """Keep the depth of the plane that holds the most measured points only."""
     if not on:
         return frame
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     points = frame.intrinsics.unproject(frame.intrinsics.pixel_centres()) * depth[..., None]
     plane = _largest_plane(points[depth > 0], generator)
     return _kept(frame, _on_plane(points, plane))
@@ -126,10 +126,10 @@ def _normal(depth: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, 
 
 def _remeasured(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
     """Return the frame with another depth where there was a measurement; depths of 0 and below are none."""
-    valid = (measured_depth(frame) > 0) & (depth > 0)
+    valid = (depth_of(frame) > 0) & (depth > 0)
     return replace(frame, depth=torch.where(valid, depth, torch.zeros_like(depth)))
 
 
 def _kept(frame: Frame, kept: Bool[Tensor, "h w"]) -> Frame:
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     return replace(frame, depth=torch.where(kept, depth, torch.zeros_like(depth)))

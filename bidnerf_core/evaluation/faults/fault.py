@@ -54,7 +54,7 @@ class Fault:
         return self.allowed is SWITCH
 
 
-def measured_depth(frame: Frame) -> Float[Tensor, "h w"]:
+def depth_of(frame: Frame) -> Float[Tensor, "h w"]:
     """Return the measured depth (planar z, metres). Raises ``InputError`` where nothing was measured."""
     if frame.depth is None or not frame.has_depth:
         raise InputError(f"frame {frame.name} has no measured depth that a fault of depth could change")
@@ -63,11 +63,11 @@ def measured_depth(frame: Frame) -> Float[Tensor, "h w"]:
 
 def random_direction(generator: Generator) -> tuple[float, float]:
     """Return a unit vector of the image plane, uniformly distributed."""
-    angle = 2 * math.pi * uniform(generator)
+    angle = 2 * math.pi * uniform_number(generator)
     return math.cos(angle), math.sin(angle)
 
 
-def uniform(generator: Generator, low: float = 0.0, high: float = 1.0) -> float:
+def uniform_number(generator: Generator, low: float = 0.0, high: float = 1.0) -> float:
     """Return a number that is uniformly distributed between two limits."""
     return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
 

@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation
 from torch import Generator, Tensor
 
 from bidnerf_core.evaluation.faults.blob import blob, smooth_noise, texture
-from bidnerf_core.evaluation.faults.fault import measured_depth, random_direction, random_pixel, uniform
+from bidnerf_core.evaluation.faults.fault import depth_of, random_direction, random_pixel, uniform_number
 from bidnerf_core.evaluation.faults.warp import reflected, warped
 from bidnerf_core.frames import Frame
 
@@ -37,7 +37,7 @@ def occluder(frame: Frame, share: float, generator: Generator) -> Frame:
         return _pasted(frame, mask, colours, frame.depth)
     near = float(np.quantile(frame.depth[frame.depth > 0].numpy(), NEAREST_QUANTILE))
     relief = 1 + RELIEF * _bounded_noise(frame, 3, generator)
-    return _pasted(frame, mask, colours, uniform(generator, *OCCLUDER_DEPTH) * near * relief)
+    return _pasted(frame, mask, colours, uniform_number(generator, *OCCLUDER_DEPTH) * near * relief)
 
 
 def unmeasured_occluder(frame: Frame, share: float, generator: Generator) -> Frame:
@@ -54,19 +54,19 @@ def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     """
     height, width = frame.rgb.shape[:2]
     mask = blob(height, width, share, generator)
-    travel = uniform(generator, *TRAVEL) * min(height, width)
+    travel = uniform_number(generator, *TRAVEL) * min(height, width)
     move = torch.tensor(random_direction(generator)) * travel
     elsewhere = warped(frame, reflected(frame.intrinsics.pixel_centres() - move, width, height))
-    depth = None if elsewhere.depth is None else elsewhere.depth * uniform(generator, *APPROACH)
+    depth = None if elsewhere.depth is None else elsewhere.depth * uniform_number(generator, *APPROACH)
     return _pasted(frame, mask, elsewhere.rgb, depth, elsewhere.alpha)
 
 
 def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     """Put a textured thing onto ``share`` of the measured surface, from which it rises a little."""
     mask = _surface_piece(frame, share, generator)
-    rise = uniform(generator, *ADDED_HEIGHT) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
+    rise = uniform_number(generator, *ADDED_HEIGHT) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
     colours = texture(frame.intrinsics.height, frame.intrinsics.width, generator)
-    return _pasted(frame, mask, colours, measured_depth(frame) * (1 - rise))
+    return _pasted(frame, mask, colours, depth_of(frame) * (1 - rise))
 
 
 def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
@@ -79,7 +79,7 @@ def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
     rim = torch.from_numpy(binary_dilation(mask.numpy(), iterations=RIM)) & ~mask
     if not mask.any() or not rim.any():
         return frame
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     empty = None if frame.alpha is None else rim & (frame.alpha < 0.5)
     if empty is not None and empty.any():
         background = frame.rgb[empty].median(dim=0).values.expand_as(frame.rgb)
@@ -96,7 +96,7 @@ def _textured_blob(
 
 def _surface_piece(frame: Frame, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
     """Mark ``share`` of the measured pixels: those whose points are nearest to a random one of them."""
-    depth = measured_depth(frame)
+    depth = depth_of(frame)
     points = frame.intrinsics.unproject(frame.intrinsics.pixel_centres()) * depth[..., None]
     row, column = random_pixel(depth > 0, generator)
     distance = (points - points[row, column]).norm(dim=-1)

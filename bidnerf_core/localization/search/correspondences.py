@@ -14,7 +14,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping.features import Features, Keypoints
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import ObservedPoints
+from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
+from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.se3 import SE3
@@ -32,47 +33,81 @@ def guided_matches(
     T_world_rig: SE3,
     radius: float,
     most_distance: float,
-    focal_factor: float = 1.0,
-    shift: tuple[float, float] = (0.0, 0.0),
+    calibration: Calibration = GIVEN,
 ) -> LandmarkMatches:
     """Return the matches of keypoints with landmarks that project within ``radius`` pixels of them.
 
-    ``most_distance`` is the largest squared distance between the descriptors of a match. ``shift`` (pixels) is added to all
-    projections: with a shift longer than the radius, every match is due to chance.
+    ``most_distance`` is the largest squared distance between the descriptors of a match.
     """
-    parts = [
-        _in_view(number, image, landmarks, T_world_rig, radius, most_distance, focal_factor, shift)
-        for number, image in enumerate(images)
-    ]
-    return LandmarkMatches.cat(parts)
+    projections = projected_landmarks(images, landmarks, T_world_rig, calibration, radius)
+    return LandmarkMatches.cat([found.matches(radius, most_distance) for found in projections])
 
 
-def _in_view(
-    number: int,
-    image: QueryImage,
+def projected_landmarks(
+    images: Sequence[QueryImage],
     landmarks: LandmarkMap,
     T_world_rig: SE3,
-    radius: float,
-    most_distance: float,
-    focal_factor: float,
-    shift: tuple[float, float],
-) -> LandmarkMatches:
-    focal = image.focal * focal_factor
-    T_world_camera = T_world_rig @ image.T_rig_camera
-    local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
-    index = _visible(image, landmarks, T_world_camera, local, focal, radius).nonzero()[:, 0]
-    projected = local[index, :2] / local[index, 2:] * focal + torch.tensor(shift)
-    observed = (image.rays[:, :2] * image.focal).float()
-    keypoint, found = _near(observed, projected, radius)
-    landmark = index[found]
-    size = landmarks.sizes[landmark] * focal / local[landmark, 2]
-    alike = (size / image.keypoints.sizes[keypoint]).log2().abs() <= OCTAVES
-    keypoint, landmark = keypoint[alike], landmark[alike]
-    distance = paired_squared_distances(
-        image.keypoints.descriptors, landmarks.descriptors, keypoint, landmark
-    )
-    best, ambiguity = _best(keypoint, landmark, distance, most_distance)
-    return LandmarkMatches(torch.full_like(best, number), keypoint[best], landmark[best], ambiguity)
+    calibration: Calibration,
+    margin: float,
+) -> list[ProjectedLandmarks]:
+    """Return the landmarks that each image should show, up to ``margin`` pixels beyond its edges."""
+    return [
+        ProjectedLandmarks(number, image, landmarks, T_world_rig, calibration, margin)
+        for number, image in enumerate(images)
+    ]
+
+
+class ProjectedLandmarks:
+    """The landmarks that one of the query's images should show, and where."""
+
+    def __init__(
+        self,
+        number: int,
+        image: QueryImage,
+        landmarks: LandmarkMap,
+        T_world_rig: SE3,
+        calibration: Calibration,
+        margin: float,
+    ) -> None:
+        self._number, self._image, self._landmarks = number, image, landmarks
+        focal = image.focal * calibration.focal_factor
+        T_world_camera = T_world_rig @ image.T_rig_camera
+        local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
+        self._index = _visible(image, landmarks, T_world_camera, local, focal, margin).nonzero()[:, 0]
+        local = local[self._index]
+        self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
+        self._tree = cKDTree(self._pixels.numpy()) if len(self._pixels) else None
+        self._sizes = landmarks.sizes[self._index] * focal / local[:, 2]
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def matches(
+        self, radius: float, most_distance: float, shift: tuple[float, float] = (0.0, 0.0)
+    ) -> LandmarkMatches:
+        """Return matches as ``guided_matches`` does; with keypoints that are shifted (pixels), all matches are due to chance."""
+        observed = (self._image.rays[:, :2] * self._image.focal + torch.tensor(shift)).float()
+        keypoint, found = self._near(observed, radius)
+        keypoints = self._image.keypoints
+        alike = (self._sizes[found] / keypoints.sizes[keypoint]).log2().abs() <= OCTAVES
+        keypoint, landmark = keypoint[alike], self._index[found[alike]]
+        distance = paired_squared_distances(
+            keypoints.descriptors, self._landmarks.descriptors, keypoint, landmark
+        )
+        best, ambiguity = _best(keypoint, landmark, distance, most_distance)
+        number = torch.full_like(best, self._number)
+        return LandmarkMatches(number, keypoint[best], landmark[best], ambiguity)
+
+    def _near(
+        self, observed: Float[Tensor, "k 2"], radius: float
+    ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+        """Return the indices of keypoints and projections that are within ``radius`` (pixels) of one another, pairwise."""
+        if self._tree is None or not len(observed):
+            return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
+        _, found = self._tree.query(observed.numpy(), k=CANDIDATES, distance_upper_bound=radius)
+        index = torch.from_numpy(np.asarray(found, dtype=np.int64))
+        rows, columns = (index < len(self._pixels)).nonzero().unbind(-1)
+        return rows, index[rows, columns]
 
 
 def _visible(
@@ -87,18 +122,6 @@ def _visible(
     length = torch.linalg.vector_norm(towards, dim=-1).clamp(min=1e-12)
     cosine = (towards * landmarks.directions).sum(-1) / length
     return inside & (cosine >= (landmarks.cones + OBLIQUE).clamp(max=torch.pi).cos())
-
-
-def _near(
-    observed: Float[Tensor, "k 2"], projected: Float[Tensor, "n 2"], radius: float
-) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-    """Return the indices of keypoints and projections that are within ``radius`` (pixels) of one another, pairwise."""
-    if not len(observed) or not len(projected):
-        return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
-    _, found = cKDTree(projected.numpy()).query(observed.numpy(), k=CANDIDATES, distance_upper_bound=radius)
-    index = torch.from_numpy(np.asarray(found, dtype=np.int64))
-    rows, columns = (index < len(projected)).nonzero().unbind(-1)
-    return rows, index[rows, columns]
 
 
 def _best(

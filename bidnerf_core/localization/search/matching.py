@@ -14,7 +14,7 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 
 EXACT = 4_000
 """The number of landmarks up to which the search is exhaustive, and no cells are built."""
-COMPARISONS = 30_000_000
+COMPARISONS = 4_000_000
 """The number of keypoint-landmark pairs up to which comparing all of them is faster than searching cells."""
 QUERY_BLOCK = 64
 """Width of the blocks of columns whose minima are ranked first, because ranking all columns is slower."""

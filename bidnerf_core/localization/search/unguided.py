@@ -22,11 +22,16 @@ LEAST_MATCHES = 60
 """If there are fewer unambiguous matches, the least ambiguous others are added up to this number."""
 
 
-def unguided_matches(images: Sequence[QueryImage], matcher: LandmarkMatcher) -> LandmarkMatches:
-    """Return the matches of keypoints with their nearest landmarks that pass the ratio test, least ambiguous first."""
+def unguided_matches(
+    images: Sequence[QueryImage], matcher: LandmarkMatcher, strongest: int
+) -> LandmarkMatches:
+    """Return the matches of keypoints with their nearest landmarks that pass the ratio test, least ambiguous first.
+
+    Only the ``strongest`` keypoints of each image are matched.
+    """
     parts = []
     for number, image in enumerate(images):
-        distances, index = matcher.nearest(image.keypoints.descriptors, LOOKED_UP)
+        distances, index = matcher.nearest(image.keypoints.descriptors[:strongest], LOOKED_UP)
         ambiguity = _ambiguity(matcher.landmarks, distances, index)
         keypoint = torch.arange(len(index))[distances[:, 0].isfinite()]
         part = LandmarkMatches(

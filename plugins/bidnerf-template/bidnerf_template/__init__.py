@@ -22,7 +22,7 @@ __all__ = ["TemplateBackend", "TemplateConfig", "TemplateField", "backend"]
 class TemplateConfig:
     """Each field is an option of ``bidnerf train`` and is stored with the map, so it must be what JSON can hold."""
 
-    resolution: int = 96  # grid points along each axis of the scene's box
+    resolution: int = 96  # grid points along each axis of the modelled space
     samples: int = 96  # samples along a ray
     steps: int = 1500  # steps of the optimizer
     rays_per_step: int = 2048  # number of rays a step
@@ -37,15 +37,14 @@ class TemplateField(nn.Module):
         super().__init__()
         self.bounds = bounds
         self.side = max(bounds.size)
-        self.sampler = Stratified(config.samples)
+        self.sampler = Stratified(config.samples, bounds)
         self.grid = nn.Parameter(
             torch.zeros(4, *[config.resolution] * 3)
         )  # density and rgb, before activation
 
     def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
         """Return density (* per metre) and rgb (* 3) at positions (* 3, metres, world) along unit directions (* 3)."""
-        lower, upper = (positions.new_tensor(corner) for corner in (self.bounds.lower, self.bounds.upper))
-        places = (positions.reshape(1, -1, 1, 1, 3) - lower) / (upper - lower) * 2 - 1
+        places = self.bounds.normalized(positions).reshape(1, -1, 1, 1, 3)  # in [-1, 1]
         raw = functional.grid_sample(self.grid[None], places, padding_mode="border", align_corners=True)
         raw = raw.reshape(4, *positions.shape[:-1])
         density = (

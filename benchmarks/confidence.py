@@ -1,0 +1,192 @@
+r"""Learn the confidence of method ``auto`` from answers to images with and without faults, and test it on others.
+
+    python benchmarks/faults.py MAP:DATA ... --tuning-frames --name NAME
+    python benchmarks/confidence.py benchmarks/results/NAME.rows.jsonl [...] [--write]
+
+Each row of ``benchmarks/faults.py`` that holds diagnostics is an example; it is right within 5 degrees and 0.05 units. A
+logistic regression with a small ridge is fitted, one for poses by landmarks and one for poses by the surface. Its quality is
+measured by leaving out one scene at a time: the model is fitted to the other scenes and tested on the one left out (expected
+calibration error in ten bins, wrong answers among the accepted, right ones among the rejected). A harder test leaves out one
+half of the faults as well, so that it meets kinds of failure that it never saw. ``--write`` fits to all examples and stores the
+weights in the package.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.localization import confidence
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+
+RESULTS = Path(__file__).resolve().parent / "results"
+STORED = Path(confidence.__file__).with_suffix(".json")
+RIDGE = 0.02
+"""Penalty of the squared weights of standardised features, relative to the mean log loss."""
+BINS = 10
+FEWEST = 30
+"""Least number of right and of wrong examples from which a model is learned."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """A row's features, whether its pose is right, and where it comes from."""
+
+    kind: str  # "landmarks" or "surface"
+    features: dict[str, float]
+    right: bool
+    scene: str
+    fault: str
+
+
+def examples(paths: Sequence[Path]) -> list[Example]:
+    """Read the rows that hold diagnostics; no answer to an image of another scene is right."""
+    found = []
+    for path in paths:
+        for text in path.read_text().splitlines():
+            row = json.loads(text)
+            row = row.get("row", row)
+            if row.get("diagnostics"):
+                found.append(example(row))
+    return found
+
+
+def example(row: dict[str, Any]) -> Example:
+    said, error = row["diagnostics"], row["translation"]
+    right = error is not None and error < 0.05 and row["rotation_deg"] < 5
+    if "inliers" in said:
+        features = confidence.landmark_features(LandmarkDiagnostics(**said))
+        return Example("landmarks", features, right, row["scene"], row["fault"])
+    features = confidence.surface_features(SurfaceDiagnostics(**said))
+    return Example("surface", features, right, row["scene"], row["fault"])
+
+
+def fitted(given: Sequence[Example], ridge: float = RIDGE) -> confidence.LogisticModel:
+    """Fit a logistic regression; features are standardised for the ridge, and the weights are those of the raw ones."""
+    names = tuple(given[0].features)
+    x = np.array([[e.features[name] for name in names] for e in given])
+    y = np.array([e.right for e in given], dtype=float)
+    mean, deviation = x.mean(0), x.std(0) + 1e-3
+
+    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        odds = (x - mean) / deviation @ parameters[:-1] + parameters[-1]
+        value = np.mean(np.logaddexp(0, odds) - y * odds) + ridge * np.sum(parameters[:-1] ** 2)
+        off = (expit(odds) - y) / len(y)
+        slope = np.append((x - mean).T / deviation[:, None] @ off + 2 * ridge * parameters[:-1], off.sum())
+        return float(value), slope
+
+    best = minimize(loss, np.zeros(len(names) + 1), jac=True, method="L-BFGS-B").x
+    weights = best[:-1] / deviation
+    return confidence.LogisticModel(names, tuple(weights.tolist()), float(best[-1] - weights @ mean))
+
+
+def folds(given: Sequence[Example], by_fault: bool) -> list[tuple[list[Example], list[Example]]]:
+    """Return pairs of examples to fit and to test: of other scenes and, with ``by_fault``, of the other half of the faults."""
+    faults = sorted({e.fault for e in given})
+    halves = [(set(faults[::2]), set(faults[1::2])), (set(faults[1::2]), set(faults[::2]))]
+    pairs = []
+    for scene in sorted({e.scene for e in given}):
+        for tested, fitted in halves if by_fault else [(set(faults), set(faults))]:
+            test = [e for e in given if e.scene == scene and e.fault in tested]
+            fit = [e for e in given if e.scene != scene and e.fault in fitted]
+            if test and len({e.right for e in fit}) == 2:
+                pairs.append((fit, test))
+    return pairs
+
+
+def assessed(said: Sequence[float], right: Sequence[bool]) -> dict[str, Any]:
+    """Return the reliability diagram and the counts at the threshold of acceptance."""
+    p, y = np.array(said), np.array(right)
+    number = np.minimum((p * BINS).astype(int), BINS - 1)
+    diagram = [
+        {"n": int(m.sum()), "said": float(p[m].mean()), "right": float(y[m].mean())}
+        for i in range(BINS)
+        if (m := number == i).any()
+    ]
+    accepted = p >= confidence.ACCEPTED
+    return {
+        "n": len(p),
+        "right": int(y.sum()),
+        "accepted": int(accepted.sum()),
+        "accepted_but_wrong": int((accepted & ~y).sum()),
+        "right_but_rejected": int((~accepted & y).sum()),
+        "expected_calibration_error": sum(b["n"] * abs(b["said"] - b["right"]) for b in diagram) / len(p),
+        "log_loss": float(-np.mean(np.log(np.clip(np.where(y, p, 1 - p), 1e-9, 1)))),
+        "reliability": diagram,
+    }
+
+
+def cross_validated(given: Sequence[Example], by_fault: bool) -> dict[str, Any]:
+    """Fit and test on every fold, and pool the answers, in all and by scene."""
+    said, right, scenes = [], [], []
+    for fit, test in folds(given, by_fault):
+        model = fitted(fit)
+        said += [model.probability(e.features) for e in test]
+        right += [e.right for e in test]
+        scenes += [e.scene for e in test]
+    by_scene = {
+        scene: assessed(
+            [p for p, s in zip(said, scenes, strict=True) if s == scene],
+            [y for y, s in zip(right, scenes, strict=True) if s == scene],
+        )
+        for scene in sorted(set(scenes))
+    }
+    return {"all": assessed(said, right), "by_scene": by_scene}
+
+
+def line(s: dict[str, Any]) -> str:
+    """Return the counts in one line."""
+    return (
+        f"n {s['n']}, right {s['right']}, accepted {s['accepted']}, of these wrong {s['accepted_but_wrong']}, right but"
+        f" rejected {s['right_but_rejected']}, calibration error {s['expected_calibration_error']:.3f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("rows", nargs="+", type=Path)
+    parser.add_argument("--write", action="store_true", help="store the weights in the package")
+    parser.add_argument("--name", default="confidence", help="of the record")
+    given = parser.parse_args()
+    everything, results, stored = examples(given.rows), {}, {}
+    for kind in ("landmarks", "surface"):
+        some = [e for e in everything if e.kind == kind]
+        if min(sum(e.right for e in some), sum(not e.right for e in some)) < FEWEST:
+            print(f"{kind}: {len(some)} examples, expected {FEWEST} right and {FEWEST} wrong ones; no model")
+            continue
+        model = fitted(some)
+        results[kind] = {
+            "other scenes": cross_validated(some, by_fault=False),
+            "other scenes and faults": cross_validated(some, by_fault=True),
+            "the examples themselves": assessed(
+                [model.probability(e.features) for e in some], [e.right for e in some]
+            ),
+        }
+        stored[kind] = {"features": model.features, "weights": model.weights, "bias": model.bias}
+        for name, found in results[kind].items():
+            print(f"{kind}, tested on {name}: {line(found.get('all', found))}")
+        for name, weight in zip(model.features, model.weights, strict=True):
+            print(f"  {name:22} {weight:+.2f}")
+    record = write_record(
+        RESULTS / f"{given.name}.json", {"examples": len(everything), "held_out": results}, seed=0
+    )
+    print(record)
+    if given.write:
+        text = json.dumps({"source": record.name, "models": stored}, indent=1)
+        STORED.write_text(text + "\n")
+        print(STORED)
+
+
+if __name__ == "__main__":
+    main()

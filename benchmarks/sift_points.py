@@ -1,0 +1,169 @@
+"""Points with SIFT descriptors, triangulated by COLMAP from images whose poses are known, as hloc makes its maps.
+
+Everything has the default settings of pycolmap, whose SIFT is root-normalised: matching with a ratio test of 0.8 in both
+directions, verification of the matches by the known poses, and triangulation with bundle adjustment of the points. Only
+tracks of two images, which pycolmap drops by default, are kept: on the frames for tuning, they help.
+"""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.fingerprint import views_digest
+from bidnerf_core.files import write_file
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.mapping.view_pairs import likely_pairs
+
+NEIGHBOURS = 20
+"""Number of images near it that each image is matched with; hloc's examples take 20 as well."""
+
+
+@dataclass(frozen=True, eq=False)
+class SiftPoints:
+    """Triangulated points, and the descriptors of all keypoints that show them, in the order of the points."""
+
+    positions: NDArray[np.float64]  # (n, 3), world frame, metres
+    descriptors: NDArray[np.uint8]  # (m, 128), of length 512
+    first: NDArray[np.int64]  # (n,), each point's first descriptor
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+class SiftDetector:
+    """COLMAP's SIFT with default settings."""
+
+    def __init__(self) -> None:
+        import pycolmap
+
+        pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+        options = pycolmap.FeatureExtractionOptions(num_threads=1)
+        self.library: Any = pycolmap
+        self.extractor: Any = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+
+    def __call__(self, frame: Frame) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Return keypoints (n, 4), whose first columns are u and v, and descriptors (n, 128) of length 512."""
+        pixels = (frame.rgb * 255).round().byte().contiguous().numpy()
+        grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+        keypoints, descriptors = self.extractor.extract_from_uint8_array(grey)
+        return self.library.keypoints_to_matrix(keypoints), descriptors.data
+
+
+def colmap_camera(intrinsics: Intrinsics, number: int = 1) -> Any:
+    """Return a camera for pycolmap; its pixel coordinates have the convention of ``Intrinsics``."""
+    import pycolmap
+
+    model, parameters = "PINHOLE", [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
+    if any(intrinsics.distortion):
+        k1, k2, p1, p2, k3, *rational = [*intrinsics.distortion, *[0.0] * 8][:8]
+        model = "FULL_OPENCV"
+        parameters += [k1, k2, p1, p2, k3, *rational]
+    if any(intrinsics.distortion[8:]):
+        raise InputError(
+            "a camera with thin prism distortion or a tilted sensor, expected one that COLMAP has a model of"
+        )
+    return pycolmap.Camera(
+        camera_id=number, model=model, width=intrinsics.width, height=intrinsics.height, params=parameters
+    )
+
+
+def sift_points(views: Sequence[View], cache: Path) -> SiftPoints:
+    """Return the points of ``views``, whose poses are T_world_camera; a folder keeps them by the views' content."""
+    import pycolmap
+
+    path = cache / f"sift-{views_digest(views)}-{pycolmap.__version__}-{NEIGHBOURS}.npz"
+    if not path.is_file():
+        found = triangulated(views)
+        content = io.BytesIO()
+        np.savez(content, **vars(found))
+        cache.mkdir(parents=True, exist_ok=True)
+        write_file(path, content.getvalue())
+    with np.load(path) as stored:
+        return SiftPoints(**stored)
+
+
+def triangulated(views: Sequence[View]) -> SiftPoints:
+    """Triangulate the SIFT keypoints of ``views``, whose poses are T_world_camera."""
+    detector = SiftDetector()
+    pycolmap = detector.library
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        described = _write_views(views, detector, folder / "database.db")
+        model = _posed(views, pycolmap)
+        _match(views, model, folder, pycolmap)
+        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=0, extract_colors=False)
+        options.triangulation.ignore_two_view_tracks = False
+        found = pycolmap.triangulate_points(model, folder / "database.db", folder, folder, options=options)
+    points = list(found.points3D.values())
+    if not points:
+        raise InputError(f"no point was triangulated from {len(views)} images")
+    tracks = [point.track.elements for point in points]
+    descriptors = [described[seen.image_id][seen.point2D_idx] for track in tracks for seen in track]
+    first = np.cumsum([0, *map(len, tracks)])[:-1]
+    return SiftPoints(np.stack([point.xyz for point in points]), np.stack(descriptors), first)
+
+
+def _write_views(views: Sequence[View], detector: SiftDetector, path: Path) -> dict[int, NDArray[np.uint8]]:
+    """Write cameras and keypoints to a database of COLMAP, and return the descriptors by image, counted from 1."""
+    pycolmap, described = detector.library, {}
+    with pycolmap.Database.open(path) as database:
+        for number, view in enumerate(views, start=1):
+            camera = colmap_camera(view.frame.intrinsics, number)
+            camera.has_prior_focal_length = True
+            database.write_camera(camera, use_camera_id=True)
+            database.write_rig(_rig(camera, pycolmap), use_rig_id=True)
+            image = pycolmap.Image(name=str(number), camera_id=number, image_id=number)
+            database.write_image(image, use_image_id=True)
+            database.write_frame(_frame(image, camera, pycolmap), use_frame_id=True)
+            keypoints, described[number] = detector(view.frame)
+            database.write_keypoints(number, keypoints)
+            kind = pycolmap.FeatureExtractorType.SIFT
+            database.write_descriptors(number, pycolmap.FeatureDescriptors(kind, described[number]))
+    return described
+
+
+def _rig(camera: Any, pycolmap: Any) -> Any:
+    rig = pycolmap.Rig(rig_id=camera.camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    return rig
+
+
+def _frame(image: Any, camera: Any, pycolmap: Any) -> Any:
+    frame = pycolmap.Frame(frame_id=image.image_id, rig_id=camera.camera_id)
+    frame.add_data_id(image.data_id)
+    return frame
+
+
+def _posed(views: Sequence[View], pycolmap: Any) -> Any:
+    """Return a model of COLMAP that has poses but no points."""
+    model = pycolmap.Reconstruction()
+    for number, view in enumerate(views, start=1):
+        T_camera_world = view.T_ref_camera.inverse().matrix().double().numpy()
+        model.add_camera_with_trivial_rig(colmap_camera(view.frame.intrinsics, number))
+        image = pycolmap.Image(name=str(number), camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T_camera_world[:3]))
+    return model
+
+
+def _match(views: Sequence[View], model: Any, folder: Path, pycolmap: Any) -> None:
+    """Match the descriptors of neighbouring images, and keep the matches that the known poses allow."""
+    pairs = (likely_pairs(views, NEIGHBOURS) + 1).tolist()
+    (folder / "pairs.txt").write_text("".join(f"{i} {j}\n" for i, j in pairs))
+    pycolmap.match_image_pairs(
+        folder / "database.db",
+        pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True),
+        pycolmap.ImportedPairingOptions(match_list_path=folder / "pairs.txt"),
+        device=pycolmap.Device.cpu,
+    )
+    pycolmap.guided_geometric_verification(model, folder / "database.db", num_threads=1)

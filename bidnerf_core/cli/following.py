@@ -1,0 +1,123 @@
+"""``bidnerf track --follow``: frames that come one by one, from a folder that is watched or as JSON lines on stdin."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time as clocks
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bidnerf_core.datasets.given_camera import GivenCamera
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame
+from bidnerf_core.images import Background
+from bidnerf_core.photos import photos_in
+
+STDIN = "-"
+POLL = 0.05
+"""Seconds between two looks into a watched folder."""
+STEADY = 2
+"""The number of looks for which a file's size has to stay the same before it is read: others may be writing it."""
+KEYS = {"image", "depth", "time", "depth_unit"}
+
+
+@dataclass(frozen=True)
+class FrameRequest:
+    """A frame to read."""
+
+    image: Path
+    depth: Path | None = None
+    time: float | None = None  # seconds
+    depth_unit: float | None = None  # metres a step
+
+    @staticmethod
+    def parse(line: str) -> FrameRequest:
+        """Return the request of a line ``{"image": path, "depth": path, "time": s}``, of which only the image is required.
+
+        Raises ``InputError`` for what is not such an object.
+        """
+        expected = 'expected {"image": path, "depth": path, "time": seconds}'
+        try:
+            found = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"not JSON ({error}), {expected}") from error
+        if not isinstance(found, dict) or not isinstance(found.get("image"), str):
+            raise InputError(f'no "image" in {line.strip()[:80]!r}, {expected}')
+        if unknown := sorted(found.keys() - KEYS):
+            raise InputError(f"unknown key {unknown[0]!r}, {expected}")
+        depth = found.get("depth")
+        if depth is not None and not isinstance(depth, str):
+            raise InputError(f'"depth" is {depth!r}, expected a path or null')
+        return FrameRequest(
+            Path(found["image"]), None if depth is None else Path(depth), _number(found, "time"),
+            _number(found, "depth_unit"),
+        )  # fmt: skip
+
+    def read(self, camera: GivenCamera, background: Background) -> Frame:
+        """Read the image and its depth. Raises ``InputError`` where they are not readable or the camera is not known."""
+        return Frame.open(
+            self.image, depth=self.depth, depth_unit=self.depth_unit, camera=camera.camera, focal=camera.focal,
+            hfov=camera.hfov, background=background,
+        )  # fmt: skip
+
+
+def requests(source: str) -> Iterator[FrameRequest | InputError]:
+    """Yield frames as they come: lines of stdin up to its end, or the images of a folder for as long as nobody stops it.
+
+    A line that is no request is yielded as the error to answer it with.
+    """
+    return _lines() if source == STDIN else _arriving(Path(source))
+
+
+def _lines() -> Iterator[FrameRequest | InputError]:
+    for line in iter(sys.stdin.readline, ""):  # iterating over stdin itself would wait for a whole block
+        if not line.strip():
+            continue
+        try:
+            yield FrameRequest.parse(line)
+        except InputError as error:
+            yield error
+
+
+def _arriving(folder: Path) -> Iterator[FrameRequest]:
+    """Yield the images of a folder in the natural order of their names, and those that come later as they come."""
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: no such folder, expected one that images come into, or {STDIN} for stdin"
+        )
+    given, sizes = set[Path](), dict[Path, tuple[int, int]]()
+    while True:
+        photos, depths = photos_in(folder)
+        waiting = [photo for photo in photos if photo not in given]
+        for photo in waiting:
+            depth = next((file for file in depths if file.name.startswith(f"{photo.stem}.")), None)
+            if not all(_is_steady(file, sizes) for file in (photo, depth) if file is not None):
+                break  # the order is that of the names
+            given.add(photo)
+            yield FrameRequest(photo, depth)
+        clocks.sleep(POLL)
+
+
+def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
+    """Return whether the size of a file has stayed the same for some looks."""
+    try:
+        size = file.stat().st_size
+    except OSError:
+        return False
+    before, looks = sizes.get(file, (-1, 0))
+    looks = looks + 1 if size == before and size > 0 else 0
+    sizes[file] = (size, looks)
+    return looks >= STEADY
+
+
+def _number(found: dict[str, Any], name: str) -> float | None:
+    value = found.get(name)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f'"{name}" is {value!r}, expected a finite number or null')
+    return float(value)

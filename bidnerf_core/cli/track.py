@@ -1,0 +1,169 @@
+"""``bidnerf track``."""
+
+from __future__ import annotations
+
+import sys
+import time as clocks
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from bidnerf_core.cli.camera_options import CameraFile, FieldOfView, FocalLength
+from bidnerf_core.cli.common import (
+    Flag,
+    MapFolder,
+    UsageError,
+    option,
+    parse,
+    print_json,
+    print_table,
+    require,
+    say,
+)
+from bidnerf_core.cli.following import STDIN, requests
+from bidnerf_core.cli.progress import counted
+from bidnerf_core.cli.starts import read_pose
+from bidnerf_core.cli.tracked_path import TrackedPath, check_out
+from bidnerf_core.datasets import open_sequence
+from bidnerf_core.datasets.given_camera import GivenCamera
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.plot_style import require_matplotlib
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization import Localization, Localizer, Tracker, TrackerConfig
+from bidnerf_core.se3 import SE3
+from bidnerf_core.storage import load_map
+
+
+def run(arguments: list[str]) -> None:
+    def track(
+        map: MapFolder,
+        sequence: Annotated[
+            Path,
+            tyro.conf.Positional,
+            option(
+                "SEQUENCE",
+                "folder of a dataset or of images, a video; with --follow a folder, or - for stdin",
+            ),
+        ],
+        *,
+        out: Annotated[
+            Path | None,
+            option(
+                "TRAJECTORY", "file of poses: .txt or .tum, transforms.json, or .json with all details", ""
+            ),
+        ] = None,
+        plot: Annotated[
+            Path | None,
+            option("PNG", "draw the path over the map's surface, coloured by its uncertainty", ""),
+        ] = None,
+        camera: CameraFile = None,
+        focal: FocalLength = None,
+        hfov: FieldOfView = None,
+        depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
+        every: Annotated[int, option("N", "take every Nth frame only")] = 1,
+        start: Annotated[
+            Path | None, option("POSE.json", "file with a 4x4 T_world_camera of about the first frame", "")
+        ] = None,
+        follow: Annotated[
+            Flag,
+            option(
+                None,
+                "answer frames as they come, one JSON object a line on stdout, until Ctrl-C or the end",
+                "",
+            ),
+        ] = False,
+        config: TrackerConfig = TrackerConfig(),
+    ) -> None:
+        """Find the poses of a sequence's frames in a map, in the order of time.
+
+        Each pose is predicted from those before it, refined and judged. A frame whose pose is not accepted counts as lost;
+        the following ones are searched in the whole map. Where the sequence has true poses, a table compares them.
+        """
+        require("--every", every, 1)
+        if out is None and not follow:
+            raise UsageError("no --out, expected the name of a file of poses")
+        if out is not None:
+            check_out(out)
+        if plot is not None:
+            require_matplotlib()
+        given = GivenCamera(camera, focal, hfov)
+        begin = None if start is None else read_pose(start)
+        stored = load_map(map)
+        path = TrackedPath(stored.info.backend)
+        tracker = Tracker(Localizer(stored), config, begin)
+        step = _Step(tracker, path, depth)
+        began = clocks.perf_counter()
+        try:
+            if follow:
+                _follow(str(sequence), step, given, stored.bounds.background)
+            else:
+                _track(sequence, step, given, every, stored.bounds.background)
+        finally:  # Ctrl-C included: what there is, is written whole
+            seconds = clocks.perf_counter() - began
+            if out is not None and path.frames:
+                path.write(out)
+            if plot is not None and path.frames:
+                path.plot(plot, stored.surface)
+            if not follow and path.frames:
+                print_table(path.table(seconds))
+
+    parse("track", track, arguments)
+
+
+class _Step:
+    """Tracks a frame, keeps the answer, and says when the tracker is lost and when it has found its way again."""
+
+    def __init__(self, tracker: Tracker, path: TrackedPath, depth: bool) -> None:
+        self.tracker, self.path, self._depth = tracker, path, depth
+        self._lost_at: int | None = None
+
+    def __call__(self, frame: Frame, time: float | None, truth: SE3 | None = None) -> Localization:
+        found = self.tracker(frame if self._depth else replace(frame, depth=None), time)
+        self.path.add(frame, time, found, truth)
+        number = len(self.path.frames)
+        if not found.converged and self._lost_at is None:
+            self._lost_at = number
+            say(f"frame {number} ({frame.name}): {found.outcome}: {found.reason}")
+        elif found.converged and self._lost_at is not None:
+            say(f"frame {number} ({frame.name}): tracking again after {number - self._lost_at} frames")
+            self._lost_at = None
+        return found
+
+
+def _track(
+    source: Path, step: _Step, camera: GivenCamera, every: int, background: tuple[float, float, float]
+) -> None:
+    frames = open_sequence(
+        source, camera=camera.camera, focal=camera.focal, hfov=camera.hfov, background=background
+    )
+    total = -(-len(frames) // every)
+    with counted("tracking", "frames", total) as report:
+        for number, timed in enumerate(frames):
+            if number % every:
+                continue
+            step(timed.frame, timed.time, timed.truth)
+            report(number // every + 1, total)
+
+
+def _follow(source: str, step: _Step, camera: GivenCamera, background: tuple[float, float, float]) -> None:
+    """Answer each frame that comes with one JSON object on a line of its own, at once."""
+    say(f"waiting for {'JSON lines on stdin' if source == STDIN else f'images in {source}'}; Ctrl-C ends")
+    for request in requests(source):
+        try:
+            if isinstance(request, InputError):
+                raise request
+            frame = request.read(camera, background)
+            step(frame, request.time)
+            print_json(step.path.plain(step.path.frames[-1]))
+        except InputError as error:
+            print_json(
+                {"frame": _name_of(request), "converged": False, "outcome": "bad input", "reason": str(error)}
+            )
+        sys.stdout.flush()
+
+
+def _name_of(request: object) -> str | None:
+    image = getattr(request, "image", None)
+    return image.stem if isinstance(image, Path) else None

@@ -1,0 +1,158 @@
+"""What ``bidnerf track`` collects: a row for each frame, the file of poses, and the summary at the end."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.table import Table
+from torch import Tensor
+
+from bidnerf_core.cli.common import UsageError, say
+from bidnerf_core.datasets.pose_writing import POSE_WRITERS, PosedImage, write_poses
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
+from bidnerf_core.evaluation.trajectory import ErrorSummary, TrajectoryErrors, spans
+from bidnerf_core.evaluation.trajectory_plot import PlottedPath, plot_path
+from bidnerf_core.evaluation.trials import plain_localization
+from bidnerf_core.files import write_file
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization import Localization
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.se3 import SE3
+
+BOUND = 12.59
+"""The 95 % quantile of the chi-squared distribution with 6 degrees of freedom."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """A frame and the answer for it, without the image."""
+
+    posed: PosedImage
+    found: Localization
+    truth: SE3 | None  # T_world_camera
+
+
+class TrackedPath:
+    """The frames tracked so far. Their images are not kept."""
+
+    def __init__(self, backend: str) -> None:
+        self.frames: list[TrackedFrame] = []
+        self._backend = backend
+
+    def add(self, frame: Frame, time: float | None, found: Localization, truth: SE3 | None = None) -> None:
+        posed = PosedImage(
+            frame.name, len(self.frames), frame.intrinsics, found.T_world_camera, None, time, found.covariance
+        )
+        # The path of each single search would make long sequences large.
+        self.frames.append(TrackedFrame(posed, replace(found, poses=found.poses[-1:]), truth))
+
+    def plain(self, tracked: TrackedFrame) -> dict[str, Any]:
+        """Return a frame's answer as JSON values: the keys of ``localize --json``, and ``time``."""
+        error = None if tracked.truth is None else pose_error(tracked.posed.T_world_camera, tracked.truth)
+        named = {"frame": tracked.posed.name, "time": tracked.posed.time}
+        return named | plain_localization(tracked.found, self._backend, error)
+
+    @property
+    def accepted(self) -> list[TrackedFrame]:
+        return [frame for frame in self.frames if frame.found.converged]
+
+    @property
+    def lost(self) -> list[tuple[int, int]]:
+        """The first and the last number of each run of frames without an accepted pose."""
+        return spans([not frame.found.converged for frame in self.frames])
+
+    def write(self, out: Path) -> None:
+        """Write the poses in the format of the name's ending, whole or not at all.
+
+        A name that ends with ``.json`` takes all frames with all that is known of them; other formats take accepted poses.
+        """
+        if _format(out) == ".json":
+            rows = ",\n".join(json.dumps(self.plain(frame), allow_nan=False) for frame in self.frames)
+            write_file(out, f"[\n{rows}\n]\n".encode())
+            return
+        write_poses(out, [frame.posed for frame in self.accepted])
+        if left_out := len(self.frames) - len(self.accepted):
+            say(f"{out}: {len(self.accepted)} poses; {left_out} that did not converge are left out")
+
+    def plot(self, file: Path, surface: SurfaceMap | None) -> None:
+        """Draw the path. Raises ``InputError`` without matplotlib or without any frame."""
+        if not self.frames:
+            raise InputError(f"{file}: not drawn, since no frame was tracked")
+        covariances = [frame.found.covariance for frame in self.frames]
+        path = PlottedPath(
+            SE3.stack([frame.posed.T_world_camera for frame in self.frames]),
+            torch.tensor([frame.found.converged for frame in self.frames]),
+            torch.tensor([_deviation(covariance) for covariance in covariances], dtype=torch.float64),
+            [frame.truth for frame in self.frames],
+        )
+        plot_path(path, surface, file)
+
+    def errors(self) -> TrajectoryErrors | None:
+        """Return the errors of the accepted poses whose truth is known, or None if there are none."""
+        known = [(f.posed.T_world_camera, f.truth) for f in self.accepted if f.truth is not None]
+        if not known:
+            return None
+        return TrajectoryErrors.of(SE3.stack([found for found, _ in known]), SE3.stack([t for _, t in known]))
+
+    def table(self, seconds: float) -> Table:
+        """Return the summary of a run that took ``seconds``."""
+        table = Table(show_header=False, box=None, pad_edge=False)
+        total, lost = len(self.frames), self.lost
+        table.add_row("frames", f"{total}, {total / max(seconds, 1e-9):.1f} a second")
+        table.add_row("tracked", f"{len(self.accepted)} ({len(self.accepted) / max(1, total):.1%})")
+        longest = max((last - first + 1 for first, last in lost), default=0)
+        table.add_row("lost", f"{len(lost)} times, longest {longest} frames" if lost else "never")
+        for name, text in self._error_rows():
+            table.add_row(name, text)
+        return table
+
+    def _error_rows(self) -> list[tuple[str, str]]:
+        errors = self.errors()
+        if errors is None:
+            return []
+        rows = [("raw error", _written(errors.raw))]
+        if errors.ate is not None:
+            rows.append(("ATE", f"{errors.ate:.4f} m (root mean square, rigidly aligned)"))
+        if errors.rpe is not None:
+            rows.append(("RPE, a frame", _written(errors.rpe)))
+        inside = [_inside(frame) for frame in self.accepted]
+        known = [value for value in inside if value is not None]
+        if known:
+            rows.append(("inside 95 % bound", f"{sum(known) / len(known):.1%} (by the poses' covariances)"))
+        return rows
+
+
+def check_out(out: Path) -> None:
+    """Raise before any work where a file of poses cannot be written."""
+    if _format(out) is None:
+        raise UsageError(f"--out is {out}, expected a name that ends with {', '.join(POSE_WRITERS)}")
+    if out.is_dir() or not out.parent.is_dir():
+        what = "is a folder" if out.is_dir() else f"no folder {out.parent}"
+        raise InputError(f"{out}: {what}, expected a file in a folder that exists")
+
+
+def _format(out: Path) -> str | None:
+    return next((ending for ending in POSE_WRITERS if out.name.lower().endswith(ending)), None)
+
+
+def _deviation(covariance: Tensor | None) -> float:
+    return float("nan") if covariance is None else float(covariance.diagonal()[:3].sum().clamp(min=0).sqrt())
+
+
+def _inside(frame: TrackedFrame) -> bool | None:
+    if frame.truth is None or frame.found.covariance is None:
+        return None
+    squared = normalized_error_squared(frame.posed.T_world_camera, frame.truth, frame.found.covariance)
+    return bool(squared <= BOUND)
+
+
+def _written(summary: ErrorSummary) -> str:
+    return (
+        f"median {summary.translation_median:.4f} m, {summary.rotation_deg_median:.3f} deg;"
+        f" 95 % within {summary.translation_p95:.4f} m, {summary.rotation_deg_p95:.3f} deg"
+    )

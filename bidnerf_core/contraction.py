@@ -1,0 +1,53 @@
+"""Contraction of unbounded space (Barron et al. 2022, mip-NeRF 360, section 2).
+
+What lies within a unit of the origin stays where it is, and all the rest is drawn into the shell between 1 and 2, so that a
+field of bounded size models near things finely and the distance coarsely. We measure length by the largest coordinate, as
+nerfstudio does: the contracted space is then a cube, which a grid fills.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def contract(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+    """Return ``x`` where its norm is at most 1, and ``(2 - 1 / |x|) x / |x|`` elsewhere (eq. 10); every norm is below 2."""
+    norm = points.abs().amax(-1, keepdim=True).clamp(min=1)
+    return points * ((2 - 1 / norm) / norm)
+
+
+def expand(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+    """Return the points whose contractions are ``points``, the inverse of ``contract``."""
+    norm = points.abs().amax(-1, keepdim=True).clamp(min=1)
+    return points / (norm * (2 - norm))
+
+
+@dataclass(frozen=True, eq=False)
+class RaySpacing:
+    """A coordinate along rays in which steps of equal length are equally fine for a contracted field (eq. 11).
+
+    It is the distance (metres) up to ``exit``, where the ray leaves the uncontracted box, and ``exit + radius * x / (1 + x)``
+    beyond, where ``x`` is the distance from there in units of ``radius``.
+    """
+
+    exit: Float[Tensor, "*r"]  # metres along the ray
+    radius: float  # metres: half the side of the uncontracted cube; infinite where nothing is contracted
+
+    def place(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
+        """Return the coordinate at a distance along the ray (metres)."""
+        if self.radius == float("inf"):
+            return distance
+        beyond = (distance - self.exit[..., None]).clamp(min=0)
+        return torch.minimum(distance, self.exit[..., None]) + beyond / (1 + beyond / self.radius)
+
+    def distance(self, place: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
+        """Return the distance (metres) at a coordinate, the inverse of ``place``."""
+        if self.radius == float("inf"):
+            return place
+        beyond = (place - self.exit[..., None]).clamp(min=0)
+        left = (1 - beyond / self.radius).clamp(min=torch.finfo(place.dtype).eps)
+        return torch.minimum(place, self.exit[..., None]) + beyond / left

@@ -1,0 +1,148 @@
+"""A picture of a capture from above: what its landmarks are seen by, where its cameras are, and what is wrong with them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.plot_style import COLOURS, new_figure, styled
+from bidnerf_core.mapping.capture_coverage import horizontal_axes
+from bidnerf_core.mapping.capture_report import CaptureReport, Gap, PhotoProblem, PhotoRecord
+
+LOOKS: dict[PhotoProblem, tuple[str, str]] = {
+    "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),
+    "apart": (COLOURS[7], "s"), "isolated": (COLOURS[6], "D"), "blurred": (COLOURS[4], "h"),
+    "badly exposed": (COLOURS[5], "*"),
+}  # fmt: skip
+"""Colour and marker of each problem."""
+SOUND = COLOURS[2]
+MOST_POINTS = 20_000
+"""Largest number of landmarks that are drawn."""
+CAPTURE_MARGIN = 0.5
+"""How far beyond the cameras the picture reaches, as a share of their extent; landmarks farther away are left out."""
+MOST_LABELS = 16
+"""Largest number of photos with problems that are named in the picture."""
+
+
+def draw_capture(
+    report: CaptureReport, points: Float[Tensor, "n 3"] | None, seen_by: Int[Tensor, "n"] | None, out: Path
+) -> None:
+    """Draw a capture to ``out``, a PNG. ``points`` (metres, world) are its landmarks, ``seen_by`` the photos that show each.
+
+    Raises ``InputError`` where matplotlib is not installed, or the file cannot be written.
+    """
+    with styled():
+        figure = new_figure(7.6, 7.0)
+        panel = figure.add_subplot()
+        cameras = _from_above([photo.position for photo in report.photos], report)
+        _frame(panel, cameras, report)
+        if points is not None and seen_by is not None and len(points):
+            _draw_landmarks(figure, panel, _from_above(points.double().tolist(), report), seen_by)
+        for gap in (*report.coverage.gaps, *filter(None, [report.coverage.open_side])):
+            _draw_gap(panel, gap, cameras, report)
+        _draw_cameras(panel, cameras, report)
+        panel.set_title("The capture from above")
+        figure.legend(loc="outside lower center", ncols=4)
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(out, dpi=150, format="png")
+        except OSError as error:
+            raise InputError(f"{out}: cannot be written ({error.strerror})") from error
+
+
+def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:
+    """Return points (world) on the horizontal plane, about the centre of the capture, metres."""
+    up, centre = (torch.tensor(v, dtype=torch.float64) for v in (report.coverage.up, report.coverage.centre))
+    away = torch.as_tensor(points, dtype=torch.float64).reshape(-1, 3) - centre
+    first, second = horizontal_axes(up)
+    return torch.stack([away @ first, away @ second], dim=-1).numpy()
+
+
+def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
+    """Choose the part of the plane that is shown: the cameras, the centre if they look at it, and a margin."""
+    shown = cameras
+    if report.coverage.arrangement in ("around", "one side"):
+        shown = np.concatenate([cameras, np.zeros((1, 2))])
+    low, high = shown.min(0), shown.max(0)
+    reach = max(float((high - low).max()), 1e-6) * (0.5 + CAPTURE_MARGIN)
+    middle = (low + high) / 2
+    panel.set_xlim(middle[0] - reach, middle[0] + reach)
+    panel.set_ylim(middle[1] - reach, middle[1] + reach)
+    panel.set_aspect("equal")
+    panel.set_xlabel("metres or units of the map")
+
+
+def _draw_landmarks(
+    figure: Any, panel: Any, points: Float[np.ndarray, "n 2"], seen_by: Int[Tensor, "n"]
+) -> None:
+    """Draw landmarks, darker where more photos show them."""
+    step = max(1, math.ceil(len(points) / MOST_POINTS))
+    views = seen_by.numpy()[::step]
+    order = np.argsort(views, kind="stable")
+    drawn = panel.scatter(
+        *points[::step][order].T, c=views[order], s=2, cmap="Blues", vmin=0,
+        vmax=max(3.0, float(np.quantile(views, 0.98))), linewidths=0, zorder=1,
+    )  # fmt: skip
+    figure.colorbar(drawn, ax=panel, label="photos that show a landmark", shrink=0.7, pad=0.02)
+
+
+def _draw_cameras(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
+    ahead = _from_above(
+        [[p + d for p, d in zip(photo.position, photo.direction, strict=True)] for photo in report.photos], report
+    )  # fmt: skip
+    length = 0.04 * (panel.get_xlim()[1] - panel.get_xlim()[0])
+    for start, step in zip(cameras, ahead - cameras, strict=True):
+        panel.plot(*np.stack([start, start + length * step]).T, color="#555", linewidth=0.7, zorder=2)
+    worst = [photo.problems[0] if photo.problems else None for photo in report.photos]
+    _mark(panel, cameras[[w is None for w in worst]], SOUND, "o", "nothing found", 18)
+    for problem, (colour, marker) in LOOKS.items():
+        _mark(panel, cameras[[w == problem for w in worst]], colour, marker, problem, 55)
+    _label(panel, cameras, report)
+
+
+def _mark(
+    panel: Any, places: Float[np.ndarray, "k 2"], colour: str, marker: str, label: str, size: int
+) -> None:
+    if len(places):
+        panel.scatter(
+            *places.T, color=colour, marker=marker, s=size, label=f"{label} ({len(places)})", zorder=3,
+            edgecolors="white", linewidths=0.5,
+        )  # fmt: skip
+
+
+def _label(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
+    """Name the photos with problems, and those at the ends of gaps."""
+    gaps = (*report.coverage.gaps, *filter(None, [report.coverage.open_side]))
+    ends = {name for gap in gaps for name in (gap.after, gap.before)}
+    named = [i for i, photo in enumerate(report.photos) if photo.problems or photo.name in ends]
+    for i in named[:MOST_LABELS]:
+        panel.annotate(
+            report.photos[i].name, cameras[i], (4, 4), textcoords="offset points", fontsize=6, zorder=4
+        )
+
+
+def _draw_gap(panel: Any, gap: Gap, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
+    """Shade the directions from the centre in which there is no camera."""
+    if report.coverage.arrangement not in ("around", "one side"):
+        return
+    from matplotlib.patches import Wedge
+
+    places: dict[str, PhotoRecord] = {photo.name: photo for photo in report.photos}
+    after, _ = (_from_above([places[name].position], report)[0] for name in (gap.after, gap.before))
+    begin = math.degrees(math.atan2(after[1], after[0]))
+    radius = float(np.median(np.linalg.norm(cameras, axis=1)))
+    panel.add_patch(
+        Wedge((0, 0), radius, begin, begin + gap.degrees, color=COLOURS[1], alpha=0.12, linewidth=0, zorder=0)
+    )
+    middle = math.radians(begin + gap.degrees / 2)
+    place = 0.7 * radius * np.array([math.cos(middle), math.sin(middle)])
+    panel.annotate(
+        f"{gap.degrees:.0f}°, no photo", place, ha="center", color=COLOURS[1], fontsize=8, zorder=4
+    )

@@ -1,0 +1,97 @@
+"""A plot of a trajectory over the map's surface, from above and from the side, coloured by its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.evaluation.arcs import mean_up
+from bidnerf_core.evaluation.plot_style import new_figure, styled
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.se3 import SE3
+
+SURFELS = 12_000
+"""Largest number of surfels that are drawn."""
+PATH_MARGIN = 1.5
+"""How far around the path the surface is drawn, in multiples of the path's size; at least half of the scene's extent."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlottedPath:
+    """What is known of each frame of a sequence."""
+
+    poses: SE3  # (n) T_world_camera
+    accepted: Bool[Tensor, "n"]
+    deviations: Float[Tensor, "n"]  # metres: standard deviation of the position; not a number where unknown
+    truth: Sequence[SE3 | None] = ()
+
+
+def plot_path(path: PlottedPath, surface: SurfaceMap | None, file: Path) -> None:
+    """Draw a path as PNG or SVG, by the ending of the file's name. Raises ``InputError`` without matplotlib."""
+    axes = _axes(path.poses)
+    with styled():
+        figure = new_figure(9.6, 4.9)
+        panels = figure.subplots(1, 2)
+        for panel, (right, up), title in zip(
+            panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True
+        ):
+            projection = np.stack([axes[right], axes[up]], axis=-1)
+            marks = _panel(panel, path, surface, projection)
+            panel.set(title=title, xlabel="metres", aspect="equal")
+        figure.colorbar(marks, ax=list(panels), label="standard deviation of the position (mm)", shrink=0.85)
+        handles, labels = panels[0].get_legend_handles_labels()
+        if labels:
+            figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        figure.savefig(file, dpi=150)
+
+
+def _axes(poses: SE3) -> Float[np.ndarray, "3 3"]:
+    """Return the axes of the plot (rows, world): the longest horizontal one, the other horizontal one, and up."""
+    up = mean_up([poses[i] for i in range(len(poses.translation))]).double()
+    centred = poses.translation.double() - poses.translation.double().mean(0)
+    level = centred - (centred @ up)[:, None] * up
+    right = torch.linalg.svd(level, full_matrices=True)[2][0]
+    right = right - (right @ up) * up
+    if float(right.norm()) < 1e-6:
+        right = torch.linalg.cross(up, torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())])
+    right = right / right.norm()
+    return torch.stack([right, torch.linalg.cross(up, right), up]).numpy()
+
+
+def _panel(
+    panel: Any, path: PlottedPath, surface: SurfaceMap | None, projection: Float[np.ndarray, "3 2"]
+) -> Any:
+    """Draw one projection and return what the colour bar belongs to."""
+    places = path.poses.translation.double().numpy() @ projection
+    if surface is not None:
+        _draw_surface(panel, surface, projection, places)
+    known = [T.translation.double().numpy() @ projection for T in path.truth if T is not None]
+    if known:
+        panel.plot(*np.array(known).T, color="#000", linewidth=0.8, label="ground truth")
+    accepted, millimetres = path.accepted.numpy(), 1000 * path.deviations.double().numpy()
+    lost = places[~accepted]
+    if len(lost):
+        panel.scatter(*lost.T, s=14, marker="x", linewidths=0.8, color="#D55E00", label="lost")
+    return panel.scatter(
+        *places[accepted].T, c=millimetres[accepted], s=9, cmap="viridis", label="tracked", zorder=3
+    )
+
+
+def _draw_surface(
+    panel: Any, surface: SurfaceMap, projection: Float[np.ndarray, "3 2"], places: Float[np.ndarray, "n 2"]
+) -> None:
+    """Draw a sample of the surfels around the path in their colours."""
+    points = surface.surfels.positions.double().numpy() @ projection
+    middle = places.mean(0)
+    size = max(0.5 * surface.extent, PATH_MARGIN * float(np.abs(places - middle).max()))
+    near = np.flatnonzero((np.abs(points - middle) <= size).all(-1))
+    some = near[:: max(1, -(-len(near) // SURFELS))]
+    colours = surface.surfels.rgb[torch.from_numpy(some)].clamp(0, 1).numpy()
+    panel.scatter(*points[some].T, s=2, c=0.3 + 0.7 * colours, linewidths=0, rasterized=True)

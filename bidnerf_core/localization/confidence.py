@@ -1,0 +1,102 @@
+"""Confidence: the probability that a pose is right, by a logistic model of its diagnostics.
+
+The weights were learned by ``benchmarks/confidence.py`` from answers to images with and without faults; ``confidence.json``
+holds them. There is one model for poses by landmarks and one for poses by measured points on the surface.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.result import Outcome, Verdict
+
+ACCEPTED = 0.55
+"""Least confidence with which a pose is accepted."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict with the probability that the pose is right; None where it is not known."""
+
+    verdict: Verdict
+    confidence: float | None
+
+
+@dataclass(frozen=True)
+class LogisticModel:
+    """A logistic regression (Cox 1958): the logarithm of the odds is linear in the features."""
+
+    features: tuple[str, ...]
+    weights: tuple[float, ...]
+    bias: float
+
+    def probability(self, values: dict[str, float]) -> float:
+        """Return the probability for features by name."""
+        odds = self.bias + sum(w * values[name] for name, w in zip(self.features, self.weights, strict=True))
+        return 1 / (1 + math.exp(-max(-500.0, min(500.0, odds))))
+
+
+def judged(verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> Judgement:
+    """Return the confidence in a pose, and the verdict, which it can turn into a rejection."""
+    value = confidence(diagnostics)
+    if value is not None and verdict.accepted and value < ACCEPTED:
+        verdict = Verdict(
+            Outcome.UNCERTAIN, f"right with a probability of {value:.0%} only; {verdict.reason}"
+        )
+    return Judgement(verdict, value)
+
+
+def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float | None:
+    """Return the probability that a pose with these diagnostics is right; None where no model was learned."""
+    if isinstance(diagnostics, LandmarkDiagnostics):
+        name, features = "landmarks", landmark_features(diagnostics)
+    else:
+        name, features = "surface", surface_features(diagnostics)
+    model = models().get(name)
+    return None if model is None else model.probability(features)
+
+
+@lru_cache(maxsize=1)
+def models() -> dict[str, LogisticModel]:
+    """Return the models by how a pose was found."""
+    stored = json.loads((files(__package__) / "confidence.json").read_text())["models"]
+    return {
+        name: LogisticModel(tuple(model["features"]), tuple(model["weights"]), model["bias"])
+        for name, model in stored.items()
+    }
+
+
+def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
+    """Return the features of a pose by landmarks; none depends on units of length or on the image's size."""
+    possible = min(found.visible, found.keypoints)
+    return {
+        "inliers": math.log10(1 + found.inliers),
+        "above_chance": math.log10((1 + found.inliers) / (1 + found.chance)),
+        "recall": math.log10((1 + found.inliers) / (1 + possible)),
+        "noise_ratio": math.log10(max(found.noise_ratio, 0.1)),
+        "agreement": found.agreeing / max(found.matches, 1),
+        "spread": found.spread,
+        "precision": math.log10(min(max(found.precision, 1e-4), 1.0)),
+        "miscalibration": found.miscalibration,
+        "estimated_calibration": float(found.estimated_calibration),
+        "confirmed_only": 0.0 if found.searched else 1.0,
+        # Without measured points the surface neither supports nor contradicts a pose.
+        "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,
+        "colour_inliers": 0.0 if found.colour_inliers is None else found.colour_inliers - 0.25,
+    }
+
+
+def surface_features(found: SurfaceDiagnostics) -> dict[str, float]:
+    """Return the features of a pose by measured points on the surface."""
+    return {
+        "on_surface": found.on_surface,
+        "colour_inliers": found.colour_inliers,
+        "free_space_violations": found.free_space_violations,
+        "runner_up_margin": min(found.runner_up_margin, 1.0),
+        "rendered_inliers": found.rendered_inliers,
+    }

@@ -1,0 +1,153 @@
+"""Refinement of a pose by guided matching: match near the projections, resect, and repeat until the matches settle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.search.guided import (
+    ProjectedLandmarks,
+    guided_matches,
+    projected_landmarks,
+)
+from bidnerf_core.localization.search.landmark_query import LandmarkQuery
+from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.search.ransac import Hypothesis
+from bidnerf_core.mapping.calibration import GIVEN, NOMINAL, Calibration, CalibrationPrior
+from bidnerf_core.mapping.features import NORM
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.resection import ReprojectionFit, resect
+from bidnerf_core.se3 import SE3
+
+RADII = (3.0, 1.5)
+"""Radii of the rounds of guided matching, in units of the inlier threshold."""
+GUIDED_ROUNDS = 3
+"""Largest number of rounds of guided matching with the last radius; they end once the matches no longer change."""
+UNCHANGED = 0.02
+"""Share of the matches that may change in the last round."""
+LOOSE = 1.3
+"""Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
+DEPTH_OFF = 0.1
+"""Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
+CERTAIN = 0.999
+"""Probability that the given intrinsics are wrong above which the estimated ones are taken."""
+MOST_DISTANCE = (0.5 * NORM) ** 2
+"""Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
+LEAST_GUIDED_MATCHES = 6
+"""Least number of guided matches for another round."""
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedPose:
+    """A pose refined on guided matches."""
+
+    fit: ReprojectionFit
+    correspondences: LandmarkMatches
+    visible: int  # landmarks that should be visible from there
+    chance: float  # matches that the last round would find at a wrong pose
+    miscalibration: Miscalibration
+
+
+def refined(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -> GuidedPose:
+    """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change."""
+    most = usual_distance(query, inliers)
+    start = Calibration(log_focal=math.log(first.focal_factor))
+    correlation = query.landmarks.correlation
+    fit = resect(
+        query.observed(inliers), first.T_world_rig, query.threshold / 2, query.prior, start, correlation
+    )
+    return _settled(query, fit, inliers, most)
+
+
+def usual_distance(query: LandmarkQuery, inliers: LandmarkMatches) -> float:
+    """Return the largest squared descriptor distance of a guided match, from those of the first inliers."""
+    return LOOSE**2 * float(query.squared_distances(inliers).quantile(0.9))
+
+
+def confirmed(query: LandmarkQuery, T_world_rig: SE3) -> GuidedPose | None:
+    """Refine a pose that was found by other means on guided matches; None if there are too few."""
+    radius = RADII[0] * query.threshold
+    found = guided_matches(query.images, query.landmarks, T_world_rig, radius, MOST_DISTANCE)
+    if len(found) < LEAST_GUIDED_MATCHES:
+        return None
+    fit = resect(
+        query.observed(found), T_world_rig, radius / 2, query.prior, correlation=query.landmarks.correlation
+    )
+    return _settled(query, fit, found, MOST_DISTANCE)
+
+
+def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches, most: float) -> GuidedPose:
+    """Refine a pose on guided matches, with the given intrinsics unless the matches contradict them for certain."""
+    correlation = query.landmarks.correlation
+    fit, found = _guided(query, query.prior, fit, found, most, RADII)
+    free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
+    wrong = Miscalibration.of(free, query.landmarks)
+    if wrong.worst[1] > CERTAIN and not query.prior.log_focal:
+        fit, found = _guided(query, NOMINAL, free, found, most, RADII[1:])
+    radius = RADII[-1] * query.threshold
+    projections = projected_landmarks(query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius)
+    visible, chance = sum(map(len, projections)), matches_by_chance(projections, radius, most)
+    return GuidedPose(fit, found, visible, chance, wrong)
+
+
+def _guided(
+    query: LandmarkQuery,
+    prior: CalibrationPrior,
+    fit: ReprojectionFit,
+    found: LandmarkMatches,
+    most: float,
+    radii: Sequence[float],
+) -> tuple[ReprojectionFit, LandmarkMatches]:
+    """Match near the projections and fit the pose to the matches, in rounds."""
+    for radius in (*radii[:-1], *[radii[-1]] * GUIDED_ROUNDS):
+        guided = guided_matches(
+            query.images, query.landmarks, fit.T_world_rig, radius * query.threshold, most, fit.calibration
+        )
+        data = query.observed(guided)
+        agrees = _depth_agrees(data, fit.T_world_rig)
+        guided, data = guided[agrees], data[agrees]
+        if len(guided) < LEAST_GUIDED_MATCHES:
+            break
+        changed, found = _changed(guided, found), guided
+        fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, query.landmarks.correlation)
+        if changed <= UNCHANGED:
+            break
+    return fit, found
+
+
+def _changed(a: LandmarkMatches, b: LandmarkMatches) -> float:
+    """Return the share of the matches ``a`` that are not among ``b``."""
+    keypoints = 1 << 32
+    keys = [((m.view * keypoints) + m.keypoint) * keypoints + m.landmark for m in (a, b)]
+    return 1 - float(torch.isin(*keys).float().mean())
+
+
+def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
+    """Return which correspondences have a landmark that fits the depth measured at the keypoint, or no measured depth."""
+    z = data.in_camera(T_world_rig)[:, 2]
+    known = data.depth > 0
+    ratio = torch.where(known, z / torch.where(known, data.depth, 1), 1)
+    scale = ratio[known].median() if int(known.sum()) >= LEAST_GUIDED_MATCHES else 1.0
+    return (ratio / scale - 1).abs() <= DEPTH_OFF
+
+
+def agreement(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
+    """Return how many landmarks should be visible from a pose, how many match near there, and how many would by chance."""
+    radius = RADII[0] * query.threshold
+    projections = projected_landmarks(query.images, query.landmarks, T_world_rig, GIVEN, radius)
+    matches = sum(len(found.matches(radius, MOST_DISTANCE)) for found in projections)
+    return sum(map(len, projections)), matches, matches_by_chance(projections, radius, MOST_DISTANCE)
+
+
+def matches_by_chance(projections: Sequence[ProjectedLandmarks], radius: float, most: float) -> float:
+    """Return the number of guided matches expected by chance: the mean over shifts of all keypoints."""
+    away = 4 * radius
+    shifts = ((away, away), (-away, -away))
+    counts = [len(found.matches(radius, most, shift)) for shift in shifts for found in projections]
+    return sum(counts) / len(shifts)

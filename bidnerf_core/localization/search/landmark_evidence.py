@@ -1,0 +1,101 @@
+"""The evidence for a pose by landmarks: how many agree with it, how many would by chance, and where they lie."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.localization.search.chance import log10_nfa
+from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.search.guided_refinement import GuidedPose
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmark_query import LandmarkQuery
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.se3 import SE3
+
+LEAST_DEPTHS = 6
+"""Least number of measured depths that give a depth scale."""
+CELLS = 8
+"""Rows and columns into which an image is divided to see how far the correspondences spread."""
+
+
+def described(
+    query: LandmarkQuery, matches: LandmarkMatches, answer: GuidedPose, seconds: dict[str, float]
+) -> LandmarkPose:
+    """Return a refined pose with the evidence for it; ``matches`` are those by descriptors alone."""
+    fit = answer.fit
+    data = query.observed(answer.correspondences).corrected(fit.calibration)
+    off = query.observed(matches).corrected(fit.calibration).residuals(fit.T_world_rig)
+    agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= query.threshold).sum())
+    return LandmarkPose(
+        T_world_camera=fit.T_world_rig,
+        covariance=fit.covariance + query.landmarks.pose_covariance,
+        noise=fit.noise,
+        correspondences=answer.correspondences,
+        residuals=data.residuals(fit.T_world_rig),
+        normalized_residuals=data.normalized_residuals(fit.T_world_rig, fit.noise),
+        pixels=query.pixels(answer.correspondences),
+        matches=len(matches),
+        agreeing=agreeing,
+        log10_nfa=log10_agreement(query, matches, agreeing),
+        chance=answer.chance,
+        visible=answer.visible,
+        keypoints=sum(len(image.keypoints) for image in query.images),
+        noise_ratio=fit.noise / query.landmarks.noise,
+        spread=_spread(query, answer.correspondences),
+        distance=median_distance(data, fit.T_world_rig),
+        calibration=fit.calibration,
+        calibration_deviations=fit.calibration_deviations,
+        slope=fit.slope,
+        miscalibration=answer.miscalibration,
+        calibration_scatter=query.landmarks.calibration_scatter,
+        depth_scale=depth_scale(data, fit.T_world_rig),
+        seconds=seconds,
+    )
+
+
+def median_distance(data: ObservedPoints, T_world_rig: SE3) -> float:
+    """Return the median depth of the points in the cameras that observed them, metres."""
+    return float(data.in_camera(T_world_rig)[:, 2].median())
+
+
+def depth_scale(data: ObservedPoints, T_world_rig: SE3) -> float | None:
+    """Return the factor that corrects measured depth; None if too little was measured."""
+    known = data.depth > 0
+    if int(known.sum()) < LEAST_DEPTHS:
+        return None
+    return float((data.in_camera(T_world_rig)[known, 2] / data.depth[known]).median())
+
+
+def log10_agreement(query: LandmarkQuery, matches: LandmarkMatches, agreeing: int) -> float:
+    """Return the logarithm of the number of false alarms if ``agreeing`` of ``matches`` are inliers."""
+    return log10_nfa(len(matches), agreeing, probability_within(query.threshold, query.images[-1].intrinsics))
+
+
+def probability_within(radius: float, camera: Intrinsics) -> float:
+    """Return the probability that a wrong match, which lies anywhere in the image, is within ``radius`` pixels of a point."""
+    return min(0.5, math.pi * radius**2 / (camera.width * camera.height))
+
+
+def cell_numbers(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Int[Tensor, "m"]:
+    """Return the number of the cell, in a grid over the image, in which each pixel lies."""
+    size = torch.tensor([camera.width, camera.height])
+    column, row = (pixels / size * CELLS).long().clamp(0, CELLS - 1).unbind(-1)
+    return row * CELLS + column
+
+
+def share_of_cells(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> float:
+    """Return the share of the image's cells that hold one of the pixels."""
+    return len(cell_numbers(pixels, camera).unique()) / CELLS**2
+
+
+def _spread(query: LandmarkQuery, found: LandmarkMatches) -> float:
+    """Return the share of an image's cells that hold a correspondence, averaged over the views."""
+    shares, pixels = [], query.pixels(found)
+    for number, image in enumerate(query.images):
+        shares.append(share_of_cells(pixels[found.view == number], image.intrinsics))
+    return sum(shares) / len(shares)

@@ -1,0 +1,75 @@
+"""A pose found by landmarks, with its covariance and the evidence for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.mapping.calibration import Calibration
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkPose:
+    """A pose found by landmarks, its covariance, and the evidence for it."""
+
+    T_world_camera: SE3  # of the last view, float64
+    # Of the right update, translation (metres) first: the errors of keypoints, landmarks, calibration, and of the poses
+    # of the map's own images.
+    covariance: Float[Tensor, "6 6"]
+    noise: float  # pixels: standard deviation of the reprojection errors along each axis, robustly
+    correspondences: LandmarkMatches  # those that the pose was refined on
+    residuals: Float[Tensor, "m 2"]  # pixels, of the correspondences
+    normalized_residuals: Float[Tensor, "m 2"]  # the same in standard deviations, those of landmarks included
+    pixels: Float[Tensor, "m 2"]  # where the correspondences were observed, as the image has them
+    matches: int  # by descriptors alone, before there was a pose
+    agreeing: int  # of those, how many agree with the pose
+    # Logarithm of the number of as good agreements expected by chance (Moisan and Stival 2004).
+    log10_nfa: float
+    chance: float  # correspondences that guided matching would find at a wrong pose
+    visible: int  # landmarks that should be visible from the pose
+    keypoints: int  # in the images
+    spread: float  # 0 to 1: share of the image that the correspondences lie in
+    noise_ratio: float  # ``noise`` over that of the map's own images
+    distance: float  # metres: median distance of the correspondences' landmarks
+    calibration: Calibration  # what was estimated of the camera
+    calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
+    slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each of them
+    miscalibration: Miscalibration
+    calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
+    depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
+    seconds: dict[str, float] = field(default_factory=dict)  # by stage
+
+    @property
+    def focal_factor(self) -> float:
+        """True over given focal length."""
+        return self.calibration.focal_factor
+
+    @property
+    def estimates_calibration(self) -> bool:
+        """Whether the calibration was estimated with the pose."""
+        return bool((self.calibration_deviations > 0).any())
+
+    @property
+    def full_covariance(self) -> Float[Tensor, "6 6"]:
+        """The covariance with that of the intrinsics, as they were given or as this image and this map show them."""
+        deviations = (
+            self.calibration_scatter if self.estimates_calibration else self.miscalibration.deviations
+        )
+        by_calibration = self.slope * deviations
+        return self.covariance + by_calibration @ by_calibration.mT
+
+    @property
+    def position_deviation(self) -> float:
+        """The standard deviation of the position along its least certain direction, metres."""
+        return float(torch.linalg.eigvalsh(self.full_covariance[:3, :3])[-1].clamp(min=0).sqrt())
+
+    @property
+    def inliers(self) -> int:
+        """The number of correspondences within three standard deviations."""
+        return int((torch.linalg.vector_norm(self.normalized_residuals, dim=-1) <= 3).sum())

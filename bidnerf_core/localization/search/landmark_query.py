@@ -1,0 +1,57 @@
+"""The images of a query, the landmarks to find in them, and what is known of the camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
+from bidnerf_core.mapping.calibration import CalibrationPrior
+from bidnerf_core.mapping.features import paired_squared_distances
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.observed_points import ObservedPoints
+
+THRESHOLD = 0.005
+"""Largest reprojection error of an inlier, as a share of the image's diagonal; never less than 2 pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkQuery:
+    """The images of a query, the landmarks to find in them, and what is known of the camera."""
+
+    images: list[QueryImage]
+    landmarks: LandmarkMap
+    prior: CalibrationPrior
+
+    @property
+    def threshold(self) -> float:
+        """The largest reprojection error of an inlier, pixels."""
+        return pixel_threshold(self.images[-1].intrinsics)
+
+    def observed(self, matches: LandmarkMatches) -> ObservedPoints:
+        """Return the landmarks and keypoints of ``matches`` as input of a pose solver."""
+        return observed_points(self.images, self.landmarks, matches)
+
+    def squared_distances(self, matches: LandmarkMatches) -> Float[Tensor, "m"]:
+        """Return the squared descriptor distance of each match."""
+        descriptors = torch.cat([image.keypoints.descriptors for image in self.images])
+        number = self._number(matches)
+        return paired_squared_distances(descriptors, self.landmarks.descriptors, number, matches.landmark)
+
+    def pixels(self, matches: LandmarkMatches) -> Float[Tensor, "m 2"]:
+        """Return where the keypoints of ``matches`` are in their images."""
+        return torch.cat([image.keypoints.pixels for image in self.images])[self._number(matches)]
+
+    def _number(self, matches: LandmarkMatches) -> Int[Tensor, "m"]:
+        first = torch.tensor([0, *(len(image.keypoints) for image in self.images)]).cumsum(0)
+        return first[matches.view] + matches.keypoint
+
+
+def pixel_threshold(camera: Intrinsics) -> float:
+    """Return the largest reprojection error of an inlier, pixels."""
+    return max(2.0, THRESHOLD * math.hypot(camera.width, camera.height))

@@ -1,0 +1,285 @@
+"""``Tracker``: finds the poses of a sequence's frames, one after another, and says at once when it has lost its way."""
+
+from __future__ import annotations
+
+import time as clocks
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization.auto import AutoConfig
+from bidnerf_core.localization.localizer import Localizer, Start, start_pose
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.tracking.clock import Clock
+from bidnerf_core.localization.tracking.detection import LandmarkDetector
+from bidnerf_core.localization.tracking.flow import Grey
+from bidnerf_core.localization.tracking.measuring import (
+    ByLandmarks,
+    Measurement,
+    by_colour,
+    by_surface,
+    determined,
+    followed,
+    is_vague,
+)
+from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
+from bidnerf_core.localization.tracking.odometry import Odometry
+from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints
+from bidnerf_core.localization.tracking.relocalization import has_points, relocalized, uses_landmarks
+from bidnerf_core.localization.tracking.settings import TrackerConfig
+from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
+from bidnerf_core.mapping.features import Sift, grey_image
+from bidnerf_core.se3 import SE3
+
+METHOD = "track"
+"""The method that poses of a tracker name."""
+START = 0.03, 0.1
+"""Standard deviations of a start whose uncertainty is not given: shares of the scene's extent, and radians."""
+VELOCITY_KEPT = 0.6
+"""Share of the velocity that is kept with each lost frame."""
+NOTHING_SEEN = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
+
+
+class Tracker:
+    """Finds the pose of each frame of a sequence from the frames before it.
+
+    It predicts the pose by a constant velocity and refines it from there, without a search, by the landmarks that optical
+    flow carries from image to image, by measured depth, or by colour. The localizer's acceptance judges each pose. When one
+    is not accepted, the answer says so; the tracker then relocalizes in the following frames and meanwhile continues by
+    odometry. Its memory does not grow. Trackers may share a localizer, also in different threads; a tracker itself belongs to
+    one thread.
+    """
+
+    def __init__(
+        self, localizer: Localizer, config: TrackerConfig | None = None, start: Start | None = None
+    ) -> None:
+        """Track in the map of ``localizer``. ``start`` is a guess at T_world_camera of the first frame."""
+        config = TrackerConfig() if config is None else config
+        self.localizer, self.config = localizer, config
+        self._state = TrackerState(Clock(None, config.frame_seconds))
+        self._start = None if start is None else start_pose(start)
+        scene = localizer.map
+        self._by_landmarks: ByLandmarks | None = None
+        if uses_landmarks(localizer) and localizer.matcher is not None:
+            detector = LandmarkDetector(localizer.matcher.landmarks, Sift(count=config.keypoints))
+            self._by_landmarks = ByLandmarks(scene, detector, config)
+        self._odometry = Odometry(config.points)
+
+    @property
+    def tracking(self) -> bool:
+        """Whether the pose of the last frame was accepted."""
+        return self._state.tracking
+
+    @property
+    def lost_frames(self) -> int:
+        """The number of frames since the last accepted pose."""
+        return self._state.lost
+
+    def __call__(self, frame: Frame, time: float | None = None) -> Localization:
+        """Find T_world_camera of the next frame.
+
+        ``time`` (seconds, from any origin) is when it was taken; frames without one come at the interval of those before.
+        The answer's ``outcome`` is other than ``CONVERGED`` where the acceptance rejects the pose; the pose is then the best
+        guess, and its covariance says how good. Raises ``InputError`` for a time that is not finite, and where the map
+        cannot be searched for the first frame without a start.
+        """
+        began = clocks.perf_counter()
+        clock, seconds = self._state.clock.step(time)
+        image = grey_image(frame.rgb) if frame.has_colour else None
+        state = replace(self._state, clock=clock, frames=self._state.frames + 1)
+        if state.motion is None:
+            answer, state = self._begun(frame, image, state)
+        else:
+            answer, state = self._continued(frame, image, state, state.motion, seconds)
+        if image is not None:  # points are followed from the last image, even past frames without one
+            state = replace(state, image=image)
+        self._state = state
+        return replace(answer, seconds=clocks.perf_counter() - began)
+
+    def save(self, path: str | Path) -> None:
+        """Write the tracker's state to a file, from which ``restore`` continues exactly here."""
+        save_state(Path(path), self._state, self._key)
+
+    def restore(self, path: str | Path) -> None:
+        """Continue where the tracker that wrote the file was. Raises ``InputError`` for another map's file, or a damaged one."""
+        self._state = load_tracker_state(Path(path), self._key)
+
+    def _begun(
+        self, frame: Frame, image: Grey | None, state: TrackerState
+    ) -> tuple[Localization, TrackerState]:
+        """Find the first pose of the sequence: around the start, if there is one, or by a search."""
+        if self._start is not None and state.frames == 1:
+            motion = self._at_start(frame, self._start)
+            answer, state = self._continued(frame, image, state, motion, 0.0)
+            if answer.converged:
+                return answer, state
+        found = relocalized(
+            self.localizer, frame, self._start, state.lost, self.config.patience, seed=state.frames
+        )
+        if found is None or not found.converged:
+            return self._unknown(found), replace(state, lost=state.lost + 1)
+        return self._found(frame, image, state, found)
+
+    def _at_start(self, frame: Frame, start: SE3) -> Motion:
+        covariance = torch.diag(torch.tensor([START[0] * self._extent] * 3 + [START[1]] * 3).double() ** 2)
+        return Motion.at(PoseEstimate(start, covariance, torch.zeros_like(covariance)), self._reach(frame))
+
+    def _continued(
+        self, frame: Frame, image: Grey | None, state: TrackerState, motion: Motion, seconds: float
+    ) -> tuple[Localization, TrackerState]:
+        """Find the pose from that of the last frame. If it is not accepted, search anew from the next frame on."""
+        predicted = motion.predicted(seconds)
+        points = followed(state, image, frame, predicted.T_world_camera)
+        predicted, points, how = self._by_odometry(frame, points, motion, predicted, seconds)
+        measured = self._measured(frame, image, state, points, predicted)
+        if measured is not None and measured.verdict.accepted:
+            return self._accepted(frame, image, measured, predicted)
+        if state.lost or is_vague(predicted, frame.intrinsics):
+            found = relocalized(
+                self.localizer,
+                frame,
+                predicted.T_world_camera,
+                state.lost,
+                self.config.patience,
+                state.frames,
+            )
+            if found is not None and found.converged:
+                return self._found(frame, image, state, found)
+        state = self._adrift(frame, image, state, points, predicted)
+        verdict = NOTHING_SEEN if measured is None else measured.verdict
+        reason = (
+            f"lost for {state.lost} frame{'s' if state.lost > 1 else ''}, bridged by {how}: {verdict.reason}"
+        )
+        return _localization(predicted, Verdict(verdict.outcome, reason), predicted, 1.0), state
+
+    def _by_odometry(
+        self, frame: Frame, points: FollowedPoints, motion: Motion, predicted: Motion, seconds: float
+    ) -> tuple[Motion, FollowedPoints, str]:
+        """Return a prediction by the motion between the images, where corners of the last one were followed."""
+        corners = points[points.landmark == FRESH]
+        if len(corners):
+            moved = self._odometry.moved(frame, corners, motion, predicted.T_world_camera, seconds)
+            if moved is not None:
+                return *moved, "odometry"
+        return predicted, points[points.landmark != FRESH], "constant velocity"
+
+    def _measured(
+        self, frame: Frame, image: Grey | None, state: TrackerState, points: FollowedPoints, predicted: Motion
+    ) -> Measurement | None:
+        """Measure the pose by the best means that map and frame offer."""
+        if self._by_landmarks is not None and image is not None:
+            known = points[points.landmark != FRESH]
+            return self._by_landmarks(frame, image, state, known, predicted)
+        surface, config = self.localizer.map.surface, self.localizer.config
+        if image is not None:
+            state = replace(state, points=points)
+        if surface is not None and has_points(frame):
+            found = by_surface(surface, frame, state, predicted, self.config)
+        elif image is None:
+            return None
+        else:
+            colour = config.by_colour if isinstance(config, AutoConfig) else AutoConfig().by_colour
+            found = by_colour(self.localizer.map, frame, state, predicted, colour)
+        covariance = predicted.corrected(found.pose).covariance
+        return replace(found, verdict=determined(found.verdict, covariance, self._extent))
+
+    def _accepted(
+        self, frame: Frame, image: Grey | None, measured: Measurement, predicted: Motion
+    ) -> tuple[Localization, TrackerState]:
+        """Fuse an accepted pose with the prediction, unless the camera moved in a way that no prediction could foresee."""
+        motion = replace(
+            predicted, reach=self._reach(frame, measured.state.points, measured.pose.T_world_camera)
+        )
+        motion = motion.updated(measured.pose)
+        state = replace(measured.state, motion=motion, lost=0)
+        if self._by_landmarks is None:
+            corners = self._odometry.replenished(frame, image, state.points, motion.T_world_camera)
+            state = replace(state, points=corners)
+        return _localization(motion, measured.verdict, predicted, measured.loss), state
+
+    def _found(
+        self, frame: Frame, image: Grey | None, state: TrackerState, found: Localization
+    ) -> tuple[Localization, TrackerState]:
+        """Begin to track at a pose that a search has found."""
+        covariance = found.covariance
+        if covariance is None:
+            covariance = self._at_start(frame, found.T_world_camera).covariance
+        pose = PoseEstimate(found.T_world_camera, 0.5 * covariance, 0.5 * covariance)
+        motion = Motion.at(pose, self._reach(frame))
+        state = replace(state, points=FollowedPoints.none(), window=(), motion=motion)
+        measured = self._measured(frame, image, state, state.points, motion)
+        if measured is not None and measured.verdict.accepted:
+            state = measured.state
+            motion = replace(motion, reach=self._reach(frame, state.points, pose.T_world_camera))
+        if self._by_landmarks is None:
+            corners = self._odometry.replenished(frame, image, state.points, pose.T_world_camera)
+            state = replace(state, points=corners)
+        reason = f"relocalized after {state.lost} frames: {found.reason}" if state.lost else found.reason
+        answer = replace(found, method=METHOD, reason=reason, covariance=motion.covariance)
+        return answer, replace(state, motion=motion, lost=0)
+
+    def _adrift(
+        self, frame: Frame, image: Grey | None, state: TrackerState, points: FollowedPoints, predicted: Motion
+    ) -> TrackerState:
+        """Return the state of a tracker that is lost: corners to follow, and a velocity that is trusted less and less."""
+        corners = self._odometry.replenished(frame, image, points, predicted.T_world_camera)
+        motion = replace(predicted, velocity=VELOCITY_KEPT * predicted.velocity)
+        return replace(state, motion=motion, points=corners, window=(), lost=state.lost + 1)
+
+    def _unknown(self, found: Localization | None) -> Localization:
+        """Return the answer for a frame of which no pose is known, nor that of any frame before it."""
+        if found is not None:
+            return replace(found, method=METHOD)
+        T = SE3.identity() if self._start is None else self._start
+        covariance = torch.diag(torch.tensor([self._extent] * 3 + [torch.pi] * 3).double() ** 2)
+        return Localization(
+            T, Outcome.TOO_FEW_MATCHES, "the beginning of the sequence has not been recognised yet", 0, 0.0, 1.0,
+            METHOD, T[None], torch.zeros(0, dtype=torch.float64), covariance,
+        )  # fmt: skip
+
+    @property
+    def _extent(self) -> float:
+        """The size of the scene (metres)."""
+        scene = self.localizer.map
+        if scene.surface is not None:
+            return scene.surface.extent
+        corners = torch.tensor([scene.bounds.lower, scene.bounds.upper])
+        return float(torch.linalg.vector_norm(corners[1] - corners[0]))
+
+    def _reach(
+        self, frame: Frame, points: FollowedPoints | None = None, T_world_camera: SE3 | None = None
+    ) -> float:
+        """Return the distance (metres) to what the camera sees."""
+        if points is not None and T_world_camera is not None and len(points):
+            return float(
+                torch.linalg.vector_norm(points.positions - T_world_camera.translation, dim=-1).median()
+            )
+        if has_points(frame):
+            assert frame.depth is not None
+            return float(frame.depth[frame.depth > 0].median())
+        return 0.3 * self._extent
+
+    @property
+    def _key(self) -> str:
+        info: Any = getattr(self.localizer.map, "info", None)
+        return "" if info is None else str(info.weights)
+
+
+def _localization(motion: Motion, verdict: Verdict, predicted: Motion, loss: float) -> Localization:
+    """Return the state of the motion as the answer for a frame; its path leads from the prediction to the pose."""
+    T = motion.T_world_camera
+    return Localization(
+        T_world_camera=T,
+        outcome=verdict.outcome,
+        reason=verdict.reason,
+        steps=1,
+        seconds=0.0,
+        loss=loss,
+        method=METHOD,
+        poses=SE3.stack([predicted.T_world_camera, T]),
+        losses=torch.tensor([loss], dtype=torch.float64),
+        covariance=motion.covariance,
+    )

@@ -1,0 +1,1 @@
+"""Tracking: poses of the frames of a sequence, each predicted from those before it."""

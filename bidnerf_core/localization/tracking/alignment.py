@@ -1,0 +1,132 @@
+"""Measured depth against the baked surface, from a pose that is nearly right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
+from bidnerf_core.localization.by_landmarks import SURFACE_MEASUREMENTS, FusedTerm
+from bidnerf_core.localization.costs.prior import GaussianPrior
+from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
+from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE, surface_covariance
+from bidnerf_core.localization.normal_equations import Sum
+from bidnerf_core.localization.search.by_points import JUDGED
+from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.localization.tracking.motion import PoseEstimate
+from bidnerf_core.localization.tracking.single_pose import retracted
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.se3 import SE3
+
+SURFACE_BIAS = 0.5
+"""Share of the variance of a pose by depth that consecutive frames share."""
+DEPTH_MEASUREMENTS = 3.0
+"""Number of independent measurements that a frame's points count as beside landmarks: fewer than ``INDEPENDENT``, which is
+optimistic for hand-held sensors.
+"""
+ALIGNMENT_STEPS = 8
+"""Largest number of steps of an alignment without landmarks, at each of its scales."""
+ALIGNED_STEP = 1e-4
+"""Length of a step (metres and radians) at which the alignment has ended."""
+
+
+@dataclass(frozen=True, eq=False)
+class CloudInCamera:
+    """A frame's measured points, and the pose that this frame had by itself."""
+
+    cloud: PointCloud
+    T_world_camera: SE3
+
+
+def measured_cloud(frame: Frame, count: int, scale: float, generator: Generator) -> PointCloud:
+    """Return up to ``count`` of a frame's measured points in the camera's frame; depth is multiplied by ``scale``."""
+    cloud = PointCloud.measured((View(frame, SE3.identity()),), None, count, generator)
+    return cloud if scale == 1 else replace(cloud, points=scale * cloud.points)
+
+
+def joined_clouds(now: CloudInCamera, before: Sequence[CloudInCamera]) -> PointCloud:
+    """Return the points of a window of frames in the camera of the last, placed by the frames' relative poses."""
+    clouds = [now.cloud]
+    for past in before:
+        T_now_past = (now.T_world_camera.inverse() @ past.T_world_camera).to(torch.float32)
+        cloud = past.cloud
+        clouds.append(
+            replace(cloud, points=T_now_past.apply(cloud.points), origins=T_now_past.apply(cloud.origins))
+        )
+    parts = ("points", "rgb", "origins", "coloured")
+    return PointCloud(*(torch.cat([getattr(cloud, part) for cloud in clouds]) for part in parts))
+
+
+def fused_with_surface(
+    pose: PoseEstimate, surface: SurfaceMap, cloud: PointCloud, steps: int, views: int = 1
+) -> PoseEstimate:
+    """Fuse a pose with measured points on the surface, which count as ``DEPTH_MEASUREMENTS`` a view.
+
+    A share ``SURFACE_BIAS`` of the variance that the points contribute is bias, as in ``aligned``.
+    """
+    about = cloud.pivot
+    cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
+    variance = max(float(cost.residual_variance(pose.T_world_camera[None])[0]), LEAST_VARIANCE)
+    weight = DEPTH_MEASUREMENTS * views / variance
+    at_camera = about.update_at_camera(pose.T_world_camera)
+    prior = at_camera.T @ torch.linalg.inv(pose.covariance) @ at_camera
+    T, moved = pose.T_world_camera, torch.zeros(6, dtype=torch.float64)
+    for _ in range(steps):
+        here = cost(T[None])
+        hessian, gradient = weight * here.hessian[0], weight * here.gradient[0]
+        # The steps are so short that they add up; the prior pulls back by all of them.
+        step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)
+        T, moved = retracted(T, at_camera @ step), moved + step
+        if float(torch.linalg.vector_norm(step)) < ALIGNED_STEP:
+            break
+    to_pivot = torch.linalg.inv(at_camera)
+    information = to_pivot.T @ hessian @ to_pivot
+    fused = torch.linalg.inv(torch.linalg.inv(pose.covariance) + information)
+    kept, by_points = torch.eye(6).double() - fused @ information, fused @ information @ fused
+    return PoseEstimate(
+        T.normalized(),
+        kept @ pose.noise @ kept.T + (1 - SURFACE_BIAS) * by_points,
+        kept @ pose.bias @ kept.T + SURFACE_BIAS * by_points,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A pose by measured points on the surface alone, with its covariance and how well the points fit."""
+
+    T_world_camera: SE3
+    covariance: Float[Tensor, "6 6"]
+    diagnostics: SurfaceDiagnostics
+
+
+def aligned(
+    surface: SurfaceMap,
+    cloud: PointCloud,
+    predicted: SE3,
+    covariance: Float[Tensor, "6 6"],
+    spread: float,
+    views: int = 1,
+) -> Alignment:
+    """Align measured points with the surface from a predicted pose; ``spread`` (metres) is how far off they may be.
+
+    Where the points do not constrain the pose, it stays at the prediction.
+    """
+    about, finest = cloud.pivot, FINEST * surface.cell
+    prior, T = GaussianPrior(predicted, covariance, about), predicted
+    for distance in (spread, finest) if spread > 1.5 * finest else (finest,):
+        cost = SurfaceCost(surface, cloud, PointScales(distance))
+        variance = max(float(cost.residual_variance(T[None])[0]), LEAST_VARIANCE)
+        term = FusedTerm(cost, variance, SURFACE_MEASUREMENTS * views)
+        T = (
+            descend(Sum((prior, term.scaled)), T[None], ALIGNMENT_STEPS, about.moved, stop=ALIGNED_STEP)
+            .T[0]
+            .normalized()
+        )
+    judge = SurfaceCost(surface, cloud, PointScales(JUDGED * surface.extent))
+    found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, views)
+    return Alignment(T, found, surface_diagnostics(judge, T, torch.inf))

@@ -1,0 +1,227 @@
+"""Landmarks of the map that are recognised around a predicted pose, and the evidence that a pose by landmarks is right."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization.search.chance import log10_nfa
+from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
+from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches, projected_landmarks
+from bidnerf_core.localization.search.guided_refinement import RADII, matches_by_chance, usual_distance
+from bidnerf_core.localization.search.landmark_evidence import (
+    cell_numbers,
+    depth_scale,
+    median_distance,
+    probability_within,
+    share_of_cells,
+)
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmark_query import LandmarkQuery, pixel_threshold
+from bidnerf_core.localization.search.matching import EXACT, LandmarkMatcher
+from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.search.unguided import unguided_matches
+from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
+from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
+from bidnerf_core.mapping.features import Features
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.resection import resect
+from bidnerf_core.se3 import SE3
+
+NEARBY = EXACT
+"""Largest number of landmarks that are compared with an image: those that most images of the map saw."""
+WIDE = 2.0
+"""Multiple of the radius of guided matching from which on keypoints are compared with all landmarks in view. Guided matching
+compares a keypoint with the few landmarks that project nearest to it, which suits predictions that are off by little.
+"""
+LEAST_CHANCE = 0.5
+"""Least number of matches by chance that is assumed, since it is estimated from few counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """How much a pose by landmarks is supported; see ``LandmarkPose``."""
+
+    matches: int
+    agreeing: int
+    log10_nfa: float
+    chance: float
+    visible: int
+    keypoints: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recognized:
+    """Landmarks that were found in an image by their descriptors, and the pose that they determine."""
+
+    points: FollowedPoints
+    found: PointFit
+    evidence: Evidence
+    usual_distance: float  # largest squared descriptor distance at which a match was allowed
+    miscalibration: Miscalibration
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkDetector:
+    """Recognises landmarks around a predicted pose, without a search over the map."""
+
+    landmarks: LandmarkMap
+    features: Features
+
+    def __call__(
+        self,
+        frame: Frame,
+        T_world_camera: SE3,
+        radius: float,
+        most_distance: float,
+        noise: float,
+        apparent: Calibration = GIVEN,
+    ) -> Recognized | None:
+        """Match keypoints with landmarks that project within ``radius`` pixels of them, and fit the pose to the matches.
+
+        ``most_distance`` is the largest squared distance between the descriptors of a match, ``noise`` a first guess at that
+        of keypoints (pixels), ``apparent`` one at the intrinsics that fit best. Returns None if too few match.
+        """
+        number = self._near(frame.intrinsics, T_world_camera)
+        image = query_image(frame, SE3.identity(), self.features)
+        query = LandmarkQuery([image], self.landmarks[number], FIXED)
+        tight = RADII[-1] * query.threshold
+        seen = self._seen(frame, query, T_world_camera, radius, most_distance, noise)
+        surprise = 0.0
+        if seen is not None and (radius > tight or math.isinf(most_distance)):
+            if radius > WIDE * tight:
+                within = min(0.5, (query.threshold / radius) ** 2)
+                surprise = log10_nfa(len(seen[0]), seen[1].within(query.threshold), within)
+            T, noise = seen[1].T_world_camera, seen[1].fit.noise
+            most_distance = seen[2] if math.isinf(most_distance) else most_distance
+            seen = self._seen(frame, query, T, tight, most_distance, noise)
+        if seen is None:
+            return None
+        points, found, _ = seen
+        evidence = _guided_evidence(query, found, tight, most_distance)
+        evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
+        points = replace(points, landmark=number[points.landmark])
+        return Recognized(points, found, evidence, most_distance, self._miscalibration(found, apparent))
+
+    def _seen(
+        self, frame: Frame, query: LandmarkQuery, T: SE3, radius: float, most_distance: float, noise: float
+    ) -> tuple[FollowedPoints, PointFit, float] | None:
+        """Return the matches within a radius, the pose that they determine, and the usual distance of its inliers."""
+        if radius > WIDE * RADII[-1] * query.threshold:
+            matches = _matches_within(query, T, radius)
+        else:
+            matches = guided_matches(query.images, query.landmarks, T, radius, most_distance)
+        points = FollowedPoints.of_landmarks(query.landmarks, matches.landmark, query.pixels(matches))
+        found = fit_pose(points.observed(frame), T, noise, query.threshold, self.landmarks.correlation)
+        if found is None or not bool(found.inliers.any()):
+            return None
+        return points, found, usual_distance(query, matches[found.inliers])
+
+    def _near(self, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "n"]:
+        """Return the numbers of landmarks in view that most images of the map saw, from about this direction."""
+        landmarks = self.landmarks
+        local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
+        half = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
+        middle = torch.tensor([0.5 - camera.cx / camera.width, 0.5 - camera.cy / camera.height]) * 2 * half
+        inside = ((local[:, :2] - middle * local[:, 2:]).abs() <= 1.3 * half * local[:, 2:]).all(-1)
+        towards = T_world_camera.translation.float() - landmarks.positions
+        cosine = (towards * landmarks.directions).sum(-1) / towards.norm(dim=-1).clamp(min=1e-12)
+        facing = cosine >= (landmarks.cones + OBLIQUE).clamp(max=torch.pi).cos()
+        index = (inside & facing).nonzero()[:, 0]
+        if len(index) <= NEARBY:
+            return index
+        return index[landmarks.views[index].argsort(descending=True, stable=True)[:NEARBY].sort().values]
+
+    def _miscalibration(self, found: PointFit, apparent: Calibration) -> Miscalibration:
+        """Judge the given intrinsics by those that fit the landmarks best."""
+        free = resect(
+            found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL, apparent,
+            self.landmarks.correlation,
+        )  # fmt: skip
+        return Miscalibration.of(free, self.landmarks)
+
+
+def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float, most: float) -> Evidence:
+    """Compare the number of matches with that around shifted projections, where all of them are due to chance."""
+    agreeing, keypoints = int(found.inliers.sum()), len(query.images[0].keypoints)
+    projections = projected_landmarks(query.images, query.landmarks, found.T_world_camera, GIVEN, radius)
+    chance = matches_by_chance(projections, radius, most)
+    probability = min(0.5, max(LEAST_CHANCE, chance) / max(1, keypoints))
+    nfa = log10_nfa(keypoints, agreeing, probability)
+    return Evidence(keypoints, agreeing, nfa, chance, sum(map(len, projections)), keypoints)
+
+
+def flow_evidence(found: PointFit, camera: Intrinsics) -> Evidence:
+    """Return the evidence of landmarks that the optical flow has carried over from an earlier image.
+
+    Each is one match, which would fall anywhere in the image if the flow were wrong.
+    """
+    threshold, count = pixel_threshold(camera), len(found.inliers)
+    agreeing = found.within(threshold)
+    nfa = log10_nfa(count, agreeing, probability_within(threshold, camera))
+    return Evidence(count, agreeing, nfa, 0.0, count, count)
+
+
+def landmark_pose(
+    points: FollowedPoints,
+    found: PointFit,
+    evidence: Evidence,
+    landmarks: LandmarkMap,
+    miscalibration: Miscalibration,
+    camera: Intrinsics,
+) -> LandmarkPose:
+    """Return a pose by landmarks in the form that ``landmark_verdict`` judges."""
+    fit, data, every = found.fit, found.data, torch.arange(len(points))
+    return LandmarkPose(
+        T_world_camera=fit.T_world_rig,
+        covariance=fit.covariance + landmarks.pose_covariance,
+        noise=fit.noise,
+        correspondences=LandmarkMatches(
+            torch.zeros_like(every), every, points.landmark, torch.zeros(len(every))
+        ),
+        residuals=data.residuals(fit.T_world_rig),
+        normalized_residuals=data.normalized_residuals(fit.T_world_rig, fit.noise),
+        pixels=points.pixels,
+        matches=evidence.matches,
+        agreeing=evidence.agreeing,
+        log10_nfa=evidence.log10_nfa,
+        chance=evidence.chance,
+        visible=evidence.visible,
+        keypoints=evidence.keypoints,
+        spread=share_of_cells(points.pixels[found.inliers], camera),
+        noise_ratio=fit.noise / landmarks.noise,
+        distance=median_distance(data, fit.T_world_rig),
+        calibration=GIVEN,
+        calibration_deviations=fit.calibration_deviations,
+        slope=fit.slope,
+        miscalibration=miscalibration,
+        calibration_scatter=landmarks.calibration_scatter,
+        depth_scale=depth_scale(data, fit.T_world_rig),
+    )
+
+
+def well_spread(pixels: Float[Tensor, "m 2"], camera: Intrinsics, most: int) -> Int[Tensor, "k"]:
+    """Return up to ``most`` indices, from all cells of a grid over the image in turn; the pixels come best first."""
+    if len(pixels) <= most:
+        return torch.arange(len(pixels))
+    cell = cell_numbers(pixels, camera)
+    order = cell.argsort(stable=True)
+    first = torch.searchsorted(cell[order], cell[order])
+    rank = torch.empty_like(cell)
+    rank[order] = torch.arange(len(cell)) - first
+    return rank.argsort(stable=True)[:most].sort().values
+
+
+def _matches_within(query: LandmarkQuery, T_world_camera: SE3, radius: float) -> LandmarkMatches:
+    """Return the matches by descriptors, least ambiguous first, whose landmarks project within ``radius`` pixels."""
+    (image,) = query.images
+    matches = unguided_matches(query.images, LandmarkMatcher(query.landmarks), len(image.keypoints))
+    return matches[
+        torch.linalg.vector_norm(query.observed(matches).residuals(T_world_camera), dim=-1) <= radius
+    ]

@@ -1,0 +1,79 @@
+"""Optical flow between consecutive images (Lucas and Kanade 1981; pyramids by Bouguet 2000), by OpenCV."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from bidnerf_core.mapping.features import FIRST_CENTRE
+
+FLOW_WINDOW = (13, 13)
+"""Pixels of the patches that are compared."""
+LEVELS = 3
+"""Number of pyramid levels above the image itself; each halves it."""
+FLOW_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
+"""Largest number of iterations on each level, and the step (pixels) below which they end."""
+RETURN = 0.7
+"""Largest distance (pixels) between a point and where the flow back from its new place leads to."""
+LEAST_TEXTURE = 1e-3
+"""Least eigenvalue of a patch's gradient matrix, as OpenCV normalises it; a blank wall with noise stays below it."""
+BRIGHTNESS = 0.02
+"""Relative change of an image's mean from which on its brightness is matched first: the flow assumes constant brightness."""
+
+Grey = UInt8[np.ndarray, "h w"]
+
+
+def flow(
+    before: Grey, now: Grey, pixels: Float[Tensor, "m 2"], guess: Float[Tensor, "m 2"]
+) -> tuple[Float[Tensor, "m 2"], Bool[Tensor, "m"]]:
+    """Return where ``pixels`` (u, v) of one image are in the next, and which of them were found.
+
+    The search begins at ``guess``. A point counts as found if the flow from its new place leads back to the old one.
+    """
+    if not len(pixels):
+        return pixels, torch.zeros(0, dtype=torch.bool)
+    before = _as_bright_as(now, before)
+    start = _corner_based(pixels)
+    there, seen, _ = cv2.calcOpticalFlowPyrLK(
+        before, now, start, _corner_based(guess), winSize=FLOW_WINDOW, maxLevel=LEVELS,
+        criteria=FLOW_STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE,
+    )  # fmt: skip
+    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(
+        now, before, there, start.copy(), winSize=FLOW_WINDOW, maxLevel=1,
+        criteria=FLOW_STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE,
+    )  # fmt: skip
+    height, width = now.shape
+    inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(-1)
+    returned = np.linalg.norm(back - start, axis=-1) <= RETURN
+    found = inside & returned & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)
+    return torch.from_numpy(there + FIRST_CENTRE).to(pixels), torch.from_numpy(found)
+
+
+def corners(image: Grey, count: int, apart: float) -> Float[Tensor, "n 2"]:
+    """Return up to ``count`` corners (u, v), at least ``apart`` pixels from each other (Shi and Tomasi 1994)."""
+    found: np.ndarray | None = cv2.goodFeaturesToTrack(image, count, 0.01, apart)
+    if found is None:
+        return torch.zeros((0, 2))
+    return torch.from_numpy(found.reshape(-1, 2) + FIRST_CENTRE)
+
+
+def _corner_based(pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m 2"]:
+    return np.ascontiguousarray(pixels.float().numpy() - np.float32(FIRST_CENTRE))
+
+
+def _as_bright_as(model: Grey, image: Grey) -> Grey:
+    """Return ``image`` with the mean and the standard deviation of ``model``."""
+    (mean, spread), (wanted, wanted_spread) = _moments(image), _moments(model)
+    if abs(wanted - mean) <= BRIGHTNESS * mean or spread < 1:
+        return image
+    gain = min(4.0, max(0.25, wanted_spread / spread))
+    levels = (gain * (np.arange(256) - mean) + wanted).round().clip(0, 255).astype(np.uint8)
+    return levels[image]
+
+
+def _moments(image: Grey) -> tuple[float, float]:
+    mean, spread = cv2.meanStdDev(image)
+    return float(mean[0, 0]), float(spread[0, 0])

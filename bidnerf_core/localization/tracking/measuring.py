@@ -1,0 +1,268 @@
+"""Measuring a pose in one frame from a prediction: by followed and recognised landmarks, by depth, or by colour."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
+from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
+from bidnerf_core.localization.by_landmarks import shrunk_depth_scale
+from bidnerf_core.localization.costs.surface import PointCloud
+from bidnerf_core.localization.covariance import INDEPENDENT
+from bidnerf_core.localization.problem import SceneMap, rig
+from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmark_query import pixel_threshold
+from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.tracking.alignment import (
+    SURFACE_BIAS,
+    CloudInCamera,
+    aligned,
+    fused_with_surface,
+    joined_clouds,
+    measured_cloud,
+)
+from bidnerf_core.localization.tracking.detection import (
+    Evidence,
+    LandmarkDetector,
+    flow_evidence,
+    landmark_pose,
+    well_spread,
+)
+from bidnerf_core.localization.tracking.flow import Grey, flow
+from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
+from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
+from bidnerf_core.localization.tracking.settings import TrackerConfig
+from bidnerf_core.localization.tracking.state import TrackerState
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.se3 import SE3
+
+WIDEST = 0.4
+"""Largest radius, as a share of the image's diagonal, within which landmarks are sought around their prediction."""
+SIGMAS = 3.0
+"""The radius in standard deviations of the prediction."""
+ENOUGH_LANDMARKS = 40
+"""The number of followed landmarks that agree from which on no new ones are sought."""
+SINGLE = LandmarkThresholds(precision=math.inf)
+"""Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
+SHAPE_ALONE = Verdict(
+    Outcome.UNDETERMINED, "no colours were recorded, and shape alone does not show a slide along walls"
+)
+DETERMINED = 0.02, math.radians(3)
+"""Largest standard deviation of an accepted pose by depth or colour: shares of the scene's extent, and radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A pose measured in a frame, the verdict on it, and what the next frame needs."""
+
+    pose: PoseEstimate
+    verdict: Verdict
+    loss: float
+    state: TrackerState  # with the points and the window of this frame
+    steps: int = 0
+
+
+def followed(state: TrackerState, image: Grey | None, frame: Frame, predicted: SE3) -> FollowedPoints:
+    """Return the points of the last image that were found in this one."""
+    if image is None or state.image is None or image.shape != state.image.shape or not len(state.points):
+        return FollowedPoints.none()
+    guess = state.points.projected(frame.intrinsics, predicted)
+    pixels, found = flow(state.image, image, state.points.pixels, guess)
+    if float(found.float().mean()) < 0.5:  # the prediction may be what is wrong
+        again, found_again = flow(state.image, image, state.points.pixels, state.points.pixels)
+        if int(found_again.sum()) > int(found.sum()):
+            pixels, found = again, found_again
+    return replace(state.points, pixels=pixels)[found]
+
+
+@dataclass(frozen=True, eq=False)
+class ByLandmarks:
+    """Measures poses by landmarks: those that the flow carries over, and new ones where these become few."""
+
+    map: SceneMap
+    detector: LandmarkDetector
+    config: TrackerConfig
+
+    @property
+    def correlation(self) -> float:
+        """The number of landmarks in an image that count as one measurement."""
+        return self.detector.landmarks.correlation
+
+    def __call__(
+        self, frame: Frame, image: Grey, state: TrackerState, points: FollowedPoints, predicted: Motion
+    ) -> Measurement | None:
+        """Return the pose by landmarks, fused with measured depth; None if too few are seen for any pose."""
+        threshold = pixel_threshold(frame.intrinsics)
+        found = fit_pose(
+            points.observed(frame), predicted.T_world_camera, state.noise, threshold, self.correlation
+        )
+        judged = None
+        if found is not None:
+            evidence = flow_evidence(found, frame.intrinsics)
+            judged = self._judged(frame, points, found, evidence, state.miscalibration)
+        state = replace(state, age=state.age + 1)
+        if judged is None or self._wants_more(state, points, judged):
+            fresh = self._recognized(frame, state, predicted, judged)
+            if fresh is not None and (judged is None or fresh[1].accepted or not judged[1].accepted):
+                judged, points, found, state = fresh[:2], fresh[2], fresh[3], fresh[4]
+        if judged is None or found is None:
+            return None
+        measured = self._fused(frame, state, points[found.inliers], *judged)
+        covariance = predicted.updated(measured.pose).covariance
+        return replace(measured, verdict=precise(measured.verdict, covariance, judged[0].distance))
+
+    def _judged(
+        self,
+        frame: Frame,
+        points: FollowedPoints,
+        found: PointFit,
+        evidence: Evidence,
+        miscalibration: Miscalibration,
+    ) -> tuple[LandmarkPose, Verdict]:
+        pose = landmark_pose(
+            points, found, evidence, self.detector.landmarks, miscalibration, frame.intrinsics
+        )
+        return pose, landmark_verdict(pose, SINGLE)
+
+    def _wants_more(
+        self, state: TrackerState, points: FollowedPoints, judged: tuple[LandmarkPose, Verdict]
+    ) -> bool:
+        left = judged[0].inliers
+        few = left < max(ENOUGH_LANDMARKS, self.config.refresh_share * state.sought)
+        pose, verdict = judged
+        few |= pose.position_deviation > LandmarkThresholds().precision * pose.distance
+        return few or state.age >= self.config.refresh_frames or not verdict.accepted
+
+    def _recognized(
+        self,
+        frame: Frame,
+        state: TrackerState,
+        predicted: Motion,
+        judged: tuple[LandmarkPose, Verdict] | None,
+    ) -> tuple[LandmarkPose, Verdict, FollowedPoints, PointFit, TrackerState] | None:
+        """Seek landmarks about the pose of those that were followed, or else about the prediction."""
+        camera = frame.intrinsics
+        least, most = 1.5 * pixel_threshold(camera), WIDEST * math.hypot(camera.width, camera.height)
+        if judged is not None and judged[1].accepted:
+            T, radius = judged[0].T_world_camera, least
+        else:
+            T = predicted.T_world_camera
+            radius = max(least, search_radius(predicted, camera))
+            if radius > most:
+                return None
+        seen = self.detector(
+            frame, T, radius, state.usual_distance, state.noise, state.miscalibration.calibration
+        )
+        if seen is None:
+            return None
+        pose, verdict = self._judged(frame, seen.points, seen.found, seen.evidence, seen.miscalibration)
+        if not verdict.accepted:
+            return pose, verdict, seen.points, seen.found, state
+        some = well_spread(seen.points.pixels[seen.found.inliers], camera, self.config.points)
+        kept = torch.zeros(len(seen.points), dtype=torch.bool)
+        kept[seen.found.inliers.nonzero()[:, 0][some]] = True
+        state = replace(
+            state,
+            sought=len(some),
+            age=0,
+            usual_distance=seen.usual_distance,
+            miscalibration=seen.miscalibration,
+        )
+        return pose, verdict, seen.points, replace(seen.found, inliers=kept), state
+
+    def _fused(
+        self, frame: Frame, state: TrackerState, kept: FollowedPoints, found: LandmarkPose, verdict: Verdict
+    ) -> Measurement:
+        state = replace(state, points=kept, noise=found.noise)
+        # Errors that the landmarks of an image have in common are those of the next image, too.
+        noise = (found.covariance - self.detector.landmarks.pose_covariance) / self.correlation
+        bias = found.full_covariance - noise
+        pose, surface = PoseEstimate(found.T_world_camera, noise, bias), self.map.surface
+        if not verdict.accepted or surface is None or not frame.has_depth:
+            return Measurement(pose, verdict, found.noise, state)
+        here = CloudInCamera(self._cloud(frame, found, state.frames), found.T_world_camera)
+        cloud = joined_clouds(here, state.window)
+        pose = fused_with_surface(pose, surface, cloud, self.config.depth_steps, 1 + len(state.window))
+        kept_clouds = (*state.window, here)[-(self.config.window - 1) :] if self.config.window > 1 else ()
+        verdict = replace(verdict, reason=f"{verdict.reason}, fused with depth")
+        return Measurement(pose, verdict, found.noise, replace(state, window=kept_clouds))
+
+    def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:
+        generator = Generator().manual_seed(seed)
+        return measured_cloud(frame, self.config.depth_points, shrunk_depth_scale(found), generator)
+
+
+def search_radius(predicted: Motion, camera: Intrinsics) -> float:
+    """Return the radius (pixels) around its prediction within which a landmark most likely appears."""
+    return SIGMAS * pixel_radius(predicted.covariance, camera.fx, predicted.reach)
+
+
+def is_vague(predicted: Motion, camera: Intrinsics) -> bool:
+    """Return whether a prediction, such as that after a gap, says too little about where landmarks appear."""
+    return search_radius(predicted, camera) > WIDEST * math.hypot(camera.width, camera.height)
+
+
+def by_surface(
+    surface: SurfaceMap, frame: Frame, state: TrackerState, predicted: Motion, config: TrackerConfig
+) -> Measurement:
+    """Return the pose by measured depth on the surface alone."""
+    cloud = measured_cloud(frame, config.depth_points, 1.0, Generator().manual_seed(state.frames))
+    here = CloudInCamera(cloud, predicted.T_world_camera)
+    views = 1 + len(state.window)
+    translation, rotation = predicted.noise[:6, :6].diagonal().split(3)
+    off = math.sqrt(float(translation.mean() + rotation.mean() * predicted.reach**2))
+    found = aligned(
+        surface, joined_clouds(here, state.window), predicted.T_world_camera, predicted.covariance,
+        2 * off, views,
+    )  # fmt: skip
+    here = replace(here, T_world_camera=found.T_world_camera)
+    window = (*state.window, here)[-(config.window - 1) :] if config.window > 1 else ()
+    covariance = found.covariance
+    pose = PoseEstimate(found.T_world_camera, (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance)
+    loss = 1 - found.diagnostics.colour_inliers
+    verdict = found.diagnostics.verdict() if frame.has_colour else SHAPE_ALONE
+    return Measurement(pose, verdict, loss, replace(state, window=window))
+
+
+def by_colour(
+    scene: SceneMap, frame: Frame, state: TrackerState, predicted: Motion, config: ByColourConfig
+) -> Measurement:
+    """Return the pose by colours of rendered rays alone, which takes far longer than the other ways."""
+    problem = rig(scene, [View(replace(frame, depth=None), SE3.identity())], predicted.T_world_camera)
+    T, none = predicted.T_world_camera, torch.zeros(0, dtype=torch.float64)
+    start = SearchResult(T[None], torch.zeros(1, dtype=torch.float64), math.inf, T[None], none)
+    answer = refine_by_colour(problem, start, config, Generator().manual_seed(state.frames))
+    covariance = answer.refined.covariance * max(1.0, config.steps.fine_rays / INDEPENDENT)
+    if not bool(covariance.isfinite().all()):
+        covariance = predicted.covariance
+    pose = PoseEstimate(
+        answer.refined.T.normalized(), (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance
+    )
+    return Measurement(pose, answer.verdict, answer.refined.loss, state)
+
+
+def precise(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
+    """Return the verdict, or that the position is too uncertain for the ``distance`` (metres) of what is in view."""
+    deviation = float(torch.linalg.eigvalsh(covariance[:3, :3])[-1].clamp(min=0).sqrt())
+    if not verdict.accepted or deviation <= LandmarkThresholds().precision * distance:
+        return verdict
+    why = f"but the position is uncertain by {deviation / distance:.1%} of the distance"
+    return Verdict(Outcome.IMPRECISE, f"{verdict.reason}, {why}")
+
+
+def determined(verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float) -> Verdict:
+    """Return the verdict, or that the pose is not determined where its covariance is large."""
+    translation, rotation = (float(part.max().sqrt()) for part in covariance.diagonal().split(3))
+    if not verdict.accepted or (translation <= DETERMINED[0] * extent and rotation <= DETERMINED[1]):
+        return verdict
+    why = f"one standard deviation is {translation:.3g} m and {math.degrees(rotation):.2g} deg"
+    return Verdict(Outcome.UNDETERMINED, why)

@@ -1,0 +1,168 @@
+"""The motion of a camera: its pose, its velocity, and how uncertain both are.
+
+An error-state Kalman filter on SE(3) with right errors (Sola et al. 2018) and a white-noise acceleration. Two kinds of error
+are kept apart, as a Schmidt-Kalman filter does: noise, which is independent from frame to frame and averages out, and the
+bias of the map and the camera, which consecutive frames share and which therefore does not become smaller however many are
+fused.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.localization.tracking.single_pose import retracted, update_between
+from bidnerf_core.se3 import SE3
+
+SPEED, TURN_RATE = 1.0, 1.0
+"""Standard deviations of an unknown velocity: reaches (the distance to what the camera sees) a second, and radians a second."""
+ACCELERATION, TURN_ACCELERATION = 2.0, 4.0
+"""Standard deviations of the acceleration: reaches a second squared, and radians a second squared. Those of a hand-held camera
+that is moved briskly.
+"""
+LONGEST_GAP = 0.6
+"""Seconds without a frame after which the velocity is no longer used."""
+UNFORESEEN = 60.0
+"""Squared Mahalanobis distance of a measured pose from the prediction beyond which the prediction is dropped."""
+LEAST_SECONDS = 1e-3
+"""Least time between two frames for which noise of the motion is added; frames may be repeated or lack distinct times."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """A pose measured in one frame, with the two parts of its covariance; right updates, translation (metres) first."""
+
+    T_world_camera: SE3  # float64
+    noise: Float[Tensor, "6 6"]  # independent of other frames'
+    bias: Float[Tensor, "6 6"]  # shared with the frames before and after
+
+    @property
+    def covariance(self) -> Float[Tensor, "6 6"]:
+        return self.noise + self.bias
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A camera's pose and velocity at one time; float64."""
+
+    T_world_camera: SE3
+    velocity: Float[Tensor, "6"]  # right updates of the pose (metres, radians) a second
+    noise: Float[Tensor, "12 12"]  # covariance of pose and velocity
+    bias: Float[Tensor, "6 6"]  # covariance of the pose's error that frames share
+    reach: float  # metres: distance to what the camera sees, which scales translations
+
+    @staticmethod
+    def at(pose: PoseEstimate, reach: float) -> Motion:
+        """Return a camera at a known pose with an unknown velocity."""
+        noise = torch.zeros((12, 12), dtype=torch.float64)
+        noise[:6, :6] = pose.noise
+        noise[6:, 6:] = _scaled(reach * SPEED, TURN_RATE)
+        return Motion(pose.T_world_camera, torch.zeros(6, dtype=torch.float64), noise, pose.bias, reach)
+
+    @property
+    def covariance(self) -> Float[Tensor, "6 6"]:
+        """Covariance of the pose, right update."""
+        return self.noise[:6, :6] + self.bias
+
+    def predicted(self, seconds: float) -> Motion:
+        """Return the state ``seconds`` later, or earlier where they are negative.
+
+        After a gap, the pose stays where it was and its uncertainty grows with the speed that a camera may have.
+        """
+        motion = self.at_rest() if abs(seconds) > LONGEST_GAP else self
+        step = motion.velocity * seconds
+        T = retracted(motion.T_world_camera, step)
+        back = _adjoint_of_inverse(step)
+        transition = torch.eye(12, dtype=torch.float64)
+        transition[:6, :6] = back
+        transition[:6, 6:] = seconds * torch.eye(6, dtype=torch.float64)
+        noise = transition @ motion.noise @ transition.T + self._acceleration_noise(seconds)
+        return replace(motion, T_world_camera=T, noise=_symmetric(noise), bias=back @ self.bias @ back.T)
+
+    def at_rest(self) -> Motion:
+        """Return the same pose with an unknown velocity."""
+        return Motion.at(PoseEstimate(self.T_world_camera, self.noise[:6, :6], self.bias), self.reach)
+
+    def corrected(self, measured: PoseEstimate) -> Motion:
+        """Return the state after fusing it with a measured pose.
+
+        The bias of the measurement and that of the state are taken as fully correlated, so that fusing does not reduce it.
+        """
+        off = update_between(self.T_world_camera, measured.T_world_camera)
+        innovation = self.noise[:6, :6] + measured.noise
+        gain = torch.linalg.solve(innovation, self.noise[:6]).T
+        delta = gain @ off
+        kept = torch.eye(12, dtype=torch.float64)
+        kept[:, :6] -= gain
+        noise = kept @ self.noise @ kept.T + gain @ measured.noise @ gain.T  # Joseph's form stays positive
+        shared = kept[:6, :6] @ _root(self.bias) + gain[:6] @ _root(measured.bias)
+        return Motion(
+            retracted(self.T_world_camera, delta[:6]).normalized(),
+            self.velocity + delta[6:],
+            _symmetric(noise),
+            shared @ shared.T,
+            self.reach,
+        )
+
+    def updated(self, measured: PoseEstimate) -> Motion:
+        """Return the state after fusing it with a measured pose, or at that pose alone if no prediction could foresee it."""
+        if self.distance(measured) > UNFORESEEN:
+            return Motion.at(measured, self.reach)
+        return self.corrected(measured)
+
+    def moved(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
+        """Return the state after a motion that the images themselves gave, ``seconds`` later.
+
+        ``relative`` is the covariance of that motion, a right update of the new pose.
+        """
+        step = update_between(self.T_world_camera, T_world_camera)
+        back = _adjoint_of_inverse(step)
+        seconds = max(abs(seconds), LEAST_SECONDS) * (-1 if seconds < 0 else 1)
+        noise = torch.zeros((12, 12), dtype=torch.float64)
+        noise[:6, :6] = back @ self.noise[:6, :6] @ back.T + relative
+        spread = _scaled(self.reach * ACCELERATION, TURN_ACCELERATION)
+        noise[6:, 6:] = 2 * relative / seconds**2 + spread * seconds**2
+        bias = back @ self.bias @ back.T
+        return replace(
+            self, T_world_camera=T_world_camera, velocity=step / seconds, noise=_symmetric(noise), bias=bias
+        )
+
+    def distance(self, measured: PoseEstimate) -> float:
+        """Return the squared Mahalanobis distance of a measured pose from this one; 6 on average."""
+        off = update_between(self.T_world_camera, measured.T_world_camera)
+        spread = self.noise[:6, :6] + measured.noise
+        return float(off @ torch.linalg.solve(spread, off))
+
+    def _acceleration_noise(self, seconds: float) -> Float[Tensor, "12 12"]:
+        seconds = max(abs(seconds), LEAST_SECONDS)
+        spread = _scaled(self.reach * ACCELERATION, TURN_ACCELERATION)
+        pairs = torch.tensor([[seconds**4 / 4, seconds**3 / 2], [seconds**3 / 2, seconds**2]])
+        return torch.kron(pairs.double(), spread)
+
+
+def pixel_radius(covariance: Float[Tensor, "6 6"], focal: float, distance: float) -> float:
+    """Return the standard deviation (pixels) of where a point at ``distance`` (metres) appears for an uncertain pose."""
+    translation, rotation = covariance.diagonal().split(3)
+    return focal * math.sqrt(float(translation.mean()) / distance**2 + float(rotation.mean()))
+
+
+def _scaled(translation: float, rotation: float) -> Float[Tensor, "6 6"]:
+    return torch.diag(torch.tensor([translation] * 3 + [rotation] * 3, dtype=torch.float64) ** 2)
+
+
+def _adjoint_of_inverse(step: Float[Tensor, "6"]) -> Float[Tensor, "6 6"]:
+    return retracted(SE3.identity(), -step).adjoint()
+
+
+def _symmetric(matrix: Tensor) -> Tensor:
+    return (matrix + matrix.T) / 2
+
+
+def _root(covariance: Float[Tensor, "6 6"]) -> Float[Tensor, "6 6"]:
+    """Return the symmetric square root of a positive semidefinite matrix."""
+    values, axes = torch.linalg.eigh(covariance)
+    return (axes * values.clamp(min=0).sqrt()) @ axes.T

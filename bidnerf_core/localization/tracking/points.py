@@ -1,0 +1,146 @@
+"""Points of the world that are followed from image to image, and the pose that they determine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import poselib
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame
+from bidnerf_core.localization.search.ransac import sample_consensus
+from bidnerf_core.mapping.keypoint_depth import measured_depth
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.resection import ReprojectionFit, resect
+from bidnerf_core.se3 import SE3
+
+LEAST_FOLLOWED = 6
+"""Least number of points from which a pose is estimated."""
+INLIER = 3.0
+"""Largest reprojection error of an inlier, in standard deviations along both axes together."""
+MAJORITY = 0.7
+"""Share of inliers below which the robust fit is not relied upon, and a sample consensus is sought."""
+FRESH = -1
+"""The number of a landmark that a point stands for, if it stands for none."""
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedPoints:
+    """Points in an image, and where they are in the world; all tensors are on the CPU."""
+
+    pixels: Float[Tensor, "m 2"]  # (u, v) in the last image
+    positions: Float[Tensor, "m 3"]  # metres, world; float64
+    deviations: Float[Tensor, "m 2"]  # metres, across and along ``directions``; float64
+    directions: Float[Tensor, "m 3"]  # unit, world; float64
+    landmark: Int[Tensor, "m"]  # its number in the map; FRESH for points that were measured in an image
+
+    @staticmethod
+    def none() -> FollowedPoints:
+        wide = torch.zeros((0, 3), dtype=torch.float64)
+        return FollowedPoints(torch.zeros((0, 2)), wide, wide[:, :2], wide, torch.zeros(0, dtype=torch.long))
+
+    @staticmethod
+    def of_landmarks(
+        landmarks: LandmarkMap, number: Int[Tensor, "m"], pixels: Float[Tensor, "m 2"]
+    ) -> FollowedPoints:
+        return FollowedPoints(
+            pixels,
+            landmarks.positions[number].double(),
+            landmarks.deviations[number].double(),
+            landmarks.directions[number].double(),
+            number,
+        )
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def __getitem__(self, index: Tensor) -> FollowedPoints:
+        return FollowedPoints(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def projected(self, camera: Intrinsics, T_world_camera: SE3) -> Float[Tensor, "m 2"]:
+        """Return where the points appear from a pose; their present pixels where they would lie behind the camera."""
+        pixels = camera.project(T_world_camera.inverse().apply(self.positions)).float()
+        return torch.where(pixels.isfinite().all(-1, keepdim=True), pixels, self.pixels)
+
+    def observed(self, frame: Frame) -> ObservedPoints:
+        """Return the points as the input of a pose solver, seen in ``frame``."""
+        camera, count = frame.intrinsics, len(self)
+        return ObservedPoints(
+            self.positions,
+            self.deviations,
+            self.directions,
+            camera.unproject(self.pixels.double())[:, :2],
+            torch.full((count,), (camera.fx * camera.fy) ** 0.5, dtype=torch.float64),
+            measured_depth(frame, self.pixels),
+            torch.eye(3, dtype=torch.float64).expand(count, 3, 3),
+            torch.zeros((count, 3), dtype=torch.float64),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PointFit:
+    """The pose that points determine, and which of them agree with it."""
+
+    fit: ReprojectionFit
+    data: ObservedPoints
+    inliers: Bool[Tensor, "m"]
+
+    @property
+    def T_world_camera(self) -> SE3:
+        return self.fit.T_world_rig
+
+    @property
+    def share(self) -> float:
+        return float(self.inliers.float().mean()) if len(self.inliers) else 0.0
+
+    def within(self, threshold: float) -> int:
+        """Return how many points have a reprojection error of at most ``threshold`` pixels."""
+        off = torch.linalg.vector_norm(self.data.residuals(self.T_world_camera), dim=-1)
+        return int((off <= threshold).sum())
+
+
+def fit_pose(
+    data: ObservedPoints, start: SE3, noise: float, threshold: float, correlation: float = 1.0
+) -> PointFit | None:
+    """Return the pose that the points in one camera determine, from a start; None if they are too few.
+
+    ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. Where most points do not agree with the robust fit, a
+    consensus of samples within ``threshold`` pixels replaces the start.
+    """
+    if len(data) < LEAST_FOLLOWED:
+        return None
+    fit = resect(data, _nearby(data, start, threshold), noise, correlation=correlation)
+    found = PointFit(fit, data, _inliers(data, fit))
+    if found.share >= MAJORITY and found.fit.noise <= threshold:
+        return found
+    consensus = sample_consensus(data, torch.zeros(len(data), dtype=torch.long), threshold, seed=0)
+    if consensus is None or int(consensus.inliers.sum()) < LEAST_FOLLOWED:
+        return found
+    better = resect(data[consensus.inliers], consensus.T_world_rig, threshold / 2, correlation=correlation)
+    other = PointFit(better, data, _inliers(data, better))
+    return other if other.within(threshold) > found.within(threshold) else found
+
+
+def _inliers(data: ObservedPoints, fit: ReprojectionFit) -> Bool[Tensor, "m"]:
+    off = data.normalized_residuals(fit.T_world_rig, fit.noise)
+    return torch.linalg.vector_norm(off, dim=-1) <= INLIER
+
+
+def _nearby(data: ObservedPoints, start: SE3, threshold: float) -> SE3:
+    """Return the pose of least robust reprojection error, without its covariance: a start that costs next to nothing."""
+    focal = float(data.focal[0])
+    inverse = start.inverse()
+    pose = poselib.CameraPose()
+    pose.R, pose.t = inverse.rotation.numpy(), inverse.translation.numpy()
+    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+    options = {"loss_type": "CAUCHY", "loss_scale": threshold / 2}
+    found, _ = poselib.refine_absolute_pose(
+        np.asarray(data.image * focal), np.asarray(data.points), pose, camera, options
+    )
+    T = SE3(torch.from_numpy(np.array(found.R)), torch.from_numpy(np.array(found.t))).inverse()
+    return T.normalized() if bool(T.is_rigid()) else start

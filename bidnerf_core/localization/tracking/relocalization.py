@@ -1,0 +1,81 @@
+"""Finding the pose of a frame anew, with as little work as a lost tracker can afford."""
+
+from __future__ import annotations
+
+import time
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.acceptance import FLAT
+from bidnerf_core.localization.auto import LEAST_POINTS, MANY_LANDMARKS, AutoConfig
+from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
+from bidnerf_core.localization.localizer import Localizer
+from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization.result import Localization
+from bidnerf_core.se3 import SE3
+
+FIRST_FULL_SEARCH = 4
+"""The number of lost frames after which the whole surface is searched; then again whenever that number has doubled."""
+
+
+def relocalized(
+    localizer: Localizer, frame: Frame, predicted: SE3 | None, lost: int, patience: int, seed: int
+) -> Localization | None:
+    """Return what a search for the pose gives, or None in frames that are left out to save time.
+
+    Where the map has landmarks, they are sought in the first ``patience`` frames after a loss and then in every second. The
+    search of the whole surface, which takes longer, comes at growing intervals; it is the only one in maps without
+    landmarks. ``lost`` is the number of frames since the last accepted pose, 0 at the beginning of a sequence.
+    """
+    if is_blank(frame) and not has_points(frame):
+        return None
+    if uses_landmarks(localizer):
+        assert localizer.matcher is not None
+        if lost > patience and lost % 2:
+            return None
+        began = time.perf_counter()
+        problem = rig(localizer.map, [View(frame, SE3.identity())], None, None, localizer.matcher)
+        answer = answer_by_landmarks(problem, localizer.matcher, 0, seed)
+        found = None if answer is None else localization_by_landmarks(problem, answer, began)
+        if found is not None and found.converged:
+            return found
+        return localizer(frame, predicted, seed=seed) if _searched(localizer, frame, lost) else found
+    if lost and not _due(lost, 1):
+        return None
+    try:
+        return localizer(frame, predicted, seed=seed)
+    except InputError:
+        if lost:  # the sequence has begun, so this frame is to blame and not the map or the settings
+            return None
+        raise
+
+
+def uses_landmarks(localizer: Localizer) -> bool:
+    """Return whether the map has landmarks and the method of the localizer makes use of them."""
+    config = localizer.config
+    return localizer.matcher is not None and isinstance(config, AutoConfig) and config.landmarks
+
+
+def has_points(frame: Frame) -> bool:
+    """Return whether the frame has enough measured depth for the shape of the scene to be recognised."""
+    return frame.depth is not None and int((frame.depth > 0).sum()) >= LEAST_POINTS
+
+
+def is_blank(frame: Frame) -> bool:
+    """Return whether the image is of a single colour, as if the lens were covered, or the frame has no colours at all."""
+    return not frame.has_colour or float(frame.rgb.flatten(0, 1).std(0).max()) < FLAT
+
+
+def _searched(localizer: Localizer, frame: Frame, lost: int) -> bool:
+    """Return whether the surface is searched for a frame in which too few landmarks were recognised."""
+    assert localizer.matcher is not None
+    few = len(localizer.matcher.landmarks) < MANY_LANDMARKS  # else such an answer is not accepted
+    return (lost == 0 or _due(lost, FIRST_FULL_SEARCH)) and (
+        localizer.map.surface is not None and (has_points(frame) or few)
+    )
+
+
+def _due(lost: int, first: int) -> bool:
+    """Return whether ``lost`` is ``first`` times a power of two."""
+    times, rest = divmod(lost, first)
+    return rest == 0 and times > 0 and times & (times - 1) == 0

@@ -1,0 +1,139 @@
+"""The state of a tracker between two frames, and the file that it can be kept in."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as tensors_to_bytes
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.files import write_file
+from bidnerf_core.localization.costs.surface import PointCloud
+from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.tracking.alignment import CloudInCamera
+from bidnerf_core.localization.tracking.clock import Clock
+from bidnerf_core.localization.tracking.flow import Grey
+from bidnerf_core.localization.tracking.motion import Motion
+from bidnerf_core.localization.tracking.points import FollowedPoints
+from bidnerf_core.se3 import SE3
+
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 1
+CLOUD = ("points", "rgb", "origins", "coloured")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """All that a tracker carries from one frame to the next."""
+
+    clock: Clock
+    motion: Motion | None = None  # None before the first pose was found
+    frames: int = 0  # that the tracker has been called with
+    lost: int = 0  # consecutive frames without an accepted pose, up to the last one
+    points: FollowedPoints = field(default_factory=FollowedPoints.none)
+    image: Grey | None = None  # the last one, in which the points were seen
+    sought: int = 0  # number of points when they were last sought
+    age: int = 0  # frames since then
+    usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
+    miscalibration: Miscalibration = field(default_factory=Miscalibration.unknown)
+    noise: float = 1.0  # pixels: of the points in the last image
+    window: tuple[CloudInCamera, ...] = ()
+
+    @property
+    def tracking(self) -> bool:
+        """Whether the pose of the last frame was accepted."""
+        return self.motion is not None and self.lost == 0
+
+
+def save_state(path: Path, state: TrackerState, key: str) -> None:
+    """Write a state as safetensors, atomically; ``key`` identifies the map."""
+    numbers = {
+        "now": state.clock.now, "interval": state.clock.interval, "frames": state.frames, "lost": state.lost,
+        "sought": state.sought, "age": state.age, "usual_distance": _written(state.usual_distance),
+        "noise": state.noise, "window": len(state.window),
+        "reach": None if state.motion is None else state.motion.reach,
+    }  # fmt: skip
+    tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
+    tensors |= {
+        f"miscalibration.{f.name}": getattr(state.miscalibration, f.name) for f in fields(Miscalibration)
+    }
+    if state.image is not None:
+        tensors["image"] = torch.from_numpy(state.image)
+    if state.motion is not None:
+        tensors |= _pose_tensors("motion", state.motion.T_world_camera)
+        tensors |= {f"motion.{name}": getattr(state.motion, name) for name in ("velocity", "noise", "bias")}
+    for number, past in enumerate(state.window):
+        tensors |= _pose_tensors(f"window.{number}", past.T_world_camera)
+        tensors |= {f"window.{number}.{name}": getattr(past.cloud, name) for name in CLOUD}
+    content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": numbers}
+    metadata = {"bidnerf": json.dumps(content, allow_nan=False)}
+    write_file(
+        path,
+        tensors_to_bytes({name: value.contiguous().clone() for name, value in tensors.items()}, metadata),
+    )
+
+
+def load_tracker_state(path: Path, key: str) -> TrackerState:
+    """Read a state. Raises ``InputError`` for another file, another version, and another map than ``key``."""
+    numbers, tensors = _read(path, key)
+    try:
+        return _state(numbers, tensors)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: not a whole state of a tracker ({error}), save it anew") from error
+
+
+def _read(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            found = json.loads((file.metadata() or {}).get("bidnerf", "null"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, ValueError, SafetensorError) as error:
+        raise InputError(
+            f"{path}: not readable ({error}), expected a file that Tracker.save wrote"
+        ) from error
+    if not isinstance(found, dict) or found.get("format") != STATE_FORMAT:
+        raise InputError(f"{path}: not the state of a tracker, expected a file that Tracker.save wrote")
+    if found.get("version") != STATE_VERSION:
+        raise InputError(f"{path}: version {found.get('version')!r}, expected {STATE_VERSION}")
+    if found.get("map") != key:
+        raise InputError(f"{path}: belongs to map {found.get('map')!r}, the tracker's is {key!r}")
+    return found["state"], tensors
+
+
+def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
+    motion = None
+    if numbers["reach"] is not None:
+        velocity, noise, bias = (tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias"))
+        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers["reach"])
+    window = tuple(
+        CloudInCamera(
+            PointCloud(*(tensors[f"window.{number}.{name}"] for name in CLOUD)),
+            _pose(f"window.{number}", tensors),
+        )
+        for number in range(numbers["window"])
+    )
+    points = FollowedPoints(*(tensors[f"points.{f.name}"] for f in fields(FollowedPoints)))
+    usual = numbers["usual_distance"]
+    miscalibration = Miscalibration(*(tensors[f"miscalibration.{f.name}"] for f in fields(Miscalibration)))
+    return TrackerState(
+        Clock(numbers["now"], numbers["interval"]), motion, numbers["frames"], numbers["lost"], points,
+        tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
+        float("inf") if usual is None else usual, miscalibration, numbers["noise"], window,
+    )  # fmt: skip
+
+
+def _written(number: float) -> float | None:
+    return None if number == float("inf") else number
+
+
+def _pose_tensors(name: str, T: SE3) -> dict[str, Tensor]:
+    return {f"{name}.rotation": T.rotation, f"{name}.translation": T.translation}
+
+
+def _pose(name: str, tensors: dict[str, Tensor]) -> SE3:
+    return SE3(tensors[f"{name}.rotation"], tensors[f"{name}.translation"])

@@ -1,0 +1,76 @@
+"""Corrections of a camera's intrinsics, and how uncertain intrinsics are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A correction of given intrinsics: what is estimated of the camera along with its pose."""
+
+    log_focal: float = 0.0  # logarithm of the true over the given focal length
+    shift_u: float = 0.0  # of the principal point, as a share of the given focal length
+    shift_v: float = 0.0
+    radial: float = 0.0  # first coefficient of radial distortion, added to the given distortion
+
+    @property
+    def focal_factor(self) -> float:
+        """True over given focal length."""
+        return math.exp(self.log_focal)
+
+    def applied(self, given: Intrinsics) -> Intrinsics:
+        """Return the corrected intrinsics."""
+        k1, *others = given.distortion or (0.0, 0.0, 0.0, 0.0)
+        factor = self.focal_factor
+        return replace(
+            given, fx=given.fx * factor, fy=given.fy * factor, cx=given.cx + self.shift_u * given.fx,
+            cy=given.cy + self.shift_v * given.fy, distortion=(k1 + self.radial, *others),
+        )  # fmt: skip
+
+    def pixels(self, flat: Float[Tensor, "m 2"], focal: float) -> Float[Tensor, "m 2"]:
+        """Return where points on the plane z = 1 appear, in pixels from the given principal point, by the given focal length."""
+        bent = flat * (1 + self.radial * flat.square().sum(-1, keepdim=True))
+        shift = torch.tensor([self.shift_u, self.shift_v], dtype=flat.dtype)
+        return (bent * self.focal_factor + shift) * focal
+
+    def undistorted(self, image: Float[Tensor, "m 2"], focal: Float[Tensor, "m"]) -> Float[Tensor, "m 2"]:
+        """Return corrected observations on the plane z = 1, for observations made with the given intrinsics."""
+        seen = (image - torch.tensor([self.shift_u, self.shift_v], dtype=image.dtype)) / self.focal_factor
+        flat = seen
+        for _ in range(8):  # fixed-point iteration as in OpenCV's undistortPoints
+            flat = seen / (1 + self.radial * flat.square().sum(-1, keepdim=True))
+        return flat
+
+
+GIVEN = Calibration()
+"""Intrinsics as they are given."""
+
+
+@dataclass(frozen=True)
+class CalibrationPrior:
+    """Standard deviations of given intrinsics, in the units of ``Calibration``; a parameter with 0 is not estimated."""
+
+    log_focal: float = 0.0
+    shift: float = 0.0
+    radial: float = 0.0
+
+    @property
+    def deviations(self) -> Float[Tensor, "4"]:
+        """The standard deviations in the order of the fields of ``Calibration``."""
+        return torch.tensor([self.log_focal, self.shift, self.shift, self.radial], dtype=torch.float64)
+
+
+FIXED = CalibrationPrior()
+"""Intrinsics that are not estimated."""
+CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002)
+"""Intrinsics from a good calibration."""
+NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
+"""Intrinsics from EXIF or a field of view, without distortion."""

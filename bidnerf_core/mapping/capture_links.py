@@ -1,0 +1,37 @@
+"""Which photos of a capture show the same, by the landmarks that they share."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
+
+LINK = 5
+"""Least number of shared landmarks that links two photos. Photos of different places share one by chance, seldom two: a match
+has to lie on the epipolar line, stand out from all others, and agree on a point in front of both cameras.
+"""
+LEAST_GROUP = 3
+"""Least number of linked photos that make a group."""
+
+
+def linked(seen: TrackedKeypoints) -> Bool[Tensor, "v v"]:
+    """Return which images share enough landmarks. ``seen`` are the keypoints that agree on their points."""
+    shape = (len(seen.images), max(1, seen.count))
+    ones = np.ones(len(seen.point), np.int32)
+    shows = csr_array((ones, (seen.image.numpy(), seen.point.numpy())), shape=shape)
+    shared = torch.from_numpy((shows @ shows.T).toarray())
+    return (shared >= LINK).fill_diagonal_(False)
+
+
+def groups(links: Bool[Tensor, "v v"]) -> Int[Tensor, "v"]:
+    """Return the group of each image, 0 for the largest; -1 where too few images are linked to make one."""
+    _, found = connected_components(csr_array(links.numpy()), directed=False)
+    label = torch.from_numpy(found).long()
+    sizes = torch.bincount(label)
+    rank = sizes.argsort(descending=True, stable=True).argsort()
+    return torch.where(sizes >= LEAST_GROUP, rank, -1)[label]

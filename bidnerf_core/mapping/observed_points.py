@@ -1,0 +1,72 @@
+"""Points of the world and where the cameras of a rig observed them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.mapping.calibration import Calibration
+from bidnerf_core.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedPoints:
+    """Points of the world and their observations by the cameras of a rig. Float64."""
+
+    points: Float[Tensor, "m 3"]  # metres, world
+    deviations: Float[Tensor, "m 2"]  # metres, of the points, across and along ``directions``
+    directions: Float[Tensor, "m 3"]  # unit, world
+    image: Float[Tensor, "m 2"]  # observed, on the plane z = 1 of the camera
+    focal: Float[Tensor, "m"]  # pixels
+    depth: Float[Tensor, "m"]  # metres, 0 where none was measured
+    rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
+    translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: Tensor) -> ObservedPoints:
+        return ObservedPoints(*(getattr(self, name)[index] for name in (f.name for f in fields(self))))
+
+    def corrected(self, calibration: Calibration) -> ObservedPoints:
+        """Return the same pixels as observations of cameras whose calibration is corrected."""
+        undistorted = calibration.undistorted(self.image, self.focal)
+        return replace(self, image=undistorted, focal=self.focal * calibration.focal_factor)
+
+    def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
+        """Return each point in the frame of the camera that observed it."""
+        rig = T_world_rig.inverse().apply(self.points)
+        return (self.rotation @ rig[..., None])[..., 0] + self.translation
+
+    def residuals(self, T_world_rig: SE3) -> Float[Tensor, "m 2"]:
+        """Return projection minus observation, pixels; infinite for points behind the camera."""
+        local = self.in_camera(T_world_rig)
+        z = local[:, 2:]
+        off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
+        return torch.where(z > 0, off, torch.inf)
+
+    def normalized_residuals(self, T_world_rig: SE3, noise: float) -> Float[Tensor, "m 2"]:
+        """Return the residuals in standard deviations, which combine the keypoints' ``noise`` (pixels) with the points'."""
+        deviation = (noise**2 + self.point_variance(T_world_rig)).sqrt()
+        return self.residuals(T_world_rig) / deviation[:, None]
+
+    def point_variance(self, T_world_rig: SE3) -> Float[Tensor, "m"]:
+        """Return the variance (square pixels) that the points' own errors add to each residual, averaged over both axes.
+
+        Along the axis perpendicular to both the line of sight and ``directions``, this is the point's variance across. Along the
+        other axis it is a mixture of the variances across and along, by the squared cosine and sine of the angle between the
+        line of sight and ``directions``.
+        """
+        rig = T_world_rig.inverse().apply(self.points)
+        local = (self.rotation @ rig[..., None])[..., 0] + self.translation
+        centres = T_world_rig.apply(-(self.rotation.mT @ self.translation[..., None])[..., 0])
+        sight = self.points - centres
+        cosine = (sight * self.directions).sum(-1) / torch.linalg.vector_norm(sight, dim=-1).clamp(min=1e-12)
+        across, along = self.deviations.square().unbind(-1)
+        seen = cosine.square().clamp(max=1)
+        metres = (across * (1 + seen) + along * (1 - seen)) / 2
+        z = torch.where(local[:, 2] > 1e-9, local[:, 2], 1)
+        return metres * (self.focal / z).square()

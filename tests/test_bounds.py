@@ -1,0 +1,92 @@
+"""Which scenes are contracted, and the bounds that landmarks give where images have colour only."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
+from landmark_scene import Points, ring
+
+CAMERA = Intrinsics(60.0, 60.0, 32.0, 24.0, 64, 48)
+
+
+def wall(measured_rows: int) -> View:
+    """A wall three metres away, whose depth was measured in the upper rows of 48."""
+    depth = torch.zeros(48, 64)
+    depth[:measured_rows] = 3.0
+    return View(Frame("wall", torch.zeros(48, 64, 3), CAMERA, depth), SE3.identity())
+
+
+def captured() -> list[View]:
+    """Views of the landmark scene with the landmarks that they see."""
+    points = Points()
+    views = ring(points)
+    seen = tracked_views(views, points).seen(LandmarkConfig())
+    return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
+
+
+@pytest.mark.parametrize(("rows", "contracted"), [(48, False), (30, False), (1, True)])
+def test_a_scene_is_contracted_unless_a_sensor_measured_its_depth(rows: int, contracted: bool) -> None:
+    assert estimate_bounds([wall(rows)]).contracted == contracted
+
+
+def test_half_of_the_views_may_lack_depth() -> None:
+    assert not estimate_bounds([wall(48), wall(0)]).contracted
+    assert estimate_bounds([wall(48), wall(0), wall(0)]).contracted
+
+
+def test_silhouettes_leave_nothing_beyond_the_box() -> None:
+    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views()]
+    assert not estimate_bounds(bare).contracted
+    opaque = [replace(view, frame=replace(view.frame, alpha=None)) for view in bare]
+    assert estimate_bounds(opaque).contracted
+
+
+def test_matter_beyond_the_box_is_within_reach() -> None:
+    closed, opened = estimate_bounds([wall(48)]), estimate_bounds([wall(1)])
+    assert opened.far > 1.5 * closed.far
+
+
+def test_landmarks_give_a_box_around_most_of_them() -> None:
+    """The points of the scene lie in the cube [-1, 1]: 90 % of each axis is 1.8 long."""
+    views = captured()
+    bounds = estimate_bounds(views)
+    assert bounds.contracted
+    assert all(1.6 < size < 2.0 for size in bounds.size)
+    assert max(abs(middle) for middle in bounds.centre) < 0.1
+    distances = torch.cat([view.landmarks.distance for view in views if view.landmarks is not None])
+    assert 0.4 * float(distances.min()) < bounds.near < float(distances.min())
+    assert bounds.far > 1.5 * float(distances.max())
+
+
+def test_bounds_by_landmarks_have_no_unit() -> None:
+    views = captured()
+    here = estimate_bounds(views)
+    there = estimate_bounds([_larger(view, 50.0) for view in views])
+    assert there.near == pytest.approx(50 * here.near, rel=1e-4)
+    assert there.far == pytest.approx(50 * here.far, rel=1e-4)
+    assert there.lower == pytest.approx([50 * x for x in here.lower], rel=1e-4)
+    assert there.upper == pytest.approx([50 * x for x in here.upper], rel=1e-4)
+
+
+def test_a_few_landmarks_give_no_box() -> None:
+    few = [
+        replace(
+            view, landmarks=replace(view.landmarks, **{k: v[:3] for k, v in vars(view.landmarks).items()})
+        )
+        for view in captured()
+        if view.landmarks is not None
+    ]
+    bare = [replace(view, landmarks=None) for view in few]
+    assert estimate_bounds(few) == estimate_bounds(bare)
+
+
+def _larger(view: View, scale: float) -> View:
+    seen, T = view.landmarks, view.T_ref_camera
+    assert seen is not None
+    seen = replace(seen, distance=scale * seen.distance, deviation=scale * seen.deviation)
+    return replace(view, landmarks=seen, T_ref_camera=SE3(T.rotation, scale * T.translation))

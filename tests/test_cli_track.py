@@ -1,0 +1,198 @@
+"""``bidnerf track``: files of poses, the summary, frames as they come, and interruptions."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bidnerf_core.cli.following as following
+import bidnerf_core.cli.track as track_module
+from bidnerf_core import InputError, Tracker, View
+from bidnerf_core.cli.following import FrameRequest, requests
+from bidnerf_core.datasets import open_dataset, write_transforms
+from bidnerf_core.datasets.trajectories import read_trajectory
+from commands import Run
+from flights import covered, flight
+from textured_field import CAMERA, MapWithLandmarks, textured_map
+
+FRAMES = 6
+
+
+@dataclass(frozen=True, eq=False)
+class StoredGround(MapWithLandmarks):
+    """The textured ground with the description that stored maps have."""
+
+    @property
+    def info(self) -> Any:
+        return SimpleNamespace(backend="ground", weights="ground")
+
+
+@pytest.fixture(autouse=True)
+def stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = textured_map(surface=True)
+    ground = StoredGround(known.field, known.bounds, known.landmarks, known.surface)
+    monkeypatch.setattr(track_module, "load_map", lambda folder: ground)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six frames, of which the fourth was taken with the lens cap on."""
+    folder = tmp_path_factory.mktemp("track") / "data"
+    frames = [(covered(f) if n == 3 else f, T) for n, (_, f, T) in enumerate(flight()[:FRAMES])]
+    write_transforms(folder, {"test": [View(frame, T) for frame, T in frames]}, (0.0, 0.0, 0.0))
+    return folder
+
+
+def test_accepted_poses_are_written_as_a_trajectory(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    status, out, err = bidnerf("track", "MAP", data, "--out", tmp_path / "path.txt")
+    assert status == 0, err
+    path = read_trajectory(tmp_path / "path.txt")
+    assert path.times.tolist() == [0, 1, 2, 4, 5]
+    truth = [T for _, _, T in flight()[:FRAMES]]
+    for place, number in enumerate((0, 1, 2, 4, 5)):
+        assert float((path.translations[place] - truth[number].translation).norm()) < 0.045
+    for word in ("frames", "tracked", "raw error", "ATE", "RPE", "inside 95 % bound"):
+        assert word in out
+    assert "5 (83.3%)" in out
+    assert "tracking again after 1 frame" in err
+
+
+def test_json_holds_all_frames(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    assert bidnerf("track", "MAP", data, "--out", tmp_path / "path.json", "--no-depth").status == 0
+    found = json.loads((tmp_path / "path.json").read_text())
+    assert [row["converged"] for row in found] == [True, True, True, False, True, True]
+    assert {"frame", "time", "T_world_camera", "covariance", "outcome", "reason", "error"} <= found[3].keys()
+    assert found[0]["method"] == "track"
+
+
+def test_a_dataset_of_poses_can_be_read_again(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    out = data / "found_transforms.json"
+    assert bidnerf("track", "MAP", data, "--out", out, "--every", 2).status == 0
+    assert len(json.loads(out.read_text())["frames"]) == 3
+    out.unlink()
+    assert len(open_dataset(data).frame_names("test")) == FRAMES
+
+
+def test_the_path_is_drawn(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    status, _, err = bidnerf("track", "MAP", data, "--out", tmp_path / "p.txt", "--plot", tmp_path / "p.png")
+    assert status == 0, err
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (["--out", "path.doc"], 2, "path.doc"),
+        (["--out", "nowhere/path.txt"], 1, "no folder nowhere"),
+        ([], 2, "no --out"),
+        (["--out", "path.txt", "--every", "0"], 2, "--every is 0"),
+        (["--out", "path.txt", "--window", "0"], 2, "window"),
+    ],
+)
+def test_wrong_options_are_refused_before_any_work(
+    bidnerf: Run, data: Path, words: list[str], status: int, message: str
+) -> None:
+    found = bidnerf("track", "MAP", data, *words)
+    assert found.status == status
+    assert message in found.err + found.out
+    assert "Traceback" not in found.err
+
+
+def test_an_interrupted_run_keeps_what_it_has(
+    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = list[int]()
+    step = Tracker.__call__
+
+    def stopped(self: Tracker, *arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) > 2:
+            raise KeyboardInterrupt
+        return step(self, *arguments)
+
+    monkeypatch.setattr(Tracker, "__call__", stopped)
+    status, _, err = bidnerf("track", "MAP", data, "--out", tmp_path / "path.txt")
+    assert status == 130
+    assert "interrupted" in err
+    assert len(read_trajectory(tmp_path / "path.txt")) == 2
+
+
+# Frames as they come.
+
+
+def lines(data: Path) -> list[dict[str, Any]]:
+    written = json.loads((data / "transforms_test.json").read_text())
+    unit = (written | written["frames"][0])["depth_unit_scale_factor"]
+    photos, depths = (sorted((data / kind).rglob("*.png")) for kind in ("images", "depth"))
+    return [
+        {"image": str(photo), "depth": str(depth), "time": 0.1 * n, "depth_unit": unit}
+        for n, (photo, depth) in enumerate(zip(photos, depths, strict=True))
+    ]
+
+
+def test_lines_of_stdin_are_answered_one_by_one(
+    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [json.dumps(line) for line in lines(data)]
+    given[1:1] = ["no json", "", '{"image": "missing.png"}']
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(given) + "\n"))
+    words = ("track", "MAP", "-", "--follow", "--focal", CAMERA.fx, "--out", tmp_path / "path.tum")
+    status, out, err = bidnerf(*words)
+    assert status == 0, err
+    found = [json.loads(line) for line in out.splitlines()]
+    assert [row["outcome"] for row in found][1:3] == ["bad input"] * 2
+    assert "missing.png" in found[2]["reason"]
+    good = [row for row in found if row["outcome"] != "bad input"]
+    assert [row["converged"] for row in good] == [True, True, True, False, True, True]
+    assert [row["time"] for row in good] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
+    assert read_trajectory(tmp_path / "path.tum").times.tolist() == pytest.approx([0, 0.1, 0.2, 0.4, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("{", "not JSON"),
+        ("[1]", "image"),
+        ('{"image": 3}', "image"),
+        ('{"image": "a", "depth": 1}', "depth"),
+        ('{"image": "a", "time": "now"}', "time"),
+        ('{"image": "a", "time": NaN}', "time"),
+        ('{"image": "a", "times": 1}', "times"),
+    ],
+)
+def test_lines_that_are_no_requests(line: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        FrameRequest.parse(line)
+
+
+def test_a_folder_is_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An image is given once, when its size no longer changes, in the order of names."""
+    import imageio.v3 as iio
+
+    monkeypatch.setattr(following, "POLL", 0.0)
+    image = np.zeros((4, 4, 3), dtype=np.uint8)
+    for name in ("2.png", "10.png"):
+        iio.imwrite(tmp_path / name, image)
+    arriving = requests(str(tmp_path))
+    found = [next(arriving) for _ in range(2)]
+    iio.imwrite(tmp_path / "11.png", image)
+    began = time.monotonic()
+    found.append(next(arriving))
+    assert time.monotonic() - began < 60
+    assert [r.image.name for r in found if isinstance(r, FrameRequest)] == ["2.png", "10.png", "11.png"]
+
+
+def test_a_folder_that_is_not_there_is_refused(bidnerf: Run, tmp_path: Path) -> None:
+    status, _, err = bidnerf("track", "MAP", tmp_path / "none", "--follow", "--hfov", 60)
+    assert status == 1
+    assert "no such folder" in err

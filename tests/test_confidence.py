@@ -1,0 +1,91 @@
+"""Confidence: the logistic model, its features, and how it enters the verdict."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from bidnerf_core.localization import confidence
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.result import Outcome, Verdict
+
+GOOD = LandmarkDiagnostics(
+    inliers=300, matches=400, agreeing=350, log10_nfa=-300.0, chance=4.0, visible=900, keypoints=1500, spread=0.7,
+    noise_ratio=1.0, miscalibration=0.02, precision=0.003, estimated_calibration=False, searched=True,
+)  # fmt: skip
+FINE = Verdict(Outcome.CONVERGED, "fine")
+
+
+@pytest.fixture(scope="module")
+def learning() -> ModuleType:
+    path = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
+    spec = importlib.util.spec_from_file_location("confidence_benchmark", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_good_pose_by_landmarks_is_accepted_and_a_poor_one_is_not() -> None:
+    poor = replace(GOOD, inliers=16, agreeing=8, chance=5.0, noise_ratio=4.0, precision=0.02, spread=0.1)
+    good, bad = (confidence.judged(FINE, d) for d in (GOOD, poor))
+    assert good.verdict is FINE
+    assert bad.verdict.outcome is Outcome.UNCERTAIN
+    assert "probability" in bad.verdict.reason
+    assert good.confidence is not None
+    assert bad.confidence is not None
+    assert 0 <= bad.confidence < confidence.ACCEPTED <= good.confidence <= 1
+
+
+def test_a_rejection_stays_what_it_is() -> None:
+    no = Verdict(Outcome.TOO_FEW_MATCHES, "no")
+    assert confidence.judged(no, GOOD).verdict is no
+
+
+def test_every_stored_weight_belongs_to_a_feature() -> None:
+    surface = SurfaceDiagnostics(0.9, 0.5, 0.0, 0.3)
+    known = {
+        "landmarks": confidence.landmark_features(GOOD),
+        "surface": confidence.surface_features(surface),
+    }
+    assert "landmarks" in confidence.models()
+    for name, model in confidence.models().items():
+        assert set(model.features) == set(known[name])
+        assert np.isfinite(model.weights).all()
+
+
+def test_features_are_finite_at_the_extremes() -> None:
+    nothing = LandmarkDiagnostics(0, 0, 0, 0.0, 0.0, 0, 0, 0.0, 0.0, 1.0, float("inf"), False, False)
+    assert np.isfinite(list(confidence.landmark_features(nothing).values())).all()
+    surface = SurfaceDiagnostics(0.0, 0.0, 1.0, float("inf"), 0.0)
+    assert np.isfinite(list(confidence.surface_features(surface).values())).all()
+
+
+def test_probability_is_the_logistic_function() -> None:
+    model = confidence.LogisticModel(("a", "b"), (2.0, -1.0), 0.5)
+    assert model.probability({"a": 1.0, "b": 3.0}) == pytest.approx(1 / (1 + np.exp(0.5)))
+    assert model.probability({"a": 1e6, "b": 0.0}) == 1.0
+
+
+def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:
+    """Examples drawn from a known model give its probabilities back, but for what the ridge shrinks."""
+    random = np.random.default_rng(0)
+    true = confidence.LogisticModel(("a", "b"), (2.0, -1.0), 0.3)
+    given = []
+    for number in range(4000):
+        features = dict(zip("ab", random.normal(size=2).tolist(), strict=True))
+        right = bool(random.random() < true.probability(features))
+        given.append(learning.Example("landmarks", features, right, str(number % 2), str(number % 4)))
+    found = learning.fitted(given, ridge=1e-5)
+    for values in ({"a": 1.0, "b": 0.0}, {"a": -1.0, "b": 1.0}):
+        assert found.probability(values) == pytest.approx(true.probability(values), abs=0.06)
+    said = learning.cross_validated(given, by_fault=True)["all"]
+    assert said["expected_calibration_error"] < 0.1

@@ -1,0 +1,108 @@
+"""Resection: derivatives, what it recovers, and how certain it is of that."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import approx_fprime
+
+from bidnerf_core import SE3, Intrinsics
+from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
+from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.resection import _Residuals, _State, resect
+
+TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
+FOCAL = 400.0
+
+
+def observed(
+    count: int = 200, calibration: Calibration = GIVEN, noise: float = 0.0, seed: int = 0
+) -> ObservedPoints:
+    """Points two to six metres before a camera whose given intrinsics lack ``calibration``."""
+    random = torch.Generator().manual_seed(seed)
+    flat = (torch.rand((count, 2), generator=random, dtype=torch.float64) - 0.5) * 1.2
+    z = 2 + 4 * torch.rand((count, 1), generator=random, dtype=torch.float64)
+    points = TRUE.apply(torch.cat([flat * z, z], dim=-1))
+    pixels = calibration.pixels(flat, FOCAL)
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=random, dtype=torch.float64)
+    nothing = torch.zeros((count, 3), dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
+    focal = torch.full((count,), FOCAL, dtype=torch.float64)
+    along = nothing + torch.tensor([0.0, 0.0, 1.0])
+    return ObservedPoints(points, nothing[:, :2], along, pixels / FOCAL, focal, nothing[:, 0], eye, nothing)
+
+
+def error(T: SE3) -> float:
+    return float((T.inverse() @ TRUE).log().norm())
+
+
+NEAR = TRUE.retract(torch.full((6,), 0.03, dtype=torch.float64))
+WRONG = Calibration(0.05, 0.01, -0.02, 0.03)
+
+
+def test_the_gradient_is_the_numerical_one() -> None:
+    data, free = observed(noise=1.0), np.arange(4)
+    residuals = _Residuals(data, NEAR)
+    state = _State.of(NEAR, WRONG)
+
+    def cost(step: np.ndarray) -> float:
+        return residuals(state.retracted(step, free), 0.7, free).cost
+
+    numerical = approx_fprime(np.zeros(10), cost, 1e-7)
+    np.testing.assert_allclose(residuals(state, 0.7, free).gradient, numerical, rtol=2e-3, atol=1e-2)
+
+
+def test_exact_observations_give_the_exact_pose() -> None:
+    assert error(resect(observed(), NEAR, 1.0).T_world_rig) < 1e-9
+
+
+def test_a_wrong_calibration_is_found_where_it_is_open() -> None:
+    data = observed(calibration=WRONG)
+    found = resect(data, NEAR, 2.0, NOMINAL)
+    assert astuple(found.calibration) == pytest.approx(astuple(WRONG), abs=2e-3)
+    assert error(found.T_world_rig) < 5e-3
+    assert error(resect(data, NEAR, 2.0, FIXED).T_world_rig) > 0.05
+
+
+def test_corrected_observations_are_those_of_the_true_camera() -> None:
+    corrected = observed(calibration=WRONG).corrected(WRONG)
+    assert float(corrected.residuals(TRUE).abs().max()) < 1e-5
+
+
+def test_applied_intrinsics_project_as_the_calibration_does() -> None:
+    given = Intrinsics(FOCAL, FOCAL, 320.0, 240.0, 640, 480)
+    flat = torch.tensor([[0.3, -0.2], [-0.5, 0.4]], dtype=torch.float64)
+    points = torch.cat([flat, torch.ones(2, 1, dtype=torch.float64)], dim=-1)
+    expected = WRONG.pixels(flat, FOCAL) + torch.tensor([320.0, 240.0])
+    torch.testing.assert_close(WRONG.applied(given).project(points), expected)
+
+
+def test_the_covariance_is_that_of_many_trials_and_scales_with_correlation() -> None:
+    squared = []
+    for seed in range(60):
+        fit = resect(observed(noise=0.5, seed=seed), TRUE, 1.0)
+        update = (fit.T_world_rig.inverse() @ TRUE).log()
+        squared.append(float(update @ torch.linalg.solve(fit.covariance, update)))
+    assert 4.5 < np.mean(squared) < 8  # of six degrees of freedom: 6
+    data = observed(noise=0.5)
+    one, four = (resect(data, TRUE, 1.0, correlation=c).covariance for c in (1.0, 4.0))
+    torch.testing.assert_close(four, 4 * one)
+
+
+def test_the_slope_is_how_the_pose_follows_the_calibration() -> None:
+    data, step = observed(), 1e-4
+    slope = resect(data, TRUE, 1.0).slope
+    for i, name in enumerate(("log_focal", "shift_u", "shift_v", "radial")):
+        moved = resect(data, TRUE, 0.05, calibration=replace(GIVEN, **{name: step})).T_world_rig
+        update = (TRUE.inverse() @ moved).log() / step
+        torch.testing.assert_close(slope[:, i], update, rtol=0.05, atol=0.02)
+
+
+def test_outliers_do_not_move_the_pose() -> None:
+    data = observed(noise=0.2)
+    image = data.image.clone()
+    image[::4] += 0.1  # 40 pixels
+    assert error(resect(replace(data, image=image), NEAR, 2.0).T_world_rig) < 2e-3

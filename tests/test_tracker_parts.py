@@ -1,0 +1,154 @@
+"""Ways to measure a frame beside followed landmarks: colour alone, depth alone, depth beside landmarks, and odometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bidnerf_core import SE3, Frame, Localizer, Outcome, Tracker
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.localization import AutoConfig
+from bidnerf_core.localization.costs.prior import GaussianPrior
+from bidnerf_core.localization.costs.surface import PointScales, SurfaceCost
+from bidnerf_core.localization.covariance import FINEST
+from bidnerf_core.localization.normal_equations import Scaled, Sum
+from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.localization.tracking.alignment import (
+    DEPTH_MEASUREMENTS,
+    aligned,
+    fused_with_surface,
+    measured_cloud,
+)
+from bidnerf_core.localization.tracking.measuring import followed
+from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
+from bidnerf_core.localization.tracking.odometry import LEAST_CORNERS, Odometry
+from bidnerf_core.localization.tracking.points import FollowedPoints
+from bidnerf_core.localization.tracking.state import TrackerState
+from bidnerf_core.mapping.features import grey_image
+from flights import INTERVAL, assert_right, flight, flight_pose, localizer, tracked, without_depth
+from textured_field import textured_map
+
+NEAR = torch.tensor([0.01, -0.01, 0.01, 0.01, 0.01, -0.02], dtype=torch.float64)
+
+
+def covariance(translation: float, rotation: float) -> torch.Tensor:
+    return torch.diag(torch.tensor([translation] * 3 + [rotation] * 3, dtype=torch.float64) ** 2)
+
+
+def at(T: SE3) -> Motion:
+    """Return a camera at ``T``, known to a millimetre, that is about a metre from what it sees."""
+    return Motion.at(PoseEstimate(T, covariance(1e-3, 1e-3), covariance(1e-3, 1e-3)), 1.5)
+
+
+def depth_only(frame: Frame) -> Frame:
+    return replace(frame, rgb=torch.zeros_like(frame.rgb), has_colour=False)
+
+
+def test_an_image_without_depth_is_tracked_by_colour_in_a_map_without_landmarks() -> None:
+    bare = replace(textured_map(), landmarks=None)
+    start = flight_pose(0).retract(NEAR)
+    frames = [(t, without_depth(frame), T) for t, frame, T in flight()[:1]]
+    tracker = Tracker(Localizer(bare, config=AutoConfig(landmarks=False)), start=start)
+    answers = tracked(frames, tracker)
+    assert_right(answers, frames)
+    assert float(pose_error(answers[0].T_world_camera, flight_pose(0)).translation) < 0.01
+
+
+def test_frames_without_colours_are_bridged() -> None:
+    """Shape alone fits a corridor anywhere along it, so it confirms no pose; the next photo does."""
+    frames = flight()[:6]
+    frames = [(t, depth_only(f) if n in (3, 4) else f, T) for n, (t, f, T) in enumerate(frames)]
+    answers = tracked(frames, Tracker(localizer()))
+    assert_right(answers[:3] + answers[5:], frames[:3] + frames[5:])
+    for answer, (_, _, truth) in zip(answers[3:5], frames[3:5], strict=True):
+        assert answer.outcome is Outcome.UNDETERMINED
+        assert "no colours" in answer.reason
+        assert float(pose_error(answer.T_world_camera, truth).translation) < 0.1
+
+
+def test_a_frame_without_colours_and_depth_is_reported() -> None:
+    tracker = Tracker(localizer())
+    tracked(flight()[:2], tracker)
+    blind = without_depth(depth_only(flight()[2][1]))
+    answer = tracker(blind, flight()[2][0])
+    assert answer.outcome is Outcome.TOO_FEW_MATCHES
+    assert_right(tracked(flight()[3:5], tracker), flight()[3:5])
+
+
+def test_odometry_finds_the_motion_between_two_frames_without_a_map() -> None:
+    (_, first, T_first), (_, second, T_second) = flight()[0], flight()[1]
+    odometry, before, now = Odometry(100), grey_image(first.rgb), grey_image(second.rgb)
+    corners = odometry.replenished(first, before, FollowedPoints.none(), T_first)
+    state = TrackerState(Tracker(localizer())._state.clock, points=corners, image=before)
+    seen = followed(state, now, second, T_first)
+    moved = odometry.moved(second, seen, at(T_first), T_first, INTERVAL)
+    assert moved is not None
+    motion, agreeing = moved
+    error = pose_error(motion.T_world_camera, T_second)
+    assert float(error.translation) < 0.02
+    assert float(error.rotation_deg) < 0.8
+    assert len(agreeing) >= LEAST_CORNERS
+    truth = (T_first.inverse() @ T_second).log() / INTERVAL
+    assert torch.allclose(motion.velocity, truth, atol=0.2)
+    assert float(motion.covariance.diagonal().sum()) > float(at(T_first).covariance.diagonal().sum())
+
+
+def test_odometry_refuses_corners_that_contradict_each_other() -> None:
+    (_, first, T_first), (_, second, _) = flight()[0], flight()[1]
+    odometry = Odometry(100)
+    corners = odometry.replenished(first, grey_image(first.rgb), FollowedPoints.none(), T_first)
+    order = torch.randperm(len(corners), generator=torch.Generator().manual_seed(0))
+    shuffled = replace(corners, pixels=corners.pixels[order])
+    assert odometry.moved(second, shuffled, at(T_first), T_first, INTERVAL) is None
+
+
+def test_corners_without_measured_depth_are_left_out() -> None:
+    _, frame, T = flight()[0]
+    odometry, image = Odometry(100), grey_image(frame.rgb)
+    none = FollowedPoints.none()
+    assert len(odometry.replenished(without_depth(frame), image, none, T)) == 0
+    half = frame.depth.clone() if frame.depth is not None else torch.zeros(0)
+    half[:, : half.shape[1] // 2] = 0
+    corners = odometry.replenished(replace(frame, depth=half), image, none, T)
+    assert len(corners) > 0
+    assert float(corners.pixels[:, 0].min()) >= half.shape[1] // 2 - 1
+
+
+@pytest.mark.parametrize("steps", [3, 6])
+def test_fusing_with_depth_minimizes_the_sum_of_prior_and_surface(steps: int) -> None:
+    """The general solver on both costs is the oracle; few steps suffice from a pose that is nearly right."""
+    _, frame, truth = flight()[2]
+    surface = textured_map(surface=True).surface
+    assert surface is not None
+    cloud = measured_cloud(frame, 400, 1.0, torch.Generator().manual_seed(0))
+    start = PoseEstimate(truth.retract(0.3 * NEAR), covariance(0.01, 0.01), covariance(0.004, 0.004))
+    fused = fused_with_surface(start, surface, cloud, steps)
+    cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
+    variance = float(cost.residual_variance(start.T_world_camera[None])[0])
+    prior = GaussianPrior(start.T_world_camera, start.covariance, cloud.pivot)
+    both = Sum((prior, Scaled(cost, DEPTH_MEASUREMENTS / variance)))
+    best = descend(both, start.T_world_camera[None], 20, cloud.pivot.moved).T[0]
+    off = pose_error(fused.T_world_camera, best)
+    assert float(off.translation) < 1e-3
+    assert float(off.rotation_deg) < 0.05
+    smaller = torch.linalg.eigvalsh(start.covariance - fused.covariance)
+    assert float(smaller[0]) > -1e-12
+    assert bool((torch.linalg.eigvalsh(fused.noise) > 0).all())
+    assert bool((torch.linalg.eigvalsh(fused.bias) > 0).all())
+
+
+def test_depth_alone_is_aligned_from_a_prediction_that_is_off() -> None:
+    """A prediction is off by a few centimetres and degrees."""
+    _, frame, truth = flight()[2]
+    surface = textured_map(surface=True).surface
+    assert surface is not None
+    cloud = measured_cloud(depth_only(frame), 400, 1.0, torch.Generator().manual_seed(0))
+    assert not bool(cloud.coloured.any())
+    predicted = truth.retract(3 * NEAR)
+    found = aligned(surface, cloud, predicted, covariance(0.05, 0.05), 0.1)
+    before, after = pose_error(predicted, truth), pose_error(found.T_world_camera, truth)
+    assert float(after.rotation_deg) < 0.5 * float(before.rotation_deg)
+    assert float(after.translation) < 0.3 * float(before.translation)
+    assert found.diagnostics.verdict().accepted
