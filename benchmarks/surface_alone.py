@@ -1,10 +1,11 @@
 r"""What method ``auto`` finds by measured depth on the baked surface alone, and what the surface costs.
 
-    python benchmarks/surface_alone.py MAP:DATA [MAP:DATA ...] --bake --name surface_alone
+    python benchmarks/surface_alone.py MAP:DATA [MAP:DATA ...]
 
-No start is given, landmarks are not used. Each map is tried with the surface that it has and, with ``--bake``, with one
-baked anew from the dataset's training views. Frames whose index in the test split is 1 modulo 5 are left out, since settings were tuned on them;
-``--tuning-frames`` takes those only. One process of one thread.
+No start is given, landmarks are not used. Each frame is tried with the surface that the map has (before) and with one baked
+anew from the dataset's training views (after), in turns; to compare two versions, bake the map's surface with the older.
+Frames whose index in the test split is 1 modulo 5 are left out, since settings were tuned on them; ``--tuning-frames`` takes
+those only. One process of one thread.
 """
 
 from __future__ import annotations
@@ -59,30 +60,52 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def measured_views(stored: Map, data: Path) -> list[View]:
+    """Return the training views with measured depth."""
+    views = open_dataset(data, stored.bounds.background).views("train")
+    return [view for view in views if view.frame.has_depth]
+
+
 def baked(stored: Map, data: Path) -> tuple[Map, dict[str, float]]:
     """Return the map with a surface baked anew, as ``bidnerf bake`` does it, and the seconds that took."""
-    views = open_dataset(data, stored.bounds.background).views("train")
-    measured = [view for view in views if view.frame.has_depth]
+    measured = measured_views(stored, data)
     began, cpu = time.perf_counter(), time.process_time()
     surface = bake(stored.field, stored.bounds, [] if measured else cameras_of(stored.info), measured)
     seconds = {"bake_seconds": time.perf_counter() - began, "bake_cpu_seconds": time.process_time() - cpu}
     return replace(stored, surface=surface), seconds
 
 
-def tried(stored: Map, data: Path, tuning: bool) -> dict[str, Any]:
-    """Localize a dataset's test frames with depth on the surface of a map."""
+def described(stored: Map) -> dict[str, Any]:
+    """Return the size of a map's surface."""
     surface = stored.surface
     if surface is None:
         raise SystemExit(f"{stored.info.data}: has no surface, expected a baked map")
+    return {
+        "cell": surface.cell, "cells": list(surface.grid.shape), "surfels": len(surface.surfels),
+        "megabytes": surface.bytes / 1e6,
+    }  # fmt: skip
+
+
+def compared(data: Path, tuning: bool, **maps: Map) -> dict[str, dict[str, Any]]:
+    """Localize a dataset's test frames with depth on the surfaces of several maps, which take turns."""
+    stored = next(iter(maps.values()))
     dataset = open_dataset(data, stored.bounds.background)
     names = [n for i, n in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == tuning]
     views = [view for view in dataset.views("test", names) if view.frame.has_depth]
-    localizer = Localizer(stored, "auto", settings_of("auto", {"landmarks": False}))
-    rows = [localized(localizer, view) for view in views]
-    return {
-        "cell": surface.cell, "cells": list(surface.grid.shape), "surfels": len(surface.surfels),
-        "megabytes": surface.bytes / 1e6, **summary(rows), "frames": rows,
-    }  # fmt: skip
+    settings = settings_of("auto", {"landmarks": False})
+    localizers = {what: Localizer(a_map, "auto", settings) for what, a_map in maps.items()}
+    rows: dict[str, list[dict[str, Any]]] = {what: [] for what in maps}
+    for number, view in enumerate(views):
+        order = list(localizers) if number % 2 else list(localizers)[::-1]
+        for what in order:
+            rows[what].append(localized(localizers[what], view))
+    return {what: described(maps[what]) | summary(rows[what]) | {"frames": rows[what]} for what in maps}
+
+
+def ratio_of_times(rows: dict[str, dict[str, Any]]) -> float:
+    """Return the median over frames of the time after, divided by the time before."""
+    before, after = ([row["cpu_seconds"] for row in rows[what]["frames"]] for what in ("before", "after"))
+    return statistics.median(b / a for a, b in zip(before, after, strict=True))
 
 
 def main() -> None:
@@ -91,21 +114,20 @@ def main() -> None:
     )
     parser.add_argument("scenes", nargs="+", help="MAP:DATA")
     parser.add_argument("--name", default="surface_alone", help="of the record")
-    parser.add_argument("--bake", action="store_true", help="try a surface that is baked anew, too")
     parser.add_argument("--tuning-frames", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     results: dict[str, Any] = {}
     for pair in given.scenes:
         folder, data = map(Path, pair.rsplit(":", 1))
-        stored, found = load_map(folder), {}
-        found["stored"] = tried(stored, data, given.tuning_frames)
-        if given.bake:
-            anew, seconds = baked(stored, data)
-            found["baked anew"] = seconds | tried(anew, data, given.tuning_frames)
+        stored = load_map(folder)
+        anew, seconds = baked(stored, data)
+        found = compared(data, given.tuning_frames, before=stored, after=anew)
+        found["after"] |= seconds
         for what, row in found.items():
             print(data.name, what, {k: v for k, v in row.items() if k != "frames"}, flush=True)
-        results[data.name] = found
+        results[data.name] = found | {"cpu_time_after_to_before": ratio_of_times(found)}
+        print(data.name, results[data.name]["cpu_time_after_to_before"], flush=True)
     if not given.tuning_frames:
         print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
 
