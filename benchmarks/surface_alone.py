@@ -5,7 +5,7 @@ r"""What method ``auto`` finds by measured depth on the baked surface alone, and
 No start is given, landmarks are not used. Each frame is tried with the surface that the map has (before) and with one baked
 anew from the dataset's training views (after), in turns; to compare two versions, bake the map's surface with the older.
 Frames whose index in the test split is 1 modulo 5 are left out, since settings were tuned on them; ``--tuning-frames`` takes
-those only. One process of one thread.
+those only. Each dataset has a record of its own. One process of one thread.
 """
 
 from __future__ import annotations
@@ -113,23 +113,21 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="+", help="MAP:DATA")
-    parser.add_argument("--name", default="surface_alone", help="of the record")
     parser.add_argument("--tuning-frames", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    results: dict[str, Any] = {}
     for pair in given.scenes:
         folder, data = map(Path, pair.rsplit(":", 1))
         stored = load_map(folder)
         anew, seconds = baked(stored, data)
-        found = compared(data, given.tuning_frames, before=stored, after=anew)
+        found: dict[str, Any] = dict(compared(data, given.tuning_frames, before=stored, after=anew))
         found["after"] |= seconds
         for what, row in found.items():
             print(data.name, what, {k: v for k, v in row.items() if k != "frames"}, flush=True)
-        results[data.name] = found | {"cpu_time_after_to_before": ratio_of_times(found)}
-        print(data.name, results[data.name]["cpu_time_after_to_before"], flush=True)
-    if not given.tuning_frames:
-        print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
+        found["cpu_time_after_to_before"] = ratio_of_times(found)
+        print(data.name, found["cpu_time_after_to_before"], flush=True)
+        if not given.tuning_frames:
+            print(write_record(RESULTS / f"surface_alone_{data.name}.json", found, seed=0))
 
 
 if __name__ == "__main__":

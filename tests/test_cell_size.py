@@ -12,12 +12,14 @@ from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
 from bidnerf_core.mapping.posed_depth import PosedDepthImage, measured_image
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches
+from bidnerf_core.voxel_grid import VoxelGrid
 
 SCENE = baked.one_solid(Box((0.6, 0.6, 0.6)), blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1))
 
@@ -84,6 +86,38 @@ def test_memory_is_bounded_and_a_warning_says_so(generator: Generator) -> None:
         assert math.prod(chosen_grid(points, baked.BOUNDS, 1e-4, 1e-4, 200.0).shape) < 2**31
     with pytest.raises(InputError, match="allow more megabytes"):
         chosen_grid(points, baked.BOUNDS, 0.01, 0.01, 1e-5)
+
+
+def walls(size: tuple[float, float, float], step: float) -> Tensor:
+    """Return points (metres), ``step`` apart, on the floor, the ceiling and the walls of a room with a corner at the origin."""
+    sides = [torch.arange(step / 2, length, step) for length in size]
+    faces = []
+    for axis, length in enumerate(size):
+        for at in (0.01, length - 0.01):
+            face = [torch.tensor([at]) if i == axis else side for i, side in enumerate(sides)]
+            faces += [torch.cartesian_prod(*face)]
+    return torch.cat(faces)
+
+
+def test_a_room_in_a_box_of_a_hundred_times_its_volume_takes_little_more_memory() -> None:
+    points = walls((6.0, 4.0, 3.0), 0.04)
+    taken = {}
+    for times in (1.0, 100 ** (1 / 3)):
+        box = SceneBounds((0.0, 0.0, 0.0), (6.0 * times, 4.0 * times, 3.0 * times), 0.0, 100.0)
+        taken[times] = surface_bytes(points, VoxelGrid.covering(box, 0.05))
+    small, large = taken.values()
+    assert small < large < 2 * small
+
+
+def test_a_hundred_rooms_stay_within_the_memory_that_is_allowed() -> None:
+    room = walls((6.0, 4.0, 3.0), 0.08)
+    rooms = [room + torch.tensor([6.0 * x, 4.0 * y, 0.0]) for x in range(10) for y in range(10)]
+    box = SceneBounds((0.0, 0.0, 0.0), (60.0, 40.0, 3.0), 0.0, 100.0)
+    alone = surface_bytes(room, VoxelGrid.covering(replace(box, upper=(6.0, 4.0, 3.0)), 0.1))
+    with pytest.warns(InputWarning, match="--megabytes"):
+        grid = chosen_grid(torch.cat(rooms), box, 0.1, 0.1, 20 * alone / 1e6)
+    assert surface_bytes(torch.cat(rooms), grid) <= 20 * alone
+    assert grid.cell < 0.4  # no coarser than needed
 
 
 def test_a_baked_surface_stays_within_its_memory() -> None:

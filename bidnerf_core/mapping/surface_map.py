@@ -38,6 +38,16 @@ class SurfaceMap:
         return surfel_bytes(len(self.surfels)) + self.index.bytes
 
     @property
+    def mebibytes(self) -> float:
+        """Memory that the surfels and their index take, in MiB."""
+        return self.bytes / 2**20
+
+    @property
+    def stored_cells(self) -> int:
+        """Number of entries of the index: one for each cell near the surface, and one for several cells far from it."""
+        return len(self.index.entries)
+
+    @property
     def cell(self) -> float:
         """Side of a cell of the grid (metres)."""
         return self.grid.cell
