@@ -22,8 +22,10 @@ PIXEL = 0.7
 """Cell as a share of a pixel's footprint: pixels of several images lie between each other's and together resolve more."""
 LAYER = 2.0
 """Least cell in standard deviations of depth: in finer ones, the points of one plane would make several layers of surfels."""
-PER_CELL = 1.5
-"""Least mean number of points in the cells that hold any: with fewer, cells of the surface would be left empty by chance."""
+PER_CELL = 1.32
+"""Least mean number of points in the cells that hold any. Points scattered at random leave 5/9 of the cells empty then; with
+fewer points, surfels are farther from each other on average than the radius of their discs, which is 1.5 cells.
+"""
 COMPARED_IMAGES, COMPARED_POINTS = 40, 400
 """Images, and points of each, from which the noise is estimated."""
 GROSS = 5.0
