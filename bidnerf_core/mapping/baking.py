@@ -56,10 +56,10 @@ def bake(
 ) -> SurfaceMap:
     """Return the surface that the measured depth of ``views`` and depth rendered from ``cameras`` (T_world_camera) agree on.
 
-    Points on which several of these images agree are kept, fused into surfels and indexed by a grid whose cells are as fine as the images and their noise allow (see
-    ``cell_size``). Measured depth is more
-    accurate than a field that was trained on it, so render depth only where none was measured. Raises ``InputError`` if
-    there is no image, or no point on which they agree.
+    Points on which several of these images agree are kept, fused into surfels and indexed by a grid whose cells are as fine
+    as the images and their noise allow (see ``cell_size``). Measured depth is more accurate than a field that was trained on
+    it, so render depth only where none was measured. Raises ``InputError`` if there is no image, or no point on which they
+    agree.
     """
     total = len(views) + len(cameras)
     if not total:

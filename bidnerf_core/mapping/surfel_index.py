@@ -43,9 +43,7 @@ class SurfelIndex:
     grid: VoxelGrid
     first: Int[Tensor, "x y z"]  # int32: each block's first entry
     level: UInt8[Tensor, "x y z"]  # uint8: 2^level cells along each side share an entry
-    entries: Int[
-        Tensor, "e"
-    ]  # int32: index of the surfel nearest to the middle of the cells that share the entry
+    entries: Int[Tensor, "e"]  # int32: the surfel nearest to the middle of the cells that share the entry
 
     @staticmethod
     def of(positions: Float[Tensor, "n 3"], grid: VoxelGrid) -> SurfelIndex:
@@ -82,8 +80,8 @@ class SurfelIndex:
         """Return the index (int64) of the surfel nearest to each point (metres, world).
 
         The distance of that surfel exceeds the least one by at most the root of three times a cell, or 87 % of the least
-        one where that is more; beside a plane, by 10 % of it. A point outside the grid is first clamped to the grid's border; one that is not finite
-        has some surfel.
+        one where that is more; beside a plane, by 10 % of it. A point outside the grid is first clamped to the grid's
+        border; one that is not finite has some surfel.
         """
         offset, rate, cells, base = self._numbering
         flat = points.detach().reshape(-1, 3).T
