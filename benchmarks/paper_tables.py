@@ -57,8 +57,8 @@ def table1(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
     plan = replace(base, protocol="bid", sizes=((0.5,), (0.8,), (1.2,)), trials=each)
     return [
         replace(plan, depth=depth, config=_json(common | {"level": level}))
-        for depth in (True, False)
         for level in (0, None)
+        for depth in (True, False)
     ]
 
 
