@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -96,10 +97,11 @@ PARTS: dict[str, Callable[[Plan, Settings, int | None], list[Plan]]] = {
 }
 
 
-def untuned(map_folder: str, data: str) -> tuple[str, ...]:
-    """Return the test frames that settings were not tuned on."""
+def test_frames(map_folder: str, data: str, tuning: bool) -> tuple[str, ...]:
+    """Return the test frames that settings are tuned on, or all others."""
     _, dataset = opened(map_folder, data)
-    return tuple(name for place, name in enumerate(dataset.frame_names("test")) if place % 5 != 1)
+    names = enumerate(dataset.frame_names("test"))
+    return tuple(name for place, name in names if (place % 5 == 1) is tuning)
 
 
 def sequence_ends(plan: Plan) -> tuple[str, ...]:
@@ -108,18 +110,27 @@ def sequence_ends(plan: Plan) -> tuple[str, ...]:
     return tuple(dict.fromkeys(trial.frame for trial in every))
 
 
-def run_part(trials: Sequence[Trial], path: Path, workers: int) -> list[Group]:
-    """Run what is missing and return the groups of all results."""
+def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float | None = None) -> list[Group]:
+    """Run what is missing and return the groups of all results; after ``minutes``, of those that there are.
+
+    Raises ``SystemExit`` where it is stopped, or where nothing was done in time.
+    """
+    began = time.monotonic()
+
+    def late() -> bool:
+        return minutes is not None and time.monotonic() - began > 60 * minutes
+
     with ResultsFile(path) as file:
         todo = left_to_do(trials, file)
-        if todo:
+        if todo and minutes != 0:
             note_run(path, provenance(script_command(), f"{workers} local processes of one thread"))
             with local_processes(workers) as pool, TrialProgress(len(todo), workers) as progress:
-                run_trials(todo, file, pool, workers, progress.done, lambda: progress.stopping)
-        if left_to_do(trials, file):
+                run_trials(todo, file, pool, workers, progress.done, lambda: progress.stopping or late())
+        left = len(left_to_do(trials, file))
+        if left == len(trials) or (left and minutes is None):
             raise SystemExit(f"stopped; {path} is kept, the same command goes on")
         file.put_in_order(trials)
-        return grouped([file.results[key_of(trial)] for trial in trials])
+        return grouped([file.results[key_of(t)] for t in trials if key_of(t) in file.results])
 
 
 def as_record(groups: Sequence[Group]) -> dict[str, Any]:
@@ -160,7 +171,7 @@ def main() -> None:
         for folder in given.map:
             base = Plan(
                 folder, given.data, method="bid", seed=given.seed, device=given.device,
-                frames=untuned(folder, given.data),
+                frames=test_frames(folder, given.data, tuning=False),
             )  # fmt: skip
             plans = PARTS[part](base, common, given.trials)
             trials = [trial for plan in plans for trial in planned(plan)]

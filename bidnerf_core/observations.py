@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.errors import InputError
@@ -87,6 +87,16 @@ class Observations:
         """Return the rays along which a distance was measured, without colours. Raises ``InputError`` for none."""
         measured = self[self.measured]
         return Observations.of_depth(measured.origins, measured.directions, measured.distance)
+
+    def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
+        """Return the rays of shape (k p) at ``index`` along their second axis, m of each row."""
+        wide = index[..., None].expand(*index.shape, 3)
+        origins, directions, rgb = (
+            part.gather(1, wide) for part in (self.origins, self.directions, self.rgb)
+        )
+        return Observations(
+            origins, directions, rgb, self.distance.gather(1, index), self.coloured.gather(1, index)
+        )
 
     def flattened(self) -> Observations:
         """Return these rays flattened to one axis."""

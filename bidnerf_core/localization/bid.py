@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bidnerf_core.localization.first_order import DescentSettings, descended
+from bidnerf_core.localization.first_order import descended
 from bidnerf_core.localization.method_settings import (
     AdamSettings,
     ColourSettings,
     DepthSettings,
+    DescentSettings,
+    ReachSettings,
     objective_of,
 )
 from bidnerf_core.localization.problem import Problem
@@ -25,9 +27,11 @@ class BidConfig(Settings):
     adam: AdamSettings = AdamSettings(learning_rate=0.04, decay=0.4, decay_steps=80)
     colour: ColourSettings = ColourSettings()
     depth: DepthSettings = DepthSettings()
+    reach: ReachSettings = ReachSettings()
 
 
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
     """Descend from ``problem.start``; pixels are drawn from ``seed``."""
     objective = objective_of(config.colour, config.depth)
-    return descended(problem, config.descent, config.adam, objective, config.depth.depth_rays, seed, "bid")
+    depth_rays = config.depth.depth_rays
+    return descended(problem, config.descent, config.adam, objective, depth_rays, seed, "bid", config.reach)

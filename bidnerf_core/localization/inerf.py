@@ -10,8 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.first_order import DescentSettings, descended
-from bidnerf_core.localization.method_settings import AdamSettings, ColourSettings, objective_of
+from bidnerf_core.localization.first_order import descended
+from bidnerf_core.localization.method_settings import (
+    AdamSettings,
+    ColourSettings,
+    DescentSettings,
+    objective_of,
+)
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.settings import Settings
