@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -155,6 +156,13 @@ class Frame:
                 warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
         return Frame(name, over(colour, cover, background_colour(background)), intrinsics, metres, cover)
 
+    def to(self, device: torch.device | str) -> Frame:
+        """Return the frame with its images on ``device``; the frame itself where they lie there."""
+        images = {"rgb": self.rgb, "depth": self.depth, "alpha": self.alpha}
+        if all(image is None or image.device == torch.device(device) for image in images.values()):
+            return self
+        return replace(self, **{name: None if x is None else x.to(device) for name, x in images.items()})
+
     @property
     def has_depth(self) -> bool:
         """Whether anything was measured."""
@@ -190,3 +198,7 @@ class View:
     frame: Frame
     T_ref_camera: SE3
     landmarks: SeenLandmarks | None = None  # those that training takes distances from
+
+    def to(self, device: torch.device | str) -> View:
+        """Return the view with its images and its pose on ``device``."""
+        return replace(self, frame=self.frame.to(device), T_ref_camera=self.T_ref_camera.to(device))

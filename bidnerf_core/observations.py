@@ -117,7 +117,7 @@ class Observations:
         """Draw ``count`` of the rays uniformly with replacement; return all of them if there are no more."""
         if count >= len(self):
             return self.to(device, dtype)
-        index = torch.randint(len(self), (count,), generator=generator)
+        index = torch.randint(len(self), (count,), generator=generator, device=generator.device)
         return self[index.to(self.distance.device)].to(device, dtype)
 
     def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:

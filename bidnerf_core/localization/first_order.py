@@ -19,16 +19,23 @@ from bidnerf_core.residuals import Objective
 from bidnerf_core.se3 import SE3
 
 
+PAPERS_REACH = ReachSettings()
+"""Nothing is added to the paper's objective."""
+
+
 def descended(
     problem: Problem, rays: DescentSettings, adam: AdamSettings, objective: Objective, depth_rays: int, seed: int,
-    method: str, reach: ReachSettings = ReachSettings(),
+    method: str, reach: ReachSettings = PAPERS_REACH,
 ) -> Localization:  # fmt: skip
     """Descend with Adam from ``problem.start`` (Alg. 1) and judge the answer."""
     began = time.perf_counter()
-    start, generator = problem.start_for(method), torch.Generator().manual_seed(seed)
-    loss = SampledLoss(problem, objective, RayCounts(rays.rays, depth_rays), rays, reach, generator)
+    start, device = problem.start_for(method), problem.device
+    generator = torch.Generator(device).manual_seed(seed)
+    loss = SampledLoss(
+        problem.on_device(), objective, RayCounts(rays.rays, depth_rays), rays, reach, generator
+    )
     history = History([start])
-    finite, reason = follow_gradient(loss, pivot(rays.pivot, problem), adam, history)
+    finite, reason = follow_gradient(loss, pivot(rays.pivot, problem), adam, history, device)
     T, mean = history.answer(adam.answer)
     verdict = descent_verdict(mean, adam.converged_loss, finite, reason)
     return Localization(

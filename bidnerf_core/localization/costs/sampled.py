@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_core.blurring import Blurred
+from bidnerf_core.constants import constant
 from bidnerf_core.field import RadianceField, Rays, widened
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import DescentSettings, ReachSettings
@@ -76,8 +77,8 @@ class SampledLoss:
         """Return the mean robust loss of the distances (metres) between measured points and the box of the scene."""
         bounds = self.problem.bounds
         points = rays.origins + observed.distance[..., None] * rays.directions
-        half = points.new_tensor(bounds.size) / 2
-        off = ((points - points.new_tensor(bounds.centre)).abs() - half).clamp(min=0)
+        half = constant(bounds.size, points) / 2
+        off = ((points - constant(bounds.centre, points)).abs() - half).clamp(min=0)
         robust = Robust("huber", BOX_SCALE)
         return masked_mean(robust(torch.linalg.vector_norm(off, dim=-1)), observed.measured).mean()
 
@@ -99,7 +100,7 @@ class SampledLoss:
 
     def _meets(self, pixels: Observations, T_world_last: SE3) -> Bool[Tensor, "k p"]:
         """Return which pixels show matter in the image, or meet what may be matter in the map."""
-        background = pixels.rgb.new_tensor(self.problem.bounds.background)
+        background = constant(self.problem.bounds.background, pixels.rgb)
         shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
         sampler = self.problem.level(self.rays.level).sampler
         return shows | sampler(self._rays(pixels, T_world_last)).valid.any(-1)
