@@ -29,7 +29,7 @@ def test_the_cells_of_a_part_can_be_tried_from_the_same_starts(
 ) -> None:
     monkeypatch.syspath_prepend(str(SCRIPT.parent))
     plans = importlib.import_module("paper_tables").PARTS[part](
-        Plan(PLACE, PLACE, method="bid", seed=0), {"rays": 8, "max_steps": 2}, None
+        Plan(PLACE, PLACE, method="bid", seed=0), lambda method: {"rays": 8, "max_steps": 2}, None
     )
     conditions, sizes, each, methods = CELLS[part]
     assert len(plans) == conditions

@@ -70,6 +70,10 @@ MapFolder: TypeAlias = Annotated[
 ]
 DataFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, option("DATA", "folder of a dataset")]
 Flag: TypeAlias = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Preset: TypeAlias = Annotated[
+    str | None,
+    option("NAME", "settings to begin with: paper or paper-scene for bid, paper for inerf", "the defaults"),
+]
 Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
 """``--frame a b --frame c`` names three frames."""
 
@@ -272,6 +276,13 @@ def chosen_method(arguments: Sequence[str], usual: str) -> Method:
 
     with wrong_usage():
         return find_method(value_of("--method", arguments) or usual)
+
+
+def chosen_settings(arguments: Sequence[str], usual: str) -> Any:
+    """Return the settings of the method that ``--method`` names: its defaults, or those that ``--preset`` names."""
+    method, preset = chosen_method(arguments, usual), value_of("--preset", arguments)
+    with wrong_usage():
+        return method.settings(preset)
 
 
 @contextlib.contextmanager

@@ -16,8 +16,9 @@ from bidnerf_core.cli.common import (
     LARGEST_SEED,
     Flag,
     Names,
+    Preset,
     UsageError,
-    chosen_method,
+    chosen_settings,
     option,
     output_folder,
     parse,
@@ -52,7 +53,7 @@ Folders = Annotated[
 
 def run(arguments: list[str]) -> None:
     """Run the command; its options include the settings of the method that the arguments name."""
-    kind = chosen_method(arguments, "bid").config_type
+    settings = chosen_settings(arguments, "bid")
 
     def compare(
         folders: Folders,
@@ -71,7 +72,8 @@ def run(arguments: list[str]) -> None:
         seed: Annotated[int | None, option("N", "seed of every random choice", "the protocol's")] = None,
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
-        config: Any = kind(),
+        preset: Preset = None,
+        config: Any = settings,
     ) -> None:
         """Localize the same frames from the same starts in several maps, and compare success, time and memory.
 
@@ -98,7 +100,7 @@ def run(arguments: list[str]) -> None:
         else:
             _print(found)
 
-    compare.__annotations__["config"] = kind
+    compare.__annotations__["config"] = type(settings)
     parse("compare", compare, arguments)
 
 

@@ -16,8 +16,9 @@ import tyro
 from bidnerf_core.cli.common import (
     LARGEST_SEED,
     Names,
+    Preset,
     UsageError,
-    chosen_method,
+    chosen_settings,
     option,
     parse,
     require,
@@ -51,7 +52,7 @@ Place = Annotated[str, tyro.conf.Positional]
 
 def run(arguments: list[str]) -> None:
     """Run the command; its options include the settings of the method that the arguments name."""
-    kind = chosen_method(arguments, "auto").config_type
+    settings = chosen_settings(arguments, "auto")
 
     def evaluate(
         map: Annotated[Place, option("MAP", "folder of a map, or demo:blobs")],
@@ -103,7 +104,8 @@ def run(arguments: list[str]) -> None:
         ] = None,
         shards: Annotated[int, option("N", "number of parts that the trials are split into")] = 1,
         shard: Annotated[int, option("I", "the part to run, from 0")] = 0,
-        config: Any = kind(),
+        preset: Preset = None,
+        config: Any = settings,
     ) -> None:
         """Localize many frames from wrong starts, or from none, and write one JSON line a trial.
 
@@ -128,7 +130,7 @@ def run(arguments: list[str]) -> None:
         mine = shard_of(trials_of_all, shard, shards)
         _evaluate(mine, out, workers, dask, command_line("bidnerf evaluate", arguments))
 
-    evaluate.__annotations__["config"] = kind
+    evaluate.__annotations__["config"] = type(settings)
     parse("evaluate", evaluate, arguments)
 
 

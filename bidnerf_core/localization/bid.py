@@ -30,6 +30,16 @@ class BidConfig(Settings):
     reach: ReachSettings = ReachSettings()
 
 
+PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
+"""The paper's number of steps, with iNeRF's decay. Its learning rate is not given; this one was chosen on other frames."""
+
+BID_PRESETS = {
+    "paper": BidConfig(descent=DescentSettings(level=0, pivot="camera"), adam=PAPER_STEPS),
+    "paper-scene": BidConfig(descent=DescentSettings(level=0, pivot="scene"), adam=PAPER_STEPS),
+}
+"""The paper's settings with updates as in its Alg. 1, in the camera's frame, and with ours, about the middle of the scene."""
+
+
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
     """Descend from ``problem.start``; pixels are drawn from ``seed``."""
     objective = objective_of(config.colour, config.depth)

@@ -18,7 +18,6 @@ from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.residuals import Objective
 from bidnerf_core.se3 import SE3
 
-
 PAPERS_REACH = ReachSettings()
 """Nothing is added to the paper's objective."""
 

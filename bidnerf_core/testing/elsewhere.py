@@ -65,6 +65,15 @@ class _There(torch.Tensor):
     def __init__(self, values: Tensor) -> None:
         pass
 
+    def tolist(self) -> Any:
+        return self.cpu().tolist()
+
+    def numpy(self, *, force: bool = False) -> Any:  # type: ignore[override]
+        return self.cpu().numpy(force=force)
+
+    def new_tensor(self, data: Any, **options: Any) -> Tensor:
+        return torch.tensor(data, dtype=options.pop("dtype", self.dtype), **options).to(DEVICE)
+
     def __repr__(self) -> str:  # type: ignore[override]
         return f"elsewhere({self.values!r})"
 
@@ -110,6 +119,10 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
     asked = kwargs.get("device")
     wanted = None if asked is None else torch.device(asked)
     made_there = wanted is not None and wanted.type == DEVICE.type
+    if any(isinstance(part, Tensor) and part.is_meta and not isinstance(part, _There) for part in flat):
+        raise DeviceFault(
+            "a tensor was made of the host's numbers on the device, as torch.tensor(..., device=...)"
+        )
     if not there and not made_there:
         return func(*args, **kwargs)
     if strict:
