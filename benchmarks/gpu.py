@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +57,11 @@ FRAMES = 40
 
 def made_steps(folder: str, data: str, level: int, device: torch.device, rays: int = RAYS) -> AdamSteps:
     """Return the steps of ``bid`` from 0.1 units beside the first test frame's pose."""
-    stored, dataset = opened(folder, data, str(device))
+    stored, dataset = opened(folder, data)
+    there = None if device.type == "cpu" else device
+    scene = Localizer(stored, "bid", device=there, warm_up=False).map
     view = dataset.views("test", test_frames(folder, data, tuning=False)[:1])[0]
-    problem = rig(stored, [view], perturb(view.T_ref_camera, 0.1, 2.0, seed=0))
+    problem = rig(scene, [view], perturb(view.T_ref_camera, 0.1, 2.0, seed=0))
     usual = METHODS["bid"].settings("paper-scene")
     loss = SampledLoss(
         problem.on_device(), objective_of(usual.colour, usual.depth), RayCounts(rays),
@@ -85,7 +88,7 @@ def timed_steps(steps: AdamSteps, warm_up: int, count: int) -> dict[str, Any]:
         finally:
             torch.cuda.set_sync_debug_mode("default")
         torch.cuda.synchronize()
-        times = [a.elapsed_time(b) for a, b in zip(marks[:-1], marks[1:], strict=True)]
+        times = [a.elapsed_time(b) for a, b in pairwise(marks)]
         return {"ms": statistics.median(times), "ms_most": max(times), "operations": operations(steps)}
 
 

@@ -33,7 +33,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:
-    """Disjoint intervals of each ray, nearest first, each queried at its middle. Only valid ones are ever queried."""
+    """Disjoint intervals of each ray, nearest first, each queried at its middle. Those that are not valid have no effect."""
 
     starts: Float[Tensor, "*r s"]
     ends: Float[Tensor, "*r s"]
