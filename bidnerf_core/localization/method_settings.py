@@ -92,7 +92,7 @@ class DescentSettings(Settings):
 class ReachSettings(Settings):
     """Settings that widen the reach of first-order steps. By default nothing is added to the paper's objective."""
 
-    # number of pixels drawn for each ray; those that meet matter in the image or in the map are taken first
+    # number of pixels drawn for each ray; those that show matter, then those that may meet it, come first
     candidates: Annotated[int, Range(1, 64), EXPERT] = 1
     # number of equal intervals of each ray, whether or not they may hold matter; 0: the field's own
     samples: Annotated[int, Range(0, 4096), EXPERT] = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.blurring import Blurred
@@ -89,8 +89,8 @@ class SampledLoss:
         pixels = draw(problem.views, many, self._drawer, self.generator, device=device)
         if self.reach.candidates > 1:
             count = max(1, self.counts.pixels // len(problem.views))
-            empty = ~self._meets(pixels, T_world_last)
-            pixels = pixels.gathered(empty.sort(dim=-1, stable=True).indices[:, :count])
+            order = self._rank(pixels, T_world_last).sort(dim=-1, descending=True, stable=True).indices
+            pixels = pixels.gathered(order[:, :count])
         batches = [pixels]
         if problem.depth_rays is not None and self.objective.uses_depth and self.counts.depth_rays > 0:
             batches.append(
@@ -98,9 +98,9 @@ class SampledLoss:
             )
         return batches
 
-    def _meets(self, pixels: Observations, T_world_last: SE3) -> Bool[Tensor, "k p"]:
-        """Return which pixels show matter in the image, or meet what may be matter in the map."""
+    def _rank(self, pixels: Observations, T_world_last: SE3) -> Int[Tensor, "k p"]:
+        """Return 2 or more for pixels that show matter in the image, and 1 for others that may meet it in the map."""
         background = constant(self.problem.bounds.background, pixels.rgb)
         shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
         sampler = self.problem.level(self.rays.level).sampler
-        return shows | sampler(self._rays(pixels, T_world_last)).valid.any(-1)
+        return 2 * shows.int() + sampler(self._rays(pixels, T_world_last)).valid.any(-1).int()
