@@ -16,6 +16,11 @@ class InputWarning(UserWarning):
 
 def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
     """Return the error for a name that is not among ``known``; it suggests the one that is spelt most alike."""
+    listed = f", expected one of {', '.join(known)}"
+    return InputError(f"no {what} {name!r}{spelling_hint(name, known, listed)}")
+
+
+def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str:
+    """Return the question whether the one of ``known`` was meant that is spelt most alike, or ``otherwise`` if none is."""
     near = difflib.get_close_matches(name, known, n=1)
-    hint = f", did you mean {near[0]!r}?" if near else f", expected one of {', '.join(known)}"
-    return InputError(f"no {what} {name!r}{hint}")
+    return f", did you mean {near[0]!r}?" if near else otherwise

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import difflib
 import importlib
 import importlib.util
 import inspect
@@ -21,7 +20,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, distributions
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, spelling_hint
 
 if TYPE_CHECKING:
     from bidnerf_core.backend import Backend
@@ -270,8 +269,8 @@ def _described(error: BaseException) -> str:
 
 def _unknown(name: str, infos: list[BackendInfo]) -> str:
     names = sorted({info.name for info in infos} - {UNREADABLE})
-    near = difflib.get_close_matches(name.lower(), names, n=1)
-    message = f"unknown backend '{name}'" + (f" (did you mean '{near[0]}'?)" if near else "")
-    message += f"; installed: {', '.join(names) or 'none'}"
+    message = (
+        f"no backend {name!r}{spelling_hint(name.lower(), names)}; installed: {', '.join(names) or 'none'}"
+    )
     unread = [f"{x.distribution} {x.version}: {x.fault}" for x in infos if x.name == UNREADABLE]
     return "; ".join([message, *unread])

@@ -127,6 +127,9 @@ EVEN_SHARE = 0.25
 """Fraction of the borders that ``Concentrated`` spreads evenly, so that matter which the guide does not know of is found."""
 TAIL = 0.005
 """Fraction of a ray's weight, at either end, that ``Concentrated`` leaves to evenly spread intervals."""
+LARGEST_THICKNESS = 0.5
+"""Largest optical thickness of an interval for which ``Concentrated`` takes its guide's word. A coarse guide has one density
+for a cell in which only a part is dense; what lies behind the other part must be found as well."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,11 @@ class Concentrated:
         rough = _gathered(self.guide.sampler(rays, jitter))
         if rough.starts.shape[-1] <= self.count:
             return rough
-        weights = rendering_weights(query_samples(self.guide, rays, rough).density, rough)
+        thickest = LARGEST_THICKNESS / (rough.ends - rough.starts).clamp(
+            min=torch.finfo(rough.ends.dtype).tiny
+        )
+        density = torch.minimum(query_samples(self.guide, rays, rough).density, thickest)
+        weights = rendering_weights(density, rough)
         few = rough.valid.sum(-1) <= self.count
         kept = RaySamples(*(part[..., : self.count] for part in (rough.starts, rough.ends, rough.valid)))
         return _either(few, kept, concentrated(rough, weights, self.count, jitter))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import sys
 import types
 import typing
 from typing import Any, TypeVar
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, spelling_hint
 
 _T = TypeVar("_T")
 
@@ -56,8 +55,7 @@ def _check_keys(kind: type, value: dict[str, Any], where: str) -> None:
     known = {f.name: _is_required(f) for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else f", expected some of {', '.join(known)}"
+            hint = spelling_hint(key, known, f", expected some of {', '.join(known)}")
             raise InputError(f"{where}: {kind.__name__} has no field {key!r}{hint}")
     missing = [key for key, required in known.items() if required and key not in value]
     if missing:

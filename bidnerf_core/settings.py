@@ -8,7 +8,6 @@ method, whatever group it stands in.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import math
 import typing
@@ -16,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, cast
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.serialization import converted, to_plain
 
 S = TypeVar("S")
@@ -138,8 +137,7 @@ def from_flat(
     given = {(renamed or {}).get(name, name): value for name, value in values.items()}
     for name in given:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else f", expected some of {', '.join(known)}"
+            hint = spelling_hint(name, known, f", expected some of {', '.join(known)}")
             raise InputError(f"{where}: {type(default).__name__} has no setting {name!r}{hint}")
     return _with_values(default, given, where)
 

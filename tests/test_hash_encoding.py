@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -13,6 +15,7 @@ from torch import Tensor
 
 from bidnerf_hashgrid import encoding as encoding_module
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
+from bidnerf_hashgrid.threads import concurrently
 
 Interpolation = Literal["linear", "smooth"]
 both_interpolations = pytest.mark.parametrize("interpolation", ["linear", "smooth"])
@@ -233,6 +236,44 @@ def test_chunks_do_not_change_the_result(
     monkeypatch.setattr(encoding_module, "CPU_CHUNK", 7)
     for part, expected in zip(run(), whole, strict=True):
         torch.testing.assert_close(part, expected)
+
+
+@pytest.mark.parametrize("inference", [False, True])
+def test_the_number_of_threads_does_not_change_the_result(
+    monkeypatch: pytest.MonkeyPatch, inference: bool
+) -> None:
+    encoding, points, usual = make(), torch.rand(50, 3, dtype=torch.float64), torch.get_num_threads()
+    results = []
+    for threads in (1, 3):
+        monkeypatch.setattr(encoding_module, "threads_for", lambda _, threads=threads: threads)
+        with torch.inference_mode(inference):
+            encoded = encoding(points.clone().requires_grad_(not inference))
+        if inference:
+            results.append([encoded])
+        else:
+            results.append([encoded, *torch.autograd.grad(encoded.square().sum(), list(encoding.tables))])
+    for one, three in zip(*results, strict=True):
+        assert torch.equal(one, three)
+    assert torch.get_num_threads() == usual
+
+
+def test_an_error_in_a_thread_is_raised() -> None:
+    def fails() -> None:
+        raise ValueError("of a task")
+
+    with pytest.raises(ValueError, match="of a task"):
+        concurrently([fails, fails], threads=2)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    done = []
+    concurrently([partial(done.append, 1)] * 2, threads=2)
+    child = os.fork()
+    if child == 0:
+        concurrently([partial(done.append, 1)] * 2, threads=2)
+        os._exit(0 if len(done) == 4 else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 def test_threads_do_not_disturb_each_other() -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.field import Rays, RaySampler, RaySamples, SceneBounds
+from bidnerf_core.field import FieldValues, Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.rendering import render
 from bidnerf_core.sampling import AroundDepth, Concentrated, Importance, Resampled, Stratified
 from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
@@ -204,6 +204,25 @@ def test_a_surface_is_seen_where_it_is_with_few_samples() -> None:
     errors = [float((found.distance - exact.distance).abs().mean()) for found in (even, near)]
     assert errors[1] < 0.25 * errors[0]
     assert float((near.opacity - exact.opacity).abs().mean()) < 0.05
+
+
+class TwoWalls:
+    """Walls at 1 and 3 metres from where rays begin, each as thick as one of 256 intervals and as dense as can be."""
+
+    sampler = Stratified(256)
+
+    def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+        step = 4.0 / 256
+        there = [(positions[..., 2] - at).abs() < 0.6 * step for at in (1.0, 3.0)]
+        return FieldValues((there[0] | there[1]) * 1e6, torch.zeros_like(positions))
+
+
+def test_what_lies_behind_an_opaque_cell_of_the_guide_is_sampled_too() -> None:
+    """A guide's density is that of the densest part of a cell, past which a ray may go."""
+    where = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]), torch.zeros(1), torch.full((1,), 4.0))
+    found = Concentrated(TwoWalls(), 32)(where)
+    near = [int(((found.middles - at).abs() < 0.05).sum()) for at in (1.0, 3.0)]
+    assert near[0] > near[1] >= 5
 
 
 def test_stratified_samples_of_an_open_scene_are_even_in_its_coordinate() -> None:

@@ -1,10 +1,11 @@
 """Multiresolution hash encoding (Mueller et al. 2022, "Instant Neural Graphics Primitives", section 3).
 
-Pure torch, laid out for one CPU core and equally usable on a GPU:
+Pure torch, laid out for the cores of a CPU and equally usable on a GPU:
 
 * arrays are (corner, point), so that all arithmetic runs along contiguous points;
 * a pair of features is read and accumulated as one complex number: one memory access a corner (a "unit" below);
 * the points go through a level in chunks whose temporaries stay in the cache, and so does the table of the level;
+* levels are computed on several threads at once, because torch gathers and scatters on one;
 * the backward pass is written by hand: gradients to a table are scattered to recomputed corner indices, and the
   derivative by position is kept from the forward pass, where the corner values are at hand anyway.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
@@ -23,6 +25,7 @@ from torch.autograd.function import once_differentiable
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.settings import Range, Settings
+from bidnerf_hashgrid.threads import concurrently, threads_for
 
 # The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
@@ -182,11 +185,11 @@ def _encode_level(
             slopes[:, :, wide] *= _repeat(6 * fraction * (1 - fraction), unit)
 
 
-def _table_gradient(
-    points: Float[Tensor, "3 n"], gradient: Float[Tensor, "c w"], level: _Level, features: int
-) -> Float[Tensor, "t f"]:
-    unit = _unit(features)
-    table = points.new_zeros(level.entries, features)
+def _add_table_gradient(
+    points: Float[Tensor, "3 n"], gradient: Float[Tensor, "c w"], level: _Level, table: Float[Tensor, "t f"]
+) -> None:
+    """Add the gradient of a level's features, carried back to its entries, to ``table``."""
+    unit = _unit(table.shape[1])
     for chunk in _chunks(points):
         wide = slice(chunk.start * unit, chunk.stop * unit)
         # scatter_add_ takes int64 only, and is still twice as fast as index_add_ with int32.
@@ -196,7 +199,6 @@ def _table_gradient(
         for target, row in zip(_as_units(table, unit).unbind(1), gradient, strict=True):
             corners = _spread(row[wide], weights).view(-1)
             target.scatter_add_(0, index, _as_units(corners, unit))
-    return table
 
 
 class _Encode(torch.autograd.Function):
@@ -217,12 +219,13 @@ class _Encode(torch.autograd.Function):
         unit = _unit(features)
         rows = points.new_empty(total, features // unit, count * unit)
         rows[len(levels) :] = 0
-        slopes = []
-        for level, table, values in zip(levels, tables, rows, strict=False):
-            if want_slopes:
-                slopes.append(points.new_empty(features // unit, 3, count * unit))
-            _encode_level(points, table, level, values, slopes[-1] if want_slopes else None)
-        ctx.save_for_backward(points, *slopes)
+        slopes = [
+            points.new_empty(features // unit, 3, count * unit) if want_slopes else None for _ in levels
+        ]
+        parts = zip(tables, levels, rows[: len(levels)], slopes, strict=True)
+        tasks = [partial(_encode_level, points, *part) for part in parts]
+        concurrently(tasks, threads_for(points))
+        ctx.save_for_backward(points, *(slope for slope in slopes if slope is not None))
         ctx.levels, ctx.features = levels, features
         encoded = rows.new_empty(count, total * features)
         _as_units(encoded, unit)[:] = _as_units(rows, unit).flatten(0, 1).t()
@@ -243,9 +246,15 @@ class _Encode(torch.autograd.Function):
                     to_points.addcmul_(slope[k], part[k], value=level.resolution)
             to_points = to_points.unflatten(1, (-1, unit)).sum(-1)
         to_tables = [
-            _table_gradient(points, part, level, ctx.features) if needed else None
-            for level, part, needed in zip(ctx.levels, rows, ctx.needs_input_grad[4:], strict=False)
+            points.new_zeros(level.entries, ctx.features) if needed else None
+            for level, needed in zip(ctx.levels, ctx.needs_input_grad[4:], strict=True)
         ]
+        tasks = [
+            partial(_add_table_gradient, points, part, level, table)
+            for part, level, table in zip(rows[: len(to_tables)], ctx.levels, to_tables, strict=True)
+            if table is not None
+        ]
+        concurrently(tasks, threads_for(points))
         return to_points, None, None, None, *to_tables
 
 

@@ -57,14 +57,19 @@ class HashGridField(nn.Module):
             nn.Linear(config.width, 3),
             nn.Sigmoid(),
         )
-        self.occupancy = OccupancyGrid(bounds, config.grid_resolution)
+        # Samples are concentrated within steps by the density of whole cells, so that shorter steps would tell nothing more.
+        self.occupancy = OccupancyGrid(bounds, config.grid_resolution, steps_per_cell=1 if self.guided else 2)
         self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
 
     @property
+    def guided(self) -> bool:
+        """Whether samples are concentrated where the occupancy grid has observed density."""
+        return self.bounds.contracted and self.config.samples_per_ray > 0
+
+    @property
     def sampler(self) -> RaySampler:
-        count = self.config.samples_per_ray
-        guided = self.bounds.contracted and count > 0
-        return Concentrated(GridDensity(self.occupancy), count) if guided else self.occupancy
+        grid = self.occupancy
+        return Concentrated(GridDensity(grid), self.config.samples_per_ray) if self.guided else grid
 
     @property
     def levels(self) -> tuple[CoarseField, HashGridField]:

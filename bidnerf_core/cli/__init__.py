@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import importlib
 import os
 import sys
@@ -12,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
 from bidnerf_core.cli.text import printable
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputError, InputWarning, spelling_hint
 
 COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
@@ -77,9 +76,8 @@ def _dispatch(given: list[str]) -> int:
         print(f"bidnerf {version('bidnerf')}")
         return DONE
     if given[0] not in COMMANDS:
-        near = difflib.get_close_matches(given[0], COMMANDS, n=1)
-        hint = f", did you mean {near[0]!r}?" if near else ""
-        return _failed("bidnerf", f"no command {given[0]!r}{hint}", WRONG_USAGE, f"\n{_usage()}")
+        unknown = f"no command {given[0]!r}{spelling_hint(given[0], COMMANDS)}"
+        return _failed("bidnerf", unknown, WRONG_USAGE, f"\n{_usage()}")
     if any("\0" in word for word in given):
         return _failed(f"bidnerf {given[0]}", "an argument holds a NUL character, expected text", WRONG_USAGE)
     importlib.import_module(f"bidnerf_core.cli.{given[0]}").run(given[1:])

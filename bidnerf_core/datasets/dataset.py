@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol, TypeAlias, runtime_checkable
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, spelling_hint
 from bidnerf_core.frames import View
 
 ReadingProgress: TypeAlias = Callable[[int, int], None]
@@ -79,6 +78,5 @@ def _not_there(name: str, names: Sequence[str], stems: Sequence[str]) -> str:
     if meant:
         listed = ", ".join(meant[:4]) + (", ..." if len(meant) > 4 else "")
         return f"frame {name!r} is ambiguous, expected one of {listed}"
-    near = difflib.get_close_matches(name, names, n=1)
-    hint = f", did you mean {near[0]!r}?" if near else f", expected a name as {names[0]!r}" if names else ""
+    hint = spelling_hint(name, names, f", expected a name as {names[0]!r}" if names else "")
     return f"no frame {name!r} among its {len(names)} frames{hint}"

@@ -1,0 +1,79 @@
+"""Threads for work that torch itself does on one core: gathers from a table and scatters into it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier, Lock
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+THREADED = 4096  # points from which on several threads work
+
+_pools: dict[int, ThreadPoolExecutor] = {}  # by number of threads
+_opening = Lock()
+
+
+def threads_for(points: Float[Tensor, "3 n"]) -> int:
+    """Return how many threads work on ``points``: one on a GPU, and where there is not work enough for a second."""
+    worth = points.device.type == "cpu" and points.shape[1] >= THREADED
+    return torch.get_num_threads() if worth else 1
+
+
+def concurrently(tasks: Iterable[Callable[[], None]], threads: int) -> None:
+    """Run independent tasks of torch, none of which records gradients, on CPU threads, each of which uses one core.
+
+    The operators release Python's global lock while they compute. Whatever a task raises is raised here.
+    """
+    if threads < 2:
+        for task in tasks:
+            task()
+        return
+    inference = torch.is_inference_mode_enabled()  # by thread, as is the recording of gradients
+    for done in [_pool(threads).submit(_run, task, inference) for task in tasks]:
+        done.result()
+
+
+def _run(task: Callable[[], None], inference: bool) -> None:
+    with torch.inference_mode(inference), torch.no_grad():
+        task()
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    with _opening:
+        if threads not in _pools:
+            _pools[threads] = _opened(threads)
+        return _pools[threads]
+
+
+def _opened(threads: int) -> ThreadPoolExecutor:
+    """Return a pool whose threads all run, each limited to one core.
+
+    ``torch.set_num_threads`` holds for the thread that calls it and for those which begin later, so that it is set back.
+    """
+    usual, all_run = torch.get_num_threads(), Barrier(threads + 1)
+
+    def begin() -> None:
+        torch.set_num_threads(1)
+        all_run.wait()
+
+    pool = ThreadPoolExecutor(threads, "bidnerf-hashgrid")
+    for _ in range(threads):
+        pool.submit(begin)
+    all_run.wait()
+    torch.set_num_threads(usual)
+    return pool
+
+
+def _forget() -> None:
+    """Leave out the pools of the parent process: a forked process does not have their threads."""
+    global _opening
+    _pools.clear()
+    _opening = Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
