@@ -23,7 +23,7 @@ def pixel_at(distance: float) -> Observations:
 
 def silhouette(share: float, distance: float = 2.0, behind: float = 6.0) -> Rendering:
     """Return a rendering of one ray with ``share`` of its weight at ``distance``, and the rest far behind; metres."""
-    middles = torch.tensor([[distance, behind]], dtype=torch.float64).requires_grad_()
+    middles = torch.tensor([[distance, behind]], dtype=torch.float64)
     weights = torch.tensor([[share, 1 - share]], dtype=torch.float64)
     samples = RaySamples(middles, middles, torch.ones(1, 2, dtype=torch.bool))
     return Rendering(
@@ -55,8 +55,10 @@ def test_the_first_surface_is_compared_where_there_is_one() -> None:
     )  # the first one is glass
     empty = replace(silhouette(0.9), opacity=torch.zeros(1, dtype=torch.float64))
     assert float(first_surface_residual(empty, pixel)) == 0
-    rendering = silhouette(0.9, 2.05)
-    (slope,) = torch.autograd.grad(first_surface_residual(rendering, pixel).sum(), rendering.samples.starts)
+    leaf = torch.tensor([[2.05, 6.0]], dtype=torch.float64).requires_grad_()
+    samples = RaySamples(leaf, leaf, torch.ones(1, 2, dtype=torch.bool))
+    rendering = replace(silhouette(0.9, 2.05), samples=samples)
+    (slope,) = torch.autograd.grad(first_surface_residual(rendering, pixel).sum(), leaf)
     torch.testing.assert_close(slope, torch.tensor([[1.0, 0.0]], dtype=torch.float64))
 
 
