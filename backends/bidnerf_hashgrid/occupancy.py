@@ -18,7 +18,7 @@ from bidnerf_core.waiting import may_wait
 BLOCK = 8
 """Steps along a ray that are skipped together where no occupied cell is near."""
 
-MOST = 128
+MOST = 96
 """Largest number of samples of a ray where the host must not wait to count them: the nearest ones, in occupied cells."""
 
 
