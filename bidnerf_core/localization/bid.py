@@ -31,7 +31,7 @@ class BidConfig(Settings):
 
 
 PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
-"""The paper's number of steps, with iNeRF's decay. Its learning rate is not given; this one was chosen on other frames."""
+"""The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is provisional."""
 
 BID_PRESETS = {
     "paper": BidConfig(descent=DescentSettings(level=0, pivot="camera"), adam=PAPER_STEPS),
