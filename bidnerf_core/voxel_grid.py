@@ -47,6 +47,12 @@ class VoxelGrid:
                 return VoxelGrid(bounds.lower, cell, (x, y, z))
             cell *= 1.01  # the last cell of each row reaches beyond the box
 
+    @staticmethod
+    def covering(bounds: SceneBounds, cell: float) -> VoxelGrid:
+        """Return the grid of cells of side ``cell`` (metres) that covers the box and begins at its lower corner."""
+        x, y, z = (max(1, math.ceil(side / cell)) for side in bounds.size)
+        return VoxelGrid(bounds.lower, cell, (x, y, z))
+
     @property
     def upper(self) -> tuple[float, float, float]:
         """Upper corner of the last cell (metres, world)."""

@@ -15,7 +15,7 @@ from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, Surfels, bake
-from bidnerf_core.mapping.surface_map import nearest_surfels
+from bidnerf_core.mapping.surfel_index import SurfelIndex
 from bidnerf_core.scenes.closed_form import ClosedFormScene
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.fields import GaussianBlobs
@@ -92,7 +92,7 @@ def of_points(
         positions, positions.new_tensor(normal).expand(count, 3), rgb, positions.new_zeros((count, 3, 3))
     )
     keyframes = torch.eye(4, dtype=torch.float64)[None]
-    return SurfaceMap(surfels, grid, nearest_surfels(numbers, grid.shape), keyframes)
+    return SurfaceMap(surfels, SurfelIndex.of(positions, grid), keyframes)
 
 
 def patch(half: int = 5, dtype: torch.dtype = torch.float32) -> SurfaceMap:

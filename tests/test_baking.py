@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -95,13 +96,13 @@ def test_a_field_shows_its_surface() -> None:
     assert told == [(i, 10) for i in range(1, 11)]
     assert height(surface).abs().max() < 1
     assert torch.equal(surface.keyframes, torch.stack([T.matrix() for T in poses]))
-    assert surface.nearest_in_cell.device.type == "cpu"
+    assert surface.index.entries.device.type == "cpu"
 
 
 def test_the_grid_has_no_more_cells_than_were_asked_for() -> None:
     for bounds in (baked.BOUNDS, replace(baked.BOUNDS, lower=(-1.0, -0.9, 0.599), upper=(1.0, 1.0, 0.601))):
         surface = bake(baked.FIELD, bounds, [], ball_views(), replace(baked.CONFIG, cells=5000))
-        assert 2500 < surface.nearest_in_cell.numel() <= 5000
+        assert math.prod(surface.grid.shape) <= 5000
         for size, side in zip(surface.grid.shape, bounds.size, strict=True):
             assert size * surface.cell >= side
 
@@ -132,7 +133,16 @@ def test_views_that_contradict_each_other_have_no_surface() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"rays": 0}, {"cells": 10}, {"opacity": 1.0}, {"opacity": float("nan")}, {"agreement": 9}]
+    "wrong",
+    [
+        {"rays": 0},
+        {"measured": 0},
+        {"cells": 10},
+        {"megabytes": 0.0},
+        {"opacity": 1.0},
+        {"opacity": float("nan")},
+        {"agreement": 9},
+    ],
 )
 def test_settings_are_judged(wrong: dict[str, float]) -> None:
     (name,) = wrong

@@ -58,6 +58,19 @@ def test_a_baked_map_needs_no_start(shared: Path, folder: Path, bidnerf: Run) ->
     assert "from 24 measured views" in err
     facts = json.loads(bidnerf("info", folder, "--json")[1])
     assert facts["surfels"] > 1000
+    surface = load_map(folder).surface
+    assert surface is not None
+    assert facts["surface"] == {
+        "cell": surface.cell,
+        "cells": len(surface.index.entries),
+        "MiB": round(surface.bytes / 2**20, 1),
+    }
+    for said in (
+        f"{facts['surface']['cells']} cells",
+        f"{facts['surface']['MiB']} MiB",
+        f"side of {surface.cell:.3g}",
+    ):
+        assert said in err
     status, out, _ = bidnerf("localize", folder, data, "--frame", "t_0000", "--no-start", "--json")
     found = json.loads(out)
     assert (status, found["method"]) == (0, "auto")

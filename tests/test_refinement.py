@@ -9,9 +9,11 @@ import pytest
 import torch
 from torch import Generator
 
+import baked
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
+from bidnerf_core.localization.fusion import finest_cost
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
@@ -89,3 +91,17 @@ def test_at_the_truth_no_step_leads_away() -> None:
     problem = single(FIELD, BOUNDS, FRAME, None)
     steps = take_few_steps(problem, TRUTH, stage, settings, Generator().manual_seed(0))
     assert float(pose_error(steps.poses, TRUTH).translation.max()) < 1e-3
+
+
+def test_a_field_that_shows_something_else_leads_no_pose_off_a_surface_that_determines_it() -> None:
+    view = baked.unseen()[0]
+    search, problem = baked.point_search(view), baked.problem(view)
+    stage, finest = RefinementStage(3, 256), finest_cost(search.surface, search.cloud)
+    together, alone = (
+        take_few_steps(problem, view.T_ref_camera, stage, rendered(), Generator().manual_seed(0), surface)
+        for surface in (finest, None)
+    )
+    fused, misled = (pose_error(steps.poses, view.T_ref_camera).translation for steps in (together, alone))
+    assert float(fused[-1]) < search.surface.cell
+    assert float(misled[-1]) > 10 * search.surface.cell
+    assert together.inliers < 0.9  # what it renders is rejected nevertheless

@@ -13,6 +13,7 @@ import baked
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.mapping import SurfaceMap, Surfels
+from bidnerf_core.mapping.surfel_index import SurfelIndex
 from bidnerf_core.observations import Observations
 from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.se3 import SE3
@@ -83,11 +84,11 @@ def test_a_moved_world_changes_nothing(generator: Generator) -> None:
     T_new_world = SE3(turn, surface.cell * torch.tensor([3.0, -5.0, 11.0], dtype=torch.float64))
     parts, lower = surface.surfels, T_new_world.apply(torch.tensor(surface.grid.lower, dtype=torch.float64))
     (x, y, z), (a, b, c) = lower.tolist(), surface.grid.shape
-    moved = SurfaceMap(
-        Surfels(T_new_world.apply(parts.positions), parts.normals @ turn.T, parts.rgb, parts.rgb_gradient @ turn.T),
-        VoxelGrid((x, y, z), surface.cell, (b, c, a)), surface.nearest_in_cell.permute(1, 2, 0).contiguous(),
-        surface.keyframes,
-    )  # fmt: skip
+    surfels = Surfels(
+        T_new_world.apply(parts.positions), parts.normals @ turn.T, parts.rgb, parts.rgb_gradient @ turn.T
+    )
+    grid = VoxelGrid((x, y, z), surface.cell, (b, c, a))
+    moved = SurfaceMap(surfels, SurfelIndex.of(surfels.positions, grid), surface.keyframes)
     T = poses(generator)
     here, there = (SurfaceCost(s, cloud, SCALES)(t) for s, t in ((surface, T), (moved, T_new_world @ T)))
     assert torch.allclose(here.cost, there.cost, rtol=1e-9)

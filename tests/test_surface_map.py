@@ -8,31 +8,13 @@ from scipy.spatial import cKDTree
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.errors import InputError
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.casting import trace
-from bidnerf_core.mapping.surface_map import nearest_surfels
 from bidnerf_core.scenes.primitives import Box, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import blotches
 from bidnerf_core.se3 import SE3
 
 PAINT = blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1)
-
-
-def test_each_cell_knows_the_nearest_occupied_one(generator: Generator) -> None:
-    shape = (9, 12, 7)
-    occupied = torch.randperm(9 * 12 * 7, generator=generator)[:40].sort().values
-    place = torch.cartesian_prod(*(torch.arange(n) for n in shape)).double()
-    least, _ = cKDTree(place[occupied].numpy()).query(place.numpy())
-    chosen = nearest_surfels(occupied, shape).view(-1).long()
-    found = torch.linalg.vector_norm(place - place[occupied][chosen], dim=-1)
-    assert torch.allclose(found, torch.from_numpy(least))
-    assert chosen[occupied].tolist() == list(range(40))
-
-
-def test_no_surface_is_told() -> None:
-    with pytest.raises(InputError, match="no surface to bake"):
-        nearest_surfels(torch.zeros(0, dtype=torch.long), (2, 2, 2))
 
 
 def test_the_nearest_surfel_is_found_to_within_a_cell(generator: Generator) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.mapping import surface_from_tensors, surface_tensors
+from bidnerf_core.mapping.tensors import INDEX_KINDS
+from voxels import cell_centres
 
 
 def test_there_and_back() -> None:
@@ -24,7 +26,8 @@ def test_an_uneven_corner_comes_back_exactly() -> None:
     from dataclasses import replace
 
     toy = baked.toy()
-    odd = replace(toy, grid=replace(toy.grid, lower=(0.1, 1 / 3, -1e-7), cell=1 / 7))
+    grid = replace(toy.grid, lower=(0.1, 1 / 3, -1e-7), cell=1 / 7)
+    odd = replace(toy, index=replace(toy.index, grid=grid))
     again = surface_from_tensors(surface_tensors(odd))
     assert again.grid == odd.grid
 
@@ -41,10 +44,17 @@ def nan(value: Tensor) -> Tensor:
         ("cell", torch.zeros_like, "cell is 0"),
         ("rgb", lambda v: v[1:], "equally many"),
         ("normals", lambda v: v[:, :2], "normals is"),
-        ("nearest", lambda v: v + 1, "expected 0 to"),
-        ("nearest", lambda v: v - 1, "expected 0 to"),
-        ("nearest", lambda v: v[:0], "nearest"),
-        ("nearest", lambda v: v.long(), "int64"),
+        ("entries", lambda v: v + 1000, "expected 0 to"),
+        ("entries", lambda v: v - 1, "expected 0 to"),
+        ("entries", lambda v: v[:0], "entries"),
+        ("entries", lambda v: v[:-1], "do not exist"),
+        ("entries", lambda v: v.long(), "int64"),
+        ("first", lambda v: v - 1, "do not exist"),
+        ("first", lambda v: v[1:], "other blocks"),
+        ("level", lambda v: v + 4, "level is up to"),
+        ("shape", lambda v: v + 8, "other blocks"),
+        ("shape", lambda v: 0 * v, "numbers of cells"),
+        ("shape", lambda v: v * 10**6, "numbers of cells|larger cells"),
         ("keyframes", lambda v: v.float(), "keyframes is torch.float32"),
         ("keyframes", lambda v: v[:0], "no keyframe"),
         ("keyframes", lambda v: 2 * v, "not rigid"),
@@ -56,9 +66,29 @@ def test_what_is_no_surface_is_refused(name: str, change, said: str) -> None:
         surface_from_tensors(tensors | {name: change(tensors[name])})
 
 
-@pytest.mark.parametrize("name", ["positions", "nearest", "lower"])
+@pytest.mark.parametrize("name", ["positions", "entries", "lower"])
 def test_a_missing_tensor_is_named(name: str) -> None:
     tensors = surface_tensors(baked.toy())
     del tensors[name]
     with pytest.raises(KeyError, match=name):
         surface_from_tensors(tensors)
+
+
+def dense_tensors(generator: Generator) -> tuple[dict[str, Tensor], Tensor]:
+    """Return a surface as older versions stored it, and the surfel of each of its cells."""
+    tensors = surface_tensors(baked.toy())
+    for name in INDEX_KINDS:
+        del tensors[name]
+    nearest = torch.randint(0, len(tensors["positions"]), (13, 8, 21), generator=generator, dtype=torch.int32)
+    return tensors | {"nearest": nearest}, nearest
+
+
+def test_a_dense_index_of_an_older_version_gives_the_same_answers(generator: Generator) -> None:
+    tensors, nearest = dense_tensors(generator)
+    surface = surface_from_tensors(tensors)
+    assert surface.grid.shape == (13, 8, 21)
+    assert torch.equal(surface.nearest(cell_centres(surface.grid)), nearest.long())
+    stored = surface_from_tensors(surface_tensors(surface))
+    assert torch.equal(stored.nearest(cell_centres(surface.grid)), nearest.long())
+    with pytest.raises(ValueError, match="nearest has indices"):
+        surface_from_tensors(tensors | {"nearest": -1 - nearest})

@@ -124,6 +124,8 @@ def _bake_surface(
     say(
         f"{folder}: surface of {len(surface.surfels)} pieces from {source} views, {time.monotonic() - began:.1f} s"
     )
+    size = f"{surface.stored_cells} cells with a side of {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
+    say(f"{folder}: the surface is indexed by {size}")
 
 
 def _bake_landmarks(

@@ -12,6 +12,7 @@ from bidnerf_core.field import levels
 from bidnerf_core.map_parts import load_capture
 from bidnerf_core.mapping.capture_advice import sentences
 from bidnerf_core.mapping.capture_report import CaptureReport
+from bidnerf_core.mapping.surface_map import SurfaceMap
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import Map, load_map
 
@@ -70,6 +71,7 @@ def describe(folder: Path, stored: Map) -> dict[str, Any]:
         "levels": len(levels(stored.field)),
         "parameters": parameters,
         "surfels": 0 if stored.surface is None else len(stored.surface.surfels),
+        "surface": None if stored.surface is None else _surface_facts(stored.surface),
         "landmarks": 0 if stored.landmarks is None else len(stored.landmarks),
         "trial": None if stored.landmarks is None else to_plain(stored.landmarks.trial),
         "bytes": sum(file.stat().st_size for file in folder.iterdir() if file.is_file()),
@@ -77,6 +79,11 @@ def describe(folder: Path, stored: Map) -> dict[str, Any]:
         "config": info.config,
         "bidnerf": info.bidnerf,
     }
+
+
+def _surface_facts(surface: SurfaceMap) -> dict[str, Any]:
+    """Return the side of a cell (metres), the number of cells that are stored, and the memory (MiB) of a surface."""
+    return {"cell": surface.cell, "cells": surface.stored_cells, "MiB": round(surface.mebibytes, 1)}
 
 
 def _shown(value: Any) -> str:

@@ -39,11 +39,13 @@ from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import surface_covariance
+from bidnerf_core.localization.fusion import finest_cost
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
     RefinementSettings,
     RefinementStage,
+    rendered_depth_scale,
 )
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
@@ -204,14 +206,16 @@ def _refined(
 ) -> tuple[SearchResult, float]:
     """Return a refined pose, and the share of rendered rays that agree with the measurements there.
 
-    The surface is as coarse as its cells; the field has seen every pixel of the training images.
+    The surface is as coarse as its cells, and the field as its training: both count as far as they agree with what was
+    measured.
     """
-    cell = search.surface.cell
+    scale = rendered_depth_scale(problem.bounds)
     stage = RefinementStage(
-        config.refine_steps, config.refine_rays, depth_scale=6 * cell, surface_sigma=cell / 2
+        config.refine_steps, config.refine_rays, depth_scale=scale, surface_sigma=scale / 12
     )
     settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
-    steps = take_few_steps(problem, found.T[0], stage, settings, generator)
+    finest = finest_cost(search.surface, search.cloud)
+    steps = take_few_steps(problem, found.T[0], stage, settings, generator, finest)
     with torch.no_grad():
         scores = search.score(steps.poses)
     if not float(scores[-1]) <= float(scores[0]) + WORSE:

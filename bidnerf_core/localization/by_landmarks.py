@@ -13,15 +13,17 @@ from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_d
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.covariance import FINEST, INDEPENDENT, LEAST_VARIANCE
+from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
+from bidnerf_core.localization.covariance import INDEPENDENT
+from bidnerf_core.localization.fusion import FusedTerm, finest_cost, rendered_term, surface_term
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
     RefinementSettings,
     RefinementStage,
+    rendered_depth_scale,
 )
-from bidnerf_core.localization.normal_equations import Cost, Scaled, Sum
+from bidnerf_core.localization.normal_equations import Sum
 from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Verdict
@@ -34,31 +36,12 @@ from bidnerf_core.se3 import SE3
 
 POINTS = 2000
 """Largest number of measured points that are fused."""
-SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
-"""Numbers of independent measurements that a view's points on the surface and its rendered rays count as."""
 FUSION_STEPS = 2
 """Number of second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
 DEPTH_SCALE_PRIOR, DEPTH_SCALE_NOISE = 0.02, 0.01
 """Relative standard deviations of a depth sensor's scale, and of the scale that a few landmarks give."""
-DEPTH_CELLS, RENDERED_DEPTH_SHARE = 6.0, 0.01
-"""Depth difference at which outliers begin in rendered rays: in cells of the surface's grid, or without a surface as a share
-of the scene's extent.
-"""
-
-
-@dataclass(frozen=True, eq=False)
-class FusedTerm:
-    """A cost with the variance of its residuals, so that costs in different units can be added."""
-
-    cost: Cost
-    variance: float
-    measurements: float  # independent ones that it counts for
-
-    @property
-    def scaled(self) -> Cost:
-        return Scaled(self.cost, self.measurements / self.variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,27 +125,21 @@ def _surface_term(
 ) -> tuple[FusedTerm, SurfaceCost]:
     """Return the term of measured points on the surface, and the cost itself."""
     cloud = PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator)
-    cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
+    cost = finest_cost(surface, cloud)
     assert problem.start is not None
-    variance = max(float(cost.residual_variance(problem.start[None])[0]), LEAST_VARIANCE)
-    return FusedTerm(cost, variance, SURFACE_MEASUREMENTS * len(problem.views)), cost
+    return surface_term(cost, problem.start, len(problem.views)), cost
 
 
 def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator) -> FusedTerm:
     """Return the term that compares rendered rays with the images."""
-    surface = problem.surface
-    outlier = (
-        DEPTH_CELLS * surface.cell if surface is not None else RENDERED_DEPTH_SHARE * max(problem.bounds.size)
-    )
-    stage = RefinementStage(FUSION_STEPS, rays, depth_scale=outlier)
+    stage = RefinementStage(FUSION_STEPS, rays, depth_scale=rendered_depth_scale(problem.bounds))
     depth = DepthSettings() if problem.has_depth else None
     settings = RenderedCostSettings(
         ColourSettings(), depth, RefinementSettings(exposure=problem.exposure_varies)
     )
     cost = settings.drawn(problem, stage, about, generator)
     assert problem.start is not None
-    variance = max(float(cost.cost(problem.start[None])[0]), LEAST_VARIANCE)
-    return FusedTerm(cost, variance, RENDERED_MEASUREMENTS * len(problem.views))
+    return rendered_term(cost, float(cost.cost(problem.start[None])[0]), len(problem.views))
 
 
 def _fused(answer: LandmarkAnswer, terms: dict[str, FusedTerm], about: Pivot) -> LandmarkAnswer:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
+from bidnerf_core.field import SceneBounds
 from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.solvers.history import AnswerName
 from bidnerf_core.pixels import DrawerName
@@ -18,6 +20,9 @@ from bidnerf_core.residuals import (
 )
 from bidnerf_core.robust import Robust, RobustName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
+
+RENDERED_DEPTH_SHARE = 0.038
+"""Depth difference at which outliers begin in rendered rays, as a share of the scene's mean side."""
 
 
 @dataclass(frozen=True)
@@ -175,3 +180,12 @@ class RefinementStage:
     damping: float = 1e-3  # at first
     # times that each pose is first shifted to bring what it renders to the middle of what was measured
     centring: int = 0
+
+
+def rendered_depth_scale(bounds: SceneBounds) -> float:
+    """Return the depth difference (metres) at which outliers begin in rendered rays.
+
+    A field divides its box into parts whose size is a share of the box, and its depth errs accordingly. How fine a baked
+    surface is has no influence: it may be of measured depth, which is more accurate than what the field renders.
+    """
+    return RENDERED_DEPTH_SHARE * math.prod(bounds.size) ** (1 / 3)

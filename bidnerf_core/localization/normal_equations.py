@@ -28,6 +28,10 @@ class NormalEquations:
             self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian
         )
 
+    def scaled(self, factor: float) -> NormalEquations:
+        """Return the equations of the cost multiplied by ``factor``."""
+        return NormalEquations(factor * self.cost, factor * self.gradient, factor * self.hessian)
+
     def chosen(self, which: Tensor, other: NormalEquations) -> NormalEquations:
         """Return these equations where ``which`` (h) holds, and ``other`` elsewhere."""
         return NormalEquations(
@@ -74,7 +78,4 @@ class Scaled:
     factor: float
 
     def __call__(self, T: SE3) -> NormalEquations:
-        found = self.cost(T)
-        return NormalEquations(
-            self.factor * found.cost, self.factor * found.gradient, self.factor * found.hessian
-        )
+        return self.cost(T).scaled(self.factor)

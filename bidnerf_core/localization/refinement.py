@@ -15,8 +15,11 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
+from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import sandwich_covariance
+from bidnerf_core.localization.fusion import rendered_term, surface_term
 from bidnerf_core.localization.method_settings import RefinementStage
+from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.centring import centred
@@ -75,34 +78,47 @@ class FewSteps:
 
 
 def take_few_steps(
-    problem: Problem, start: SE3, stage: RefinementStage, settings: RenderedCostSettings, generator: Generator
-) -> FewSteps:
+    problem: Problem, start: SE3, stage: RefinementStage, settings: RenderedCostSettings, generator: Generator,
+    surface: SurfaceCost | None = None,
+) -> FewSteps:  # fmt: skip
     """Take up to ``stage.steps`` second-order steps from one pose that is nearly right, on one draw of rays.
 
-    It stops before a step that would not lower the cost. The last pose is assessed on the same rays and without derivatives,
-    which costs half as much as ``refine``.
+    With the cost of measured points on the ``surface``, the steps lower the sum of both, each divided by the variance of its
+    residuals at the start: a field that renders badly moves a pose little if the surface determines it well. It stops before
+    a step that would not lower the cost. The last pose is assessed on the same rays and without derivatives, which costs half
+    as much as ``refine``.
     """
-    device = problem.device
-    about = pivot(settings.refinement.pivot, replace(problem, start=start)).to(device)
+    # The surface lies on the CPU. Without it, all steps stay where the field computes.
+    device, name = problem.device if surface is None else torch.device("cpu"), settings.refinement.pivot
+    about = pivot(name, replace(problem, start=start)) if surface is None else surface.cloud.pivot
+    about, views = about.to(device), len(problem.views)
     cost = settings.drawn(problem.on_device(), stage, about, generator)
     poses, inliers, lower = [start.to(device)], list[Tensor](), list[Tensor]()
     with without_waiting():
         here = cost.residuals(poses[0][None])
         inliers.append(here.inliers()[0])
+        rendered = rendered_term(cost, float(here.cost()[0]), views).weight
+        beside = None if surface is None else surface_term(surface, start, views).scaled
+        aligned = None if beside is None else beside(start[None])
         for left in reversed(range(stage.steps)):
-            equations = here.normal_equations()
+            equations = _sum(here.normal_equations().scaled(rendered), aligned)
             delta = equations.solve(torch.full_like(equations.cost, stage.damping))
             trial = about.moved(poses[-1][None], delta)
             here = cost.residuals(trial, derivatives=left > 0)
-            lower.append(here.cost()[0] < equations.cost[0])
+            aligned = None if beside is None else beside(trial)
+            reached = rendered * here.cost() + (0 if aligned is None else aligned.cost)
+            lower.append(reached[0] < equations.cost[0])
             if may_wait(device) and not bool(lower[-1]):
                 break
             poses.append(trial[0])
             inliers.append(here.inliers()[0])
     # Where the host must not wait, steps were taken beyond the first that did not lower the cost: they are left out here.
-    taken = torch.stack(lower).cpu().cumprod(0).sum() if lower else 0
-    count = int(taken) + 1
+    count = 1 + int(torch.stack(lower).cpu().cumprod(0).sum() if lower else 0)
     return FewSteps(SE3.stack(poses[:count]).to("cpu"), float(inliers[count - 1]))
+
+
+def _sum(equations: NormalEquations, others: NormalEquations | None) -> NormalEquations:
+    return equations if others is None else equations + others
 
 
 def _ranked(cost: RenderedCost, T: SE3, history: History) -> SE3:

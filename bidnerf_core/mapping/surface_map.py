@@ -1,4 +1,4 @@
-"""The baked surface: surfels, and for every cell of a grid the nearest of them."""
+"""The baked surface: surfels, and an index that finds the one nearest to a point."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
-from bidnerf_core.mapping.surfels import Surfels
+from bidnerf_core.mapping.surfel_index import SurfelIndex
+from bidnerf_core.mapping.surfels import Surfels, surfel_bytes
 from bidnerf_core.voxel_grid import VoxelGrid
 
 REACH = 0.7
@@ -22,12 +21,31 @@ REACH = 0.7
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMap:
-    """Surfels, and a voxel grid around them that finds the one nearest to a point in constant time."""
+    """Surfels, and the index that finds the one nearest to a point in constant time."""
 
     surfels: Surfels
-    grid: VoxelGrid
-    nearest_in_cell: Int[Tensor, "x y z"]  # index of the surfel nearest to each cell, int32
+    index: SurfelIndex
     keyframes: Float[Tensor, "k 4 4"]  # T_world_camera from which the surface was seen
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The cells around the surface in which points are looked up."""
+        return self.index.grid
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the surfels and their index take."""
+        return surfel_bytes(len(self.surfels)) + self.index.bytes
+
+    @property
+    def mebibytes(self) -> float:
+        """Memory that the surfels and their index take, in MiB."""
+        return self.bytes / 2**20
+
+    @property
+    def stored_cells(self) -> int:
+        """Number of entries of the index: one for each cell near the surface, and one for several cells far from it."""
+        return len(self.index.entries)
 
     @property
     def cell(self) -> float:
@@ -64,31 +82,15 @@ class SurfaceMap:
     def warm_up(self) -> None:
         """Compute the cached extent and reach now, so that the first localization takes no longer than the others."""
         _ = self.extent, self.reach
+        self.index.warm_up()
 
     def nearest(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
-        """Return the index of the surfel nearest to each point (metres, world), to within a cell.
+        """Return the index of the surfel nearest to each point (metres, world), as exactly as ``SurfelIndex`` says.
 
         A point outside the grid is first clamped to the grid's border.
         """
-        return self.grid.at(self.nearest_in_cell, points).long()
+        return self.index(points)
 
     def distance(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p"]:
         """Return the distance from each point to its nearest surfel (metres)."""
         return torch.linalg.vector_norm(points - self.surfels.positions[self.nearest(points)], dim=-1)
-
-
-def nearest_surfels(occupied: Int[Tensor, "n"], shape: tuple[int, int, int]) -> Int[Tensor, "x y z"]:
-    """Return, for each cell of a grid of ``shape``, the index in ``occupied`` of the nearest occupied cell.
-
-    ``occupied`` holds the flat numbers of the cells that contain a surfel. Raises ``InputError`` if it is empty.
-    """
-    if not len(occupied):
-        raise InputError("no surface to bake: no point that several views agree on")
-    empty = torch.ones(shape, dtype=torch.bool)
-    empty.view(-1)[occupied] = False
-    place = torch.from_numpy(
-        distance_transform_edt(empty.numpy(), return_distances=False, return_indices=True)
-    ).long()
-    number = torch.full(shape, -1, dtype=torch.int32)
-    number.view(-1)[occupied] = torch.arange(len(occupied), dtype=torch.int32)
-    return number[place[0], place[1], place[2]]

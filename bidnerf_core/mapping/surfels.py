@@ -27,6 +27,11 @@ class Surfels:
         return len(self.positions)
 
 
+def surfel_bytes(count: int) -> int:
+    """Return the memory that ``count`` surfels take: 18 numbers of 4 bytes each."""
+    return 72 * count
+
+
 def merged(cells: Int[Tensor, "p"], *values: Float[Tensor, "p _"]) -> tuple[Int[Tensor, "n"], list[Tensor]]:
     """Return which cells hold points, in ascending order, and the means of the points' ``values`` in each of them."""
     found, place, counts = cells.unique(return_inverse=True, return_counts=True)

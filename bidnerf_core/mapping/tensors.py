@@ -6,41 +6,69 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.mapping.surface_map import SurfaceMap
+from bidnerf_core.mapping.surfel_index import CELLS, COARSER_FROM, SurfelIndex, block_shape
 from bidnerf_core.mapping.surfels import Surfels
 from bidnerf_core.se3 import SE3
 from bidnerf_core.voxel_grid import VoxelGrid
 
-SURFACE_KINDS = {
+Kinds = dict[str, tuple[tuple[int, ...], torch.dtype]]
+"""Shape (-1: any length) and dtype of named tensors."""
+SURFACE_KINDS: Kinds = {
     "positions": ((-1, 3), torch.float32),
     "normals": ((-1, 3), torch.float32),
     "rgb": ((-1, 3), torch.float32),
     "rgb_gradient": ((-1, 3, 3), torch.float32),
-    "nearest": ((-1, -1, -1), torch.int32),
     "keyframes": ((-1, 4, 4), torch.float64),
     "lower": ((3,), torch.float64),
     "cell": ((), torch.float64),
 }
-"""Shape (-1: any length) and dtype of each tensor."""
+INDEX_KINDS: Kinds = {
+    "shape": ((3,), torch.int64),
+    "first": ((-1, -1, -1), torch.int32),
+    "level": ((-1, -1, -1), torch.uint8),
+    "entries": ((-1,), torch.int32),
+}
+DENSE_KINDS: Kinds = {"nearest": ((-1, -1, -1), torch.int32)}
+"""The index of surfaces that older versions baked: a surfel for every cell of the grid."""
 
 
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
-    """Return all that a surface consists of, under the names and in the dtypes of ``SURFACE_KINDS``."""
-    parts = surface.surfels
+    """Return all that a surface consists of, under the names and in the dtypes of ``SURFACE_KINDS`` and ``INDEX_KINDS``."""
+    parts, index = surface.surfels, surface.index
     found = {
         "positions": parts.positions, "normals": parts.normals, "rgb": parts.rgb, "rgb_gradient": parts.rgb_gradient,
-        "nearest": surface.nearest_in_cell, "keyframes": surface.keyframes,
+        "keyframes": surface.keyframes,
         "lower": torch.tensor(surface.grid.lower, dtype=torch.float64),
         "cell": torch.tensor(surface.cell, dtype=torch.float64),
+        "shape": torch.tensor(surface.grid.shape),
+        "first": index.first, "level": index.level, "entries": index.entries,
     }  # fmt: skip
-    return {name: found[name].to(kind).contiguous().clone() for name, (_, kind) in SURFACE_KINDS.items()}
+    kinds = SURFACE_KINDS | INDEX_KINDS
+    return {name: found[name].to(kind).contiguous().clone() for name, (_, kind) in kinds.items()}
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
-    """Return the surface that ``surface_tensors`` gave as ``tensors``.
+    """Return the surface that ``surface_tensors`` gave as ``tensors``, in this version or in an older one.
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """
-    for name, (shape, kind) in SURFACE_KINDS.items():
+    dense = "nearest" in tensors
+    _check_kinds(tensors, SURFACE_KINDS | (DENSE_KINDS if dense else INDEX_KINDS))
+    count = len(tensors["positions"])
+    if any(len(tensors[name]) != count for name in ("normals", "rgb", "rgb_gradient")) or not count:
+        raise ValueError("expected equally many positions, normals and colours of surfels, and at least one")
+    _check_surfels_exist(tensors, "nearest" if dense else "entries", count)
+    if not float(tensors["cell"]) > 0:
+        raise ValueError(f"cell is {float(tensors['cell'])}, expected a length")
+    if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
+        raise ValueError("no keyframe, or one that is not rigid")
+    surfels = Surfels(*(tensors[name] for name in ("positions", "normals", "rgb", "rgb_gradient")))
+    index = _dense_index(tensors) if dense else _index(tensors)
+    return SurfaceMap(surfels, index, tensors["keyframes"])
+
+
+def _check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
+    for name, (shape, kind) in kinds.items():
         value = tensors[name]
         fits = len(shape) == value.dim() and all(
             a in (-1, b) for a, b in zip(shape, value.shape, strict=True)
@@ -49,16 +77,34 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
             raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, expected {kind} {list(shape)}")
         if value.is_floating_point() and not bool(value.isfinite().all()):
             raise ValueError(f"{name} holds NaN or infinity")
-    count, nearest = len(tensors["positions"]), tensors["nearest"]
-    if any(len(tensors[name]) != count for name in ("normals", "rgb", "rgb_gradient")) or not count:
-        raise ValueError("expected equally many positions, normals and colours of surfels, and at least one")
-    if not nearest.numel() or not 0 <= int(nearest.min()) <= int(nearest.max()) < count:
-        raise ValueError(f"nearest has indices of surfels that do not exist, expected 0 to {count - 1}")
-    if not float(tensors["cell"]) > 0:
-        raise ValueError(f"cell is {float(tensors['cell'])}, expected a length")
-    if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
-        raise ValueError("no keyframe, or one that is not rigid")
-    surfels = Surfels(*(tensors[name] for name in ("positions", "normals", "rgb", "rgb_gradient")))
-    (x, y, z), (nx, ny, nz) = tensors["lower"].tolist(), nearest.shape
-    grid = VoxelGrid((x, y, z), float(tensors["cell"]), (nx, ny, nz))
-    return SurfaceMap(surfels, grid, nearest, tensors["keyframes"])
+
+
+def _check_surfels_exist(tensors: dict[str, Tensor], name: str, count: int) -> None:
+    named = tensors[name]
+    if not named.numel() or not 0 <= int(named.min()) <= int(named.max()) < count:
+        raise ValueError(f"{name} has indices of surfels that do not exist, expected 0 to {count - 1}")
+
+
+def _grid(tensors: dict[str, Tensor], shape: list[int]) -> VoxelGrid:
+    (x, y, z), (nx, ny, nz) = tensors["lower"].tolist(), shape
+    return VoxelGrid((x, y, z), float(tensors["cell"]), (nx, ny, nz))
+
+
+def _dense_index(tensors: dict[str, Tensor]) -> SurfelIndex:
+    return SurfelIndex.of_cells(_grid(tensors, list(tensors["nearest"].shape)), tensors["nearest"])
+
+
+def _index(tensors: dict[str, Tensor]) -> SurfelIndex:
+    """Return the index, checked so that no look-up reads outside of it."""
+    shape: list[int] = tensors["shape"].tolist()
+    if min(shape) < 1 or max(shape) > 2**31:
+        raise ValueError(f"shape is {shape}, expected numbers of cells")
+    grid, level, first = _grid(tensors, shape), tensors["level"], tensors["first"]
+    if not block_shape(grid) == tuple(level.shape) == tuple(first.shape):
+        raise ValueError(f"level and first are of other blocks than those of a grid of {shape} cells")
+    if int(level.max()) > len(COARSER_FROM):
+        raise ValueError(f"level is up to {int(level.max())}, expected {len(COARSER_FROM)} at most")
+    ends = first.long() + (CELLS >> 3 * level.long())
+    if int(first.min()) < 0 or int(ends.max()) > len(tensors["entries"]):
+        raise ValueError("first names entries that do not exist")
+    return SurfelIndex(grid, first, level, tensors["entries"])

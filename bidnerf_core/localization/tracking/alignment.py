@@ -11,10 +11,10 @@ from torch import Generator, Tensor
 
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
-from bidnerf_core.localization.by_landmarks import SURFACE_MEASUREMENTS, FusedTerm
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE, surface_covariance
+from bidnerf_core.localization.fusion import surface_term
 from bidnerf_core.localization.normal_equations import Sum
 from bidnerf_core.localization.search.by_points import JUDGED
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
@@ -120,8 +120,7 @@ def aligned(
     prior, T = GaussianPrior(predicted, covariance, about), predicted
     for distance in (spread, finest) if spread > 1.5 * finest else (finest,):
         cost = SurfaceCost(surface, cloud, PointScales(distance))
-        variance = max(float(cost.residual_variance(T[None])[0]), LEAST_VARIANCE)
-        term = FusedTerm(cost, variance, SURFACE_MEASUREMENTS * views)
+        term = surface_term(cost, T, views)
         T = (
             descend(Sum((prior, term.scaled)), T[None], ALIGNMENT_STEPS, about.moved, stop=ALIGNED_STEP)
             .T[0]

@@ -1,0 +1,136 @@
+"""The size of a surface's cells: as fine as the images resolve, no finer than they are accurate, within a limit of memory."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import warnings
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.field import SceneBounds
+from bidnerf_core.mapping.posed_depth import PosedDepthImage, witnesses
+from bidnerf_core.mapping.surfel_index import MOST_CELLS, SIDE, block_levels, index_bytes
+from bidnerf_core.mapping.surfels import surfel_bytes
+from bidnerf_core.voxel_grid import VoxelGrid
+
+PIXEL = 0.7
+"""Cell as a share of a pixel's footprint: pixels of several images lie between each other's and together resolve more."""
+LAYER = 2.0
+"""Least cell in standard deviations of depth: in finer ones, the points of one plane would make several layers of surfels."""
+PER_CELL = 1.32
+"""Least mean number of points in the cells that hold any. Points scattered at random leave 5/9 of the cells empty then; with
+fewer points, surfels are farther from each other on average than the radius of their discs, which is 1.5 cells.
+"""
+COMPARED_IMAGES, COMPARED_POINTS = 40, 400
+"""Images, and points of each, from which the noise is estimated."""
+GROSS = 5.0
+"""Differences of more than so many medians are occlusions and gross errors, not noise."""
+MOST_NOISE = 0.02
+"""Images that differ by more than this share of the median distance contradict each other; it is not taken for noise."""
+MAD_TO_SIGMA = 1.4826
+"""Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
+COARSER = 2**0.25
+"""Factor by which cells grow until there are enough points in them, or until they take little enough memory."""
+
+
+def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
+    """Return the least cell (metres) that the images are worth, by their resolution and by the noise of measured depth.
+
+    Rendered images are thinned out too much to tell noise from the structure of the scene.
+    """
+    measured = [posed for posed in images if posed.measured]
+    return max(PIXEL * footprint(images, opacity), LAYER * depth_noise(measured, opacity))
+
+
+def footprint(images: Sequence[PosedDepthImage], opacity: float) -> float:
+    """Return the side (metres) of what a pixel of the full images covers at the median distance; 0 where nothing is seen."""
+    return _median([float(d.median()) / posed.full_focal for posed, d in _depths(images, opacity)])
+
+
+def spacing(images: Sequence[PosedDepthImage], opacity: float) -> float:
+    """Return the side (metres) of what a pixel of the images as they are, thinned out, covers at the median distance."""
+    return _median([float(d.median()) / posed.focal for posed, d in _depths(images, opacity)])
+
+
+def depth_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
+    """Return the standard deviation (metres) of one image's depth, from how much images differ on the same points.
+
+    It contains errors of the poses. It is 0 where no two images show the same points.
+    """
+    return _spread(images, opacity, lambda posed, points: posed.smoothly_beyond(points, opacity))
+
+
+def comparison_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
+    """Return ``depth_noise`` as ``agreed`` sees it: against the nearest pixels of images that were thinned out."""
+    return _spread(images, opacity, PosedDepthImage.beyond)
+
+
+def _spread(
+    images: Sequence[PosedDepthImage],
+    opacity: float,
+    beyond: Callable[[PosedDepthImage, Float[Tensor, "p 3"]], Float[Tensor, "p"]],
+) -> float:
+    found = []
+    for number in range(0, len(images), max(1, math.ceil(len(images) / COMPARED_IMAGES))):
+        points = images[number].points(images[number].solid(opacity))
+        points = points[:: max(1, len(points) // COMPARED_POINTS)]
+        found += [beyond(images[other], points) for other in witnesses(number, images)]
+    differences = torch.cat(found).abs() if found else torch.zeros(0)
+    differences = differences[differences.isfinite()]
+    if not len(differences):
+        return 0.0
+    near = differences[differences <= GROSS * differences.median()]
+    distance = _median([float(depths.median()) for _, depths in _depths(images, opacity)])
+    return min(MAD_TO_SIGMA * float(near.median()) / math.sqrt(2), MOST_NOISE * distance)
+
+
+def chosen_grid(
+    points: Float[Tensor, "p 3"], bounds: SceneBounds, finest: float, coarsest: float, megabytes: float
+) -> VoxelGrid:
+    """Return the grid whose cells (metres) are ``finest``, or coarser where points (metres, world) are few or memory is short.
+
+    For want of points, cells grow no larger than ``coarsest``, at which each holds a pixel. An ``InputWarning`` says by how
+    much the limit of ``megabytes`` made them larger. Raises ``InputError`` where no cell is large enough for that limit.
+    """
+    grid = VoxelGrid.covering(bounds, finest)
+    while grid.cell < coarsest and len(points) < PER_CELL * len(grid.numbers(points).unique()):
+        grid = VoxelGrid.covering(bounds, min(COARSER * grid.cell, coarsest))
+    wished, needed = grid, surface_bytes(points, grid)
+    while surface_bytes(points, grid) > 1e6 * megabytes:
+        if grid.cell > max(bounds.size):
+            raise InputError(f"no surface fits into {megabytes:g} MB; allow more megabytes")
+        grid = VoxelGrid.covering(bounds, COARSER * grid.cell)
+    if grid is not wished:
+        size = "too many cells" if math.isinf(needed) else f"{needed / 1e6:.0f} MB"
+        warnings.warn(
+            f"the surface would take {size} with cells of {wished.cell:.3g}; cells of {grid.cell:.3g} keep it within"
+            f" {megabytes:g} MB, of which 'bake --megabytes' allows more",
+            InputWarning,
+            stacklevel=2,
+        )
+    return grid
+
+
+def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
+    """Return the memory that a surface of these points (metres, world) takes; infinite where it has too many cells."""
+    if math.prod(-(-count // SIDE) * SIDE for count in grid.shape) > MOST_CELLS:
+        return math.inf
+    surfels = len(grid.numbers(points).unique())
+    return surfel_bytes(surfels) + index_bytes(block_levels(points, grid))
+
+
+def _depths(
+    images: Sequence[PosedDepthImage], opacity: float
+) -> list[tuple[PosedDepthImage, Float[Tensor, "p"]]]:
+    """Return the images that show a surface, with its depths (metres)."""
+    found = [(posed, posed.image.depth[posed.solid(opacity)]) for posed in images]
+    return [(posed, depths) for posed, depths in found if len(depths)]
+
+
+def _median(values: Sequence[float]) -> float:
+    return statistics.median(values) if values else 0.0

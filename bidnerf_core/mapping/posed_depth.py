@@ -1,0 +1,133 @@
+"""Images with depth and a known pose, and how well they agree with each other on where the surface is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.frames import View
+from bidnerf_core.rendering import RenderedImage, render_image
+from bidnerf_core.se3 import SE3
+
+WITNESSES = 8
+"""Largest number of other images with which each point is compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedDepthImage:
+    """An image with depth, its camera and its pose."""
+
+    intrinsics: Intrinsics
+    T_world_camera: SE3
+    image: RenderedImage
+    full_focal: float  # pixels, before the image was thinned out
+    measured: bool = False  # by a sensor: opacity is 1 where it measured, and 0 where nothing is known
+
+    @property
+    def focal(self) -> float:
+        """The focal length (pixels) of the image as it is."""
+        return mean_focal(self.intrinsics)
+
+    def solid(self, opacity: float) -> Bool[Tensor, "h w"]:
+        """Return the pixels that show a surface of at least this opacity."""
+        return (self.image.opacity > opacity) & (self.image.depth > 0)
+
+    def points(self, pixels: Bool[Tensor, "h w"]) -> Float[Tensor, "p 3"]:
+        """Return the points (metres, world) that these pixels show."""
+        rays = self.intrinsics.unproject(self.intrinsics.pixel_centres())[pixels]
+        return self.T_world_camera.to(torch.float32).apply(rays * self.image.depth[pixels][:, None])
+
+    def beyond(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
+        """Return how far behind each point (metres, world) its line of sight ends (metres of depth); NaN where the image
+        does not show it.
+        """
+        local = self.T_world_camera.to(torch.float32).inverse().apply(points)
+        u, v = self.intrinsics.project(local).unbind(-1)
+        height, width = self.image.depth.shape
+        within = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        index = torch.where(within, v.floor() * width + u.floor(), 0).long()
+        depth = self.image.depth.view(-1)[index]
+        nothing = self.image.opacity.view(-1)[index] < 0.5
+        # Without depth, a rendered image shows the background, and a measured one may show anything.
+        behind = torch.where(nothing, torch.nan if self.measured else torch.inf, depth) - local[:, 2]
+        return torch.where(within, behind, torch.nan)
+
+    def smoothly_beyond(self, points: Float[Tensor, "p 3"], opacity: float) -> Float[Tensor, "p"]:
+        """Return ``beyond`` with depth interpolated between pixels; NaN where one of the four shows no surface."""
+        local = self.T_world_camera.to(torch.float32).inverse().apply(points)
+        height, width = self.image.depth.shape
+        place = 2 * self.intrinsics.project(local) / local.new_tensor([width, height]) - 1
+        place = place.nan_to_num(2.0).clamp(-2, 2)[None, None]
+        channels = torch.stack([self.image.depth, self.solid(opacity).float()])[None]
+        depth, solid = grid_sample(channels, place, align_corners=False)[0, :, 0]
+        return torch.where(solid > 0.999, depth - local[:, 2], torch.nan)
+
+
+def mean_focal(intrinsics: Intrinsics) -> float:
+    """Return the focal length of square pixels of the same area (pixels)."""
+    return math.sqrt(intrinsics.fx * intrinsics.fy)
+
+
+def rendered_image(
+    field: RadianceField, bounds: SceneBounds, intrinsics: Intrinsics, T_world_camera: SE3, pixels: float
+) -> PosedDepthImage:
+    """Return what the field shows from a pose, in about ``pixels`` pixels."""
+    small, T = _shrunk(intrinsics, pixels), T_world_camera
+    image = render_image(field, small, T, bounds)
+    return PosedDepthImage(small, T.to("cpu", torch.float64), image, mean_focal(intrinsics))
+
+
+def measured_image(view: View, pixels: float) -> PosedDepthImage:
+    """Return a view's colours and measured depth, thinned out to about ``pixels``."""
+    frame = view.frame
+    small = _shrunk(frame.intrinsics, pixels)
+    scale = torch.tensor([frame.intrinsics.width / small.width, frame.intrinsics.height / small.height])
+    columns, rows = (small.pixel_centres() * scale).long().unbind(-1)
+    depth = torch.zeros(rows.shape) if frame.depth is None else frame.depth.cpu()[rows, columns]
+    depth = torch.where(depth.isfinite() & (depth > 0), depth, 0)
+    image = RenderedImage(frame.rgb.cpu()[rows, columns], depth, (depth > 0).to(depth))
+    T = view.T_ref_camera.to("cpu", torch.float64)
+    return PosedDepthImage(small, T, image, mean_focal(frame.intrinsics), True)
+
+
+def _shrunk(intrinsics: Intrinsics, pixels: float) -> Intrinsics:
+    """Return the same camera with about ``pixels`` pixels, or as it is where it has fewer."""
+    return intrinsics.scaled(min(1.0, math.sqrt(pixels / (intrinsics.width * intrinsics.height))))
+
+
+def agreed(
+    points: Float[Tensor, "p 3"],
+    number: int,
+    images: Sequence[PosedDepthImage],
+    tolerance: float,
+    needed: int,
+) -> Bool[Tensor, "p"]:
+    """Return which points of image ``number`` at least ``needed`` others show, to within ``tolerance`` (metres), and no
+    fewer than look through it.
+    """
+    agree, against = (torch.zeros(len(points), dtype=torch.int32) for _ in range(2))
+    others = witnesses(number, images)
+    for other in others:
+        beyond = images[other].beyond(points)
+        agree += (beyond.abs() <= tolerance).int()
+        against += (beyond > tolerance).int()
+    return (agree >= min(needed, len(others))) & (agree >= against)
+
+
+def witnesses(number: int, images: Sequence[PosedDepthImage]) -> list[int]:
+    """Return the images with the most similar poses: they are the likeliest to show the same points."""
+    here = images[number].T_world_camera
+    centres = torch.stack([s.T_world_camera.translation for s in images])
+    axes = torch.stack([s.T_world_camera.rotation[:, 2] for s in images])
+    away = torch.linalg.vector_norm(centres - here.translation, dim=-1)
+    turned = 1 - axes @ here.rotation[:, 2]
+    order = (away / away.mean().clamp(min=1e-9) + turned).argsort().tolist()
+    return [i for i in order if i != number][:WITNESSES]

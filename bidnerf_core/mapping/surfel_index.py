@@ -1,0 +1,193 @@
+"""The index of surfels: which one is nearest to a point, in constant time and memory in proportion to the surface.
+
+The cells of a voxel grid are grouped into blocks of 8 x 8 x 8. A dense table of blocks says where the entries of each block
+begin and how many cells share one entry: one cell where surface is near, 2, 4 or 8 along each side farther away, so that a
+block far from all surface has a single entry. Within a block, cells are in Morton order (x, y and z interleaved bit by bit),
+in which cells that share an entry are consecutive; a look-up is thus three gathers, whatever the point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.voxel_grid import VoxelGrid
+
+SIDE = 8
+"""Cells along the side of a block."""
+CELLS = SIDE**3
+MOST_CELLS = 2**31 - 1
+"""Largest number of cells of all blocks, since cells are numbered in 32 bits."""
+COARSER_FROM = (2.0, 3.5, 6.0)
+"""Distances of a block's nearest octant from the nearest octant with surfels, centre to centre in octants of 4 cells, from
+which 2, 4 and 8 cells along each side share an entry. All surfels are then at least twice as far away as that side is long."""
+CHUNK = 1 << 20
+"""Number of entries that are looked for at once."""
+
+LEAF = 32
+"""Surfels in a leaf of the k-d tree: measured to be fastest for points some cells away from a plane of surfels."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfelIndex:
+    """Finds the surfel nearest to a point, to within a cell near the surface and to within its distance far from it."""
+
+    grid: VoxelGrid
+    first: Int[Tensor, "x y z"]  # int32: each block's first entry
+    level: UInt8[Tensor, "x y z"]  # uint8: 2^level cells along each side share an entry
+    entries: Int[Tensor, "e"]  # int32: the surfel nearest to the middle of the cells that share the entry
+
+    @staticmethod
+    def of(positions: Float[Tensor, "n 3"], grid: VoxelGrid) -> SurfelIndex:
+        """Return the index of surfels at ``positions`` (metres, world).
+
+        Raises ``InputError`` where there is none, or where the grid has more cells than can be numbered.
+        """
+        if not len(positions):
+            raise InputError("no surface to bake: no point that several views agree on")
+        level = block_levels(positions, grid)
+        first = _firsts(level)
+        tree = cKDTree(positions.numpy(), leafsize=LEAF)
+        return SurfelIndex(grid, first, level, _nearest_to_middles(tree, grid, level))
+
+    @staticmethod
+    def of_cells(grid: VoxelGrid, nearest: Int[Tensor, "x y z"]) -> SurfelIndex:
+        """Return the index that gives each cell of ``grid`` its own entry: the surfel ``nearest`` names for it."""
+        shape = block_shape(grid)
+        padded = torch.zeros([SIDE * count for count in shape], dtype=torch.int32)
+        padded[tuple(slice(count) for count in grid.shape)] = nearest
+        x, y, z = shape
+        blocks = padded.view(x, SIDE, y, SIDE, z, SIDE).permute(0, 2, 4, 1, 3, 5).reshape(-1, CELLS)
+        entries = torch.empty_like(blocks)
+        entries[:, _morton(torch.cartesian_prod(*3 * [torch.arange(SIDE)]))] = blocks
+        level = torch.zeros(shape, dtype=torch.uint8)
+        return SurfelIndex(grid, _firsts(level), level, entries.view(-1))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the index takes once it is in use."""
+        return index_bytes(self.level)
+
+    def __call__(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
+        """Return the index (int64) of the surfel nearest to each point (metres, world).
+
+        The distance of that surfel exceeds the least one by at most the root of three times a cell, or 87 % of the least
+        one where that is more; beside a plane, by 10 % of it. A point outside the grid is first clamped to the grid's
+        border; one that is not finite has some surfel.
+        """
+        offset, rate, cells, base = self._numbering
+        flat = points.detach().reshape(-1, 3).T
+        places = torch.addmm(offset.to(flat.dtype), rate.to(flat.dtype), flat)
+        places = places.nan_to_num_(0.0).clamp_(0, len(cells) // 3 - 1).int().add_(base)
+        x, y, z = cells.index_select(0, places.view(-1)).view(3, -1)
+        number = x.add_(y).add_(z)
+        start, shift = self._blocks
+        block = number >> 9  # number = 512 block + Morton number of the cell in it
+        number.bitwise_right_shift_(shift.index_select(0, block)).add_(start.index_select(0, block))
+        return self.entries.index_select(0, number).view(points.shape[:-1]).long()
+
+    def warm_up(self) -> None:
+        """Compute the cached tables now, so that the first look-up takes no longer than the others."""
+        _ = self._numbering, self._blocks
+
+    @cached_property
+    def _numbering(
+        self,
+    ) -> tuple[Float[Tensor, "3 1"], Float[Tensor, "3 3"], Int[Tensor, "c"], Int[Tensor, "3 1"]]:
+        """What turns points into numbers of cells: ``offset + rate point`` is a place in each axis' part of a table (which
+        begins at ``base``) of terms whose sum is the number. Each part has one more cell at either end, which is the
+        border's.
+        """
+        longest = max(self.grid.shape) + 2
+        parts, strides = [], _strides(block_shape(self.grid))
+        for axis, count in enumerate(self.grid.shape):
+            cell = (torch.arange(longest) - 1).clamp(0, count - 1)
+            place = torch.zeros((longest, 3), dtype=torch.int64)
+            place[:, axis] = cell % SIDE
+            parts.append(cell // SIDE * strides[axis] * CELLS + _morton(place))
+        rate = torch.eye(3) / self.grid.cell
+        offset = 1 - torch.tensor(self.grid.lower, dtype=torch.float64) / self.grid.cell
+        base = longest * torch.arange(3, dtype=torch.int32)[:, None]
+        return offset.float()[:, None], rate, torch.cat(parts).int(), base
+
+    @cached_property
+    def _blocks(self) -> tuple[Int[Tensor, "b"], Int[Tensor, "b"]]:
+        """Each block's ``start`` and ``shift``: a cell's entry is ``start + (number >> shift)``."""
+        shift = 3 * self.level.view(-1).long()
+        start = self.first.view(-1) - (torch.arange(shift.numel()) * CELLS >> shift)
+        return start.int(), shift.int()
+
+
+def block_shape(grid: VoxelGrid) -> tuple[int, int, int]:
+    """Return the number of blocks along x, y and z. Raises ``InputError`` where they have too many cells to be numbered."""
+    x, y, z = (-(-count // SIDE) for count in grid.shape)
+    if x * y * z * CELLS > MOST_CELLS:
+        raise InputError(
+            f"a surface's grid of {x * y * z * CELLS} cells, expected {MOST_CELLS} at most; bake it with larger cells"
+        )
+    return x, y, z
+
+
+def block_levels(positions: Float[Tensor, "n 3"], grid: VoxelGrid) -> UInt8[Tensor, "x y z"]:
+    """Return the level of each block of ``grid``, see ``SurfelIndex``, for surfels at ``positions`` (metres, world)."""
+    x, y, z = block_shape(grid)
+    octants = VoxelGrid(grid.lower, SIDE / 2 * grid.cell, (2 * x, 2 * y, 2 * z))
+    empty: Bool[Tensor, "x y z"] = torch.ones(octants.shape, dtype=torch.bool)
+    empty.view(-1)[octants.numbers(positions)] = False
+    away = torch.from_numpy(distance_transform_edt(empty.numpy()).astype(np.float32))
+    nearest = away.view(x, 2, y, 2, z, 2).amin((1, 3, 5))
+    return torch.bucketize(nearest, torch.tensor(COARSER_FROM), right=True).to(torch.uint8)
+
+
+def index_bytes(level: UInt8[Tensor, "x y z"]) -> int:
+    """Return the memory that an index with blocks of these levels takes: entries of 4 bytes, and 13 for each block."""
+    return 4 * int(_counts(level).sum()) + 13 * level.numel()
+
+
+def _counts(level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "b"]:
+    """Return the number of entries of each block."""
+    return CELLS >> 3 * level.view(-1).long()
+
+
+def _firsts(level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "x y z"]:
+    counts = _counts(level)
+    return (counts.cumsum(0) - counts).int().view(level.shape)
+
+
+def _strides(shape: tuple[int, int, int]) -> tuple[int, int, int]:
+    return shape[1] * shape[2], shape[2], 1
+
+
+def _morton(place: Int[Tensor, "*c 3"]) -> Int[Tensor, "*c"]:
+    """Return the Morton numbers of cells of a block, z in the lowest bit."""
+    spread = (place & 1) | (place & 2) << 2 | (place & 4) << 4
+    return (spread[..., 0] << 2) | (spread[..., 1] << 1) | spread[..., 2]
+
+
+def _nearest_to_middles(tree: cKDTree, grid: VoxelGrid, level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "e"]:
+    """Return the surfel nearest to the middle of the cells that share each entry."""
+    corners = torch.cartesian_prod(*3 * [torch.arange(SIDE)])
+    corners = corners[_morton(corners).argsort()]
+    levels, found = level.view(-1).long(), []
+    step = CHUNK // CELLS
+    for at in range(0, len(levels), step):
+        number = torch.arange(at, min(at + step, len(levels)))
+        block = torch.stack(torch.unravel_index(number, level.shape), dim=-1)
+        counts = CELLS >> 3 * levels[number]
+        which = torch.arange(len(number)).repeat_interleave(counts)
+        within = torch.arange(len(which)) - (counts.cumsum(0) - counts)[which]
+        shift = levels[number][which]
+        cell = SIDE * block[which] + corners[within << 3 * shift]
+        middle = cell + 0.5 * (1 << shift)[:, None]
+        points = torch.tensor(grid.lower, dtype=torch.float64) + middle.double() * grid.cell
+        _, nearest = tree.query(points.numpy(), workers=-1)
+        found.append(torch.from_numpy(np.asarray(nearest, dtype=np.int32)))
+    return torch.cat(found)
