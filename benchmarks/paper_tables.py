@@ -1,4 +1,4 @@
-"""The tables of BID-NeRF (Csehi and Jozsa 2023) and the protocol of iNeRF, on given maps, with settings for a CPU.
+"""The tables of BID-NeRF (Csehi and Jozsa 2023) and the protocol of iNeRF, on given maps, with the paper's settings.
 
     python benchmarks/paper_tables.py DATA --map MAP [--map MAP ...] --out FOLDER [--part table1 depth_weight table2 inerf]
 
@@ -7,8 +7,9 @@
 - ``table2``: 1 image, 8 images 15 degrees apart, 8 and wide sampling, at e_t 0.9, 1.7 and 3.4;
 - ``inerf``: ``bid`` and ``inerf`` from iNeRF's starts.
 
-All cells of a part share the frames, the starts, the numbers of rays and steps, and all settings but those compared. The
-rays are fewer than the paper's 2048. In ``table1``, the frames of cells without depth have none, so that nothing profits
+All cells of a part share the frames, the starts, the numbers of rays and steps, and all settings but those compared. These are
+those of ``--preset``: ``paper``, with updates in the camera's frame as in the paper's Alg. 1, or ``paper-scene``, with ours. In
+``table1``, the frames of cells without depth have none, so that nothing profits
 from it: ``bid`` then turns about the middle of the map instead of the middle of the measured points. Frames whose index in
 the test split is 1 modulo 5 are left out, since settings were tuned on them.
 
@@ -20,13 +21,22 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bidnerf_core.cli.trial_progress import TrialProgress
-from bidnerf_core.evaluation.bench import Plan, left_to_do, local_processes, planned, run_trials
+from bidnerf_core.evaluation.bench import (
+    Plan,
+    changed_settings,
+    left_to_do,
+    local_processes,
+    planned,
+    run_trials,
+)
 from bidnerf_core.evaluation.groups import Group, grouped
 from bidnerf_core.evaluation.provenance import note_run, provenance, script_command, write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -34,10 +44,13 @@ from bidnerf_core.evaluation.significance import pairwise_tests
 from bidnerf_core.evaluation.summary import summarize
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trials import opened
+from bidnerf_core.localization import METHODS
 
 RESULTS = Path(__file__).parent / "results"
 
 Settings = dict[str, Any]
+Common = Callable[[str], Settings]
+"""Returns the settings of a method that all cells share, by its name."""
 
 PAPER = {
     "table1": {"RGB-D fine": 87.5, "RGB-D coarse": 95.83, "RGB fine": 25.0, "RGB coarse": 75.0},
@@ -51,18 +64,18 @@ PAPER = {
 """Percent, as printed there."""
 
 
-def table1(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
+def table1(base: Plan, common: Common, trials: int | None) -> list[Plan]:
     """Return the cells of table 1; ``trials`` is the number over all three sizes."""
     each = -(-(trials or 24) // 3)
     plan = replace(base, protocol="bid", sizes=((0.5,), (0.8,), (1.2,)), trials=each)
     return [
-        replace(plan, depth=depth, config=_json(common | {"level": level}))
-        for depth in (True, False)
+        replace(plan, depth=depth, config=_json(common("bid") | {"level": level}))
         for level in (0, None)
+        for depth in (True, False)
     ]
 
 
-def depth_weight(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
+def depth_weight(base: Plan, common: Common, trials: int | None) -> list[Plan]:
     """Return the cells of ``table1`` that have depth, from the same starts, with a tenth of its weight."""
     return [
         replace(plan, config=_json(json.loads(plan.config) | {"depth_weight": 0.1}))
@@ -71,24 +84,27 @@ def depth_weight(base: Plan, common: Settings, trials: int | None) -> list[Plan]
     ]
 
 
-def table2(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
+def table2(base: Plan, common: Common, trials: int | None) -> list[Plan]:
     """Return the cells of table 2."""
     plan = replace(base, protocol="bid", sizes=((0.9,), (1.7,), (3.4,)), trials=trials or 16)
     ending = sequence_ends(plan)  # one image is the last of the eight: the same frames for all
     return [
-        replace(plan, config=_json(common), frames=ending),
-        replace(plan, config=_json(common), images=8),
-        replace(plan, config=_json(common | {"wide": 2.0}), images=8),
+        replace(plan, config=_json(common("bid")), frames=ending),
+        replace(plan, config=_json(common("bid")), images=8),
+        replace(plan, config=_json(common("bid") | {"wide": 2.0}), images=8),
     ]
 
 
-def inerf(base: Plan, common: Settings, trials: int | None) -> list[Plan]:
-    """Return ``bid`` and ``inerf`` from the starts of iNeRF."""
+def inerf(base: Plan, common: Common, trials: int | None) -> list[Plan]:
+    """Return ``bid`` and ``inerf`` from the starts of iNeRF, both with its learning rate, as in the paper."""
     plan = replace(base, protocol="inerf", trials=trials or 25)
-    return [replace(plan, method=method, config=_json(common)) for method in ("bid", "inerf")]
+    return [
+        replace(plan, method=method, config=_json(common(method) | {"learning_rate": 0.01}))
+        for method in ("bid", "inerf")
+    ]
 
 
-PARTS: dict[str, Callable[[Plan, Settings, int | None], list[Plan]]] = {
+PARTS: dict[str, Callable[[Plan, Common, int | None], list[Plan]]] = {
     "table1": table1,
     "depth_weight": depth_weight,
     "table2": table2,
@@ -96,10 +112,18 @@ PARTS: dict[str, Callable[[Plan, Settings, int | None], list[Plan]]] = {
 }
 
 
-def untuned(map_folder: str, data: str) -> tuple[str, ...]:
-    """Return the test frames that settings were not tuned on."""
+def preset_settings(preset: str, others: Settings, method: str) -> Settings:
+    """Return the settings of a preset that differ from the method's defaults, and ``others``; iNeRF has one preset only."""
+    offered = METHODS[method]
+    chosen = offered.settings(preset if preset in offered.presets else "paper")
+    return json.loads(changed_settings(method, chosen)) | others
+
+
+def test_frames(map_folder: str, data: str, tuning: bool) -> tuple[str, ...]:
+    """Return the test frames that settings are tuned on, or all others."""
     _, dataset = opened(map_folder, data)
-    return tuple(name for place, name in enumerate(dataset.frame_names("test")) if place % 5 != 1)
+    names = enumerate(dataset.frame_names("test"))
+    return tuple(name for place, name in names if (place % 5 == 1) is tuning)
 
 
 def sequence_ends(plan: Plan) -> tuple[str, ...]:
@@ -108,18 +132,27 @@ def sequence_ends(plan: Plan) -> tuple[str, ...]:
     return tuple(dict.fromkeys(trial.frame for trial in every))
 
 
-def run_part(trials: Sequence[Trial], path: Path, workers: int) -> list[Group]:
-    """Run what is missing and return the groups of all results."""
+def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float | None = None) -> list[Group]:
+    """Run what is missing and return the groups of all results; after ``minutes``, of those that there are.
+
+    Raises ``SystemExit`` where it is stopped, or where nothing was done in time.
+    """
+    began = time.monotonic()
+
+    def late() -> bool:
+        return minutes is not None and time.monotonic() - began > 60 * minutes
+
     with ResultsFile(path) as file:
         todo = left_to_do(trials, file)
-        if todo:
+        if todo and minutes != 0:
             note_run(path, provenance(script_command(), f"{workers} local processes of one thread"))
             with local_processes(workers) as pool, TrialProgress(len(todo), workers) as progress:
-                run_trials(todo, file, pool, workers, progress.done, lambda: progress.stopping)
-        if left_to_do(trials, file):
+                run_trials(todo, file, pool, workers, progress.done, lambda: progress.stopping or late())
+        left = len(left_to_do(trials, file))
+        if left == len(trials) or (left and minutes is None):
             raise SystemExit(f"stopped; {path} is kept, the same command goes on")
         file.put_in_order(trials)
-        return grouped([file.results[key_of(trial)] for trial in trials])
+        return grouped([file.results[key_of(t)] for t in trials if key_of(t) in file.results])
 
 
 def as_record(groups: Sequence[Group]) -> dict[str, Any]:
@@ -147,26 +180,29 @@ def main() -> None:
     parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--part", nargs="+", choices=list(PARTS), default=list(PARTS))
-    parser.add_argument("--rays", type=int, default=512)
-    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--preset", choices=list(METHODS["bid"].presets), default="paper")
+    parser.add_argument("--rays", type=int, default=2048)
+    parser.add_argument("--steps", type=int, help="default: the preset's, 1000")
     parser.add_argument("--config", default="{}", help="JSON of other settings, for all cells")
     parser.add_argument("--trials", type=int, help="a cell; default 24, 16 of each size, 25")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--stop-after", type=float, help="minutes a part; what is done then is recorded")
     given = parser.parse_args()
-    common = {"rays": given.rays, "max_steps": given.steps} | json.loads(given.config)
+    own: Settings = {"rays": given.rays} | ({} if given.steps is None else {"max_steps": given.steps})
+    common = partial(preset_settings, given.preset, own | json.loads(given.config))
     for part in given.part:
         for folder in given.map:
             base = Plan(
                 folder, given.data, method="bid", seed=given.seed, device=given.device,
-                frames=untuned(folder, given.data),
+                frames=test_frames(folder, given.data, tuning=False),
             )  # fmt: skip
             plans = PARTS[part](base, common, given.trials)
             trials = [trial for plan in plans for trial in planned(plan)]
             name = f"{part}_{trials[0].portable.map.replace(':', '_')}"
-            groups = run_part(trials, given.out / f"{name}.jsonl", given.workers)
-            results = {"paper_percent": PAPER.get(part), "common_settings": common, **as_record(groups)}
+            groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)
+            results = {"paper_percent": PAPER.get(part), "preset": given.preset, **as_record(groups)}
             print(write_record(given.out / f"{name}.json", results, given.seed))
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
+from bidnerf_core.constants import constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.orientation import Orientation
 
@@ -95,9 +96,8 @@ class Intrinsics:
     def unproject(self, pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p 3"]:
         """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); they are not unit vectors."""
         if self.distortion:
-            flat = undistort_points(
-                pixels.reshape(-1, 2).double(), self.matrix(), self._coefficients(), num_iters=20
-            )
+            exact = pixels.reshape(-1, 2).double()
+            flat = undistort_points(exact, *self._distortion_at(exact), num_iters=20)
             pixels = flat.to(pixels.dtype).reshape(pixels.shape)
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
@@ -110,7 +110,8 @@ class Intrinsics:
         v = points[..., 1] / z * self.fy + self.cy
         pixels = torch.stack([u, v], dim=-1)
         if self.distortion:
-            flat = distort_points(pixels.reshape(-1, 2).double(), self.matrix(), self._coefficients())
+            exact = pixels.reshape(-1, 2).double()
+            flat = distort_points(exact, *self._distortion_at(exact))
             pixels = flat.to(pixels.dtype).reshape(pixels.shape)
         return pixels
 
@@ -154,8 +155,10 @@ class Intrinsics:
         distortion = tuple(self.distortion[place] for place in order)
         return Intrinsics(self.fy, self.fx, self.cy, self.cx, self.height, self.width, distortion)
 
-    def _coefficients(self) -> Tensor:
-        return torch.tensor(self.distortion, dtype=torch.float64)
+    def _distortion_at(self, points: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
+        """Return the camera matrix (3 3) and the distortion coefficients, where ``points`` lie."""
+        rows = (self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0)
+        return constant(rows, points).reshape(3, 3), constant(tuple(self.distortion), points)
 
 
 def _require(name: str, value: object, kind: type, expected: str) -> None:

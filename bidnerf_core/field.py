@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
+from bidnerf_core.constants import constant
 from bidnerf_core.contraction import RaySpacing, contract
 from bidnerf_core.errors import InputError
 
@@ -32,7 +33,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:
-    """Disjoint intervals of each ray, nearest first, each queried at its middle. Only valid ones are ever queried."""
+    """Disjoint intervals of each ray, nearest first, each queried at its middle. Those that are not valid have no effect."""
 
     starts: Float[Tensor, "*r s"]
     ends: Float[Tensor, "*r s"]
@@ -125,7 +126,7 @@ class SceneBounds:
         This is the cube around the box or, where the scene is contracted, all space: the cube around the box then fills the
         inner half of each axis.
         """
-        scaled = (positions - positions.new_tensor(self.centre)) * (2 / self.side)
+        scaled = (positions - constant(self.centre, positions)) * (2 / self.side)
         return contract(scaled) / 2 if self.contracted else scaled
 
     def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
@@ -161,7 +162,7 @@ class SceneBounds:
         """
         tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
         slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
-        first, second = ((origins.new_tensor(corner) - origins) * slope for corner in (lower, upper))
+        first, second = ((constant(corner, origins) - origins) * slope for corner in (lower, upper))
         return torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -155,6 +156,13 @@ class Frame:
                 warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
         return Frame(name, over(colour, cover, background_colour(background)), intrinsics, metres, cover)
 
+    def to(self, device: torch.device | str) -> Frame:
+        """Return the frame with its images on ``device``; the frame itself where they lie there."""
+        depth, alpha = (None if image is None else image.to(device) for image in (self.depth, self.alpha))
+        rgb = self.rgb.to(device)
+        unmoved = rgb is self.rgb and depth is self.depth and alpha is self.alpha
+        return self if unmoved else replace(self, rgb=rgb, depth=depth, alpha=alpha)
+
     @property
     def has_depth(self) -> bool:
         """Whether anything was measured."""
@@ -190,3 +198,7 @@ class View:
     frame: Frame
     T_ref_camera: SE3
     landmarks: SeenLandmarks | None = None  # those that training takes distances from
+
+    def to(self, device: torch.device | str) -> View:
+        """Return the view with its images and its pose on ``device``."""
+        return replace(self, frame=self.frame.to(device), T_ref_camera=self.T_ref_camera.to(device))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.errors import InputError
@@ -88,6 +88,16 @@ class Observations:
         measured = self[self.measured]
         return Observations.of_depth(measured.origins, measured.directions, measured.distance)
 
+    def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
+        """Return the rays of shape (k p) at ``index`` along their second axis, m of each row."""
+        wide = index[..., None].expand(*index.shape, 3)
+        origins, directions, rgb = (
+            part.gather(1, wide) for part in (self.origins, self.directions, self.rgb)
+        )
+        return Observations(
+            origins, directions, rgb, self.distance.gather(1, index), self.coloured.gather(1, index)
+        )
+
     def flattened(self) -> Observations:
         """Return these rays flattened to one axis."""
         origins, directions, rgb = (part.reshape(-1, 3) for part in (self.origins, self.directions, self.rgb))
@@ -107,7 +117,7 @@ class Observations:
         """Draw ``count`` of the rays uniformly with replacement; return all of them if there are no more."""
         if count >= len(self):
             return self.to(device, dtype)
-        index = torch.randint(len(self), (count,), generator=generator)
+        index = torch.randint(len(self), (count,), generator=generator, device=generator.device)
         return self[index.to(self.distance.device)].to(device, dtype)
 
     def to(self, device: torch.device | str | None, dtype: torch.dtype) -> Observations:

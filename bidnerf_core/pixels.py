@@ -24,15 +24,16 @@ from bidnerf_core.observations import Observations
 
 @runtime_checkable
 class PixelDrawer(Protocol):
-    """Draws ``count`` pixels (column, row) of a frame; ``generator`` and the result are on the CPU."""
+    """Draws ``count`` pixels (column, row) of a frame; they lie where ``generator`` does."""
 
     def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]: ...
 
 
 def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
     """Draw pixels uniformly, with replacement."""
-    columns = torch.randint(frame.intrinsics.width, (count,), generator=generator)
-    rows = torch.randint(frame.intrinsics.height, (count,), generator=generator)
+    size, where = frame.intrinsics, generator.device
+    columns = torch.randint(size.width, (count,), generator=generator, device=where)
+    rows = torch.randint(size.height, (count,), generator=generator, device=where)
     return torch.stack([columns, rows], dim=-1)
 
 
@@ -49,10 +50,9 @@ def observe(
 ) -> Observations:
     """Return the measurements of ``view`` at ``pixels``, as half-lines in its reference frame.
 
-    They lie on ``device``, by default the image's.
+    They lie on ``device``, by default the image's. Nothing is copied where the image, the pose and ``pixels`` lie there.
     """
     frame = view.frame
-    pixels = pixels.cpu()  # few, and a camera computes there
     columns, rows = pixels.to(frame.rgb.device).unbind(-1)
     ray = frame.intrinsics.unproject(pixels.double() + 0.5)  # z = 1
     length = torch.linalg.vector_norm(ray, dim=-1)
@@ -63,7 +63,7 @@ def observe(
     directions = T.rotate(ray / length[:, None])
     origins = T.translation.expand_as(directions)
     there = frame.rgb.device if device is None else device
-    coloured = torch.full((len(length),), frame.has_colour)
+    coloured = torch.full((len(length),), frame.has_colour, device=length.device)
     return Observations(origins, directions, frame.rgb[rows, columns], depth * length, coloured).to(
         there, dtype
     )
@@ -152,11 +152,11 @@ class Among:
 
     def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
         if frame not in self._found:
-            self._found[frame] = self._choose(frame)
+            self._found[frame] = self._choose(frame).to(generator.device)
         found = self._found[frame]
         if len(found) == 0:
             return uniform(frame, count, generator)
-        return found[torch.randint(len(found), (count,), generator=generator)]
+        return found[torch.randint(len(found), (count,), generator=generator, device=found.device)]
 
 
 def drawer(name: DrawerName) -> PixelDrawer:

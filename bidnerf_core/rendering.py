@@ -9,8 +9,10 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.constants import constant
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
 from bidnerf_core.se3 import SE3
+from bidnerf_core.waiting import may_wait
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +37,16 @@ class RenderedImage:
 
 
 def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
-    """Return the field's values at the samples (*r s). At samples that are not valid, it is not queried; density is 0."""
+    """Return the field's values at the samples (*r s). At samples that are not valid, density is 0.
+
+    There the field is not queried or, where the host must not wait for the device (see ``waiting``), queried at the origin.
+    """
     valid = samples.valid
     positions = rays.at(samples.middles)
     directions = rays.directions[..., None, :].expand_as(positions)
+    if not may_wait(valid.device):
+        found = field.query(torch.where(valid[..., None], positions, 0), directions)
+        return FieldValues(torch.where(valid, found.density, 0), found.rgb)
     if bool(valid.all()):
         return field.query(positions, directions)
     index = valid.reshape(-1).nonzero()[:, 0]
@@ -79,7 +87,7 @@ def render_samples(
     values = query_samples(field, rays, samples)
     weights = rendering_weights(values.density, samples)
     opacity = weights.sum(-1)
-    behind = torch.as_tensor(background, dtype=weights.dtype, device=weights.device)
+    behind = constant(background, weights) if isinstance(background, tuple) else background.to(weights)
     rgb = (weights[..., None] * values.rgb).sum(-2) + (1 - opacity)[..., None] * behind
     return Rendering(rgb, (weights * samples.middles).sum(-1), opacity, weights, samples, values.density)
 

@@ -59,7 +59,49 @@ def depth_residual(
     return rendering.distance - rendering.opacity * observed.distance + (1 - rendering.opacity) * miss
 
 
-DEPTH_RESIDUALS: dict[str, DepthResidual] = {"distance": depth_residual}
+TRUNCATION = 0.3
+"""Largest depth difference of a sample (metres) in ``truncated_depth_residual``, where none is given."""
+SURFACE_DEPTH = 0.1
+"""Metres about the first surface in which ``first_surface_residual`` takes the mean distance."""
+
+
+def truncated_depth_residual(
+    rendering: Rendering, observed: Observations, miss: float | None = None
+) -> Float[Tensor, "*p"]:
+    """Return ``sum_i w_i clip(t_i - d) + (1 - sum_i w_i) miss``, metres, where clip limits to +-``miss``.
+
+    At a silhouette a part of the weight lies on a surface far behind. Here it counts no more than ``miss``, however far it
+    is; in the paper's residual it counts with its whole distance.
+    """
+    limit = TRUNCATION if miss is None else miss
+    off = (rendering.samples.middles - observed.distance[..., None]).clamp(-limit, limit)
+    return (rendering.weights * off).sum(-1) + (1 - rendering.opacity) * limit
+
+
+def first_surface_residual(
+    rendering: Rendering, observed: Observations, miss: float | None = None
+) -> Float[Tensor, "*p"]:
+    """Return how far the first surface lies behind the measured distance, metres; 0 for a ray that is not stopped.
+
+    The first surface is where half of a ray's weight has been met; the distance is the mean over the weight nearby.
+    """
+    middles, weights = rendering.samples.middles, rendering.weights
+    if middles.shape[-1] == 0:
+        return torch.zeros_like(rendering.distance)
+    with torch.no_grad():
+        met = weights.cumsum(-1) >= rendering.opacity[..., None] / 2
+        first = torch.where(met & rendering.samples.valid, middles, torch.inf).amin(-1, keepdim=True)
+        near = (middles - first).abs() <= SURFACE_DEPTH
+    share = torch.where(near, weights, 0)
+    distance = (share * middles).sum(-1) / share.sum(-1).clamp(min=1e-6)
+    return torch.where(rendering.opacity > 0.5, distance - observed.distance, 0)
+
+
+DEPTH_RESIDUALS: dict[str, DepthResidual] = {
+    "distance": depth_residual,
+    "truncated": truncated_depth_residual,
+    "first-surface": first_surface_residual,
+}
 """Depth residuals by the name that the setting ``depth_residual`` takes; add your own."""
 
 
@@ -179,3 +221,12 @@ def free_space_term(robust: Robust, weight: float) -> Term:
         return free_space(rendering, observed.distance, robust.scale)[..., None]
 
     return Term(channel, robust, weight, measured)
+
+
+def opacity_term(weight: float) -> Term:
+    """Return the term of light that passes where a distance was measured: the scene must be opaque there."""
+
+    def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
+        return (1 - rendering.opacity)[..., None]
+
+    return Term(channel, Robust("l2", 1.0), weight, measured)

@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from torch import Tensor
 
+from bidnerf_core.constants import constant
+
 SERIES_BELOW = 1e-2
 """Angles (rad) under which coefficients come from their series: sin and cos cancel there, in value and derivative."""
 
@@ -49,7 +51,7 @@ class SE3:
 
     def matrix(self) -> Float[Tensor, "*b 4 4"]:
         top = torch.cat([self.rotation, self.translation[..., None]], dim=-1)
-        bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+        bottom = constant((0.0, 0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 4)
         return torch.cat([top, bottom], dim=-2)
 
     def __matmul__(self, other: SE3) -> SE3:
@@ -84,6 +86,14 @@ class SE3:
         sign = torch.ones_like(self.translation)
         sign = torch.cat([sign[..., :2], torch.linalg.det(u @ vh)[..., None]], dim=-1)
         return SE3(u @ (sign[..., None] * vh), self.translation)
+
+    def polished(self) -> SE3:
+        """Return the transform without the rounding of a product: a Newton-Schulz step towards the nearest rotation.
+
+        It needs no factorization, for which a host waits. The rotation must be orthonormal but for rounding.
+        """
+        R = self.rotation
+        return SE3(1.5 * R - 0.5 * R @ (R.mT @ R), self.translation)
 
     def is_rigid(self, tolerance: float = 1e-3) -> Bool[Tensor, "*b"]:
         """Return whether the transform is finite and its rotation orthonormal to ``tolerance``, with determinant 1."""

@@ -124,19 +124,21 @@ def to_flat(settings: Any) -> dict[str, Any]:
     return flat
 
 
-def from_flat(kind: type[S], values: dict[str, Any], where: str, renamed: dict[str, str] | None = None) -> S:
-    """Return an instance of the settings class ``kind``, with ``values`` (by flat name) in place of defaults.
+def from_flat(
+    base: S | type[S], values: dict[str, Any], where: str, renamed: dict[str, str] | None = None
+) -> S:
+    """Return the settings ``base``, or the defaults of that class, with ``values`` (by flat name) in place of its own.
 
     ``renamed`` maps names of earlier versions to today's. Raises ``InputError``, which begins with ``where``, for an
     unknown name, a value of another type than declared, and a value out of range.
     """
-    default = kind()
+    default: S = base() if isinstance(base, type) else base
     known = to_flat(default)
     given = {(renamed or {}).get(name, name): value for name, value in values.items()}
     for name in given:
         if name not in known:
             hint = spelling_hint(name, known, f", expected some of {', '.join(known)}")
-            raise InputError(f"{where}: {kind.__name__} has no setting {name!r}{hint}")
+            raise InputError(f"{where}: {type(default).__name__} has no setting {name!r}{hint}")
     return _with_values(default, given, where)
 
 

@@ -18,7 +18,12 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import BidConfig, InerfConfig, settings_of
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import AdamSettings, objective_of
+from bidnerf_core.localization.method_settings import (
+    AdamSettings,
+    DescentSettings,
+    ReachSettings,
+    objective_of,
+)
 from bidnerf_core.localization.pivots import PivotName, pivot
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.solvers.history import WINDOW
@@ -133,7 +138,9 @@ def test_fixed_pixels_are_drawn_once(problem: Problem) -> None:
     objective = objective_of(BidConfig().colour, BidConfig().depth)
     for renew in (True, False):
         generator = torch.Generator().manual_seed(0)
-        loss = SampledLoss(problem, objective, RayCounts(64), "uniform", renew, None, 1.0, generator)
+        loss = SampledLoss(
+            problem, objective, RayCounts(64), DescentSettings(renew=renew), ReachSettings(), generator
+        )
         assert torch.equal(loss(problem.start), loss(problem.start)) is not renew
 
 

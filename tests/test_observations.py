@@ -19,7 +19,13 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import window
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import ColourSettings, DepthSettings, objective_of
+from bidnerf_core.localization.method_settings import (
+    ColourSettings,
+    DepthSettings,
+    DescentSettings,
+    ReachSettings,
+    objective_of,
+)
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.observations import Observations
 from bidnerf_core.pixels import depth_rays_of
@@ -63,7 +69,7 @@ def depth_loss(problem: Problem, T: SE3, count: int = 10**6) -> float:
     values = []
     for counts in (RayCounts(16, count), RayCounts(16, 0)):
         generator = torch.Generator().manual_seed(0)
-        loss = SampledLoss(problem, OBJECTIVE, counts, "uniform", True, None, 1.0, generator)
+        loss = SampledLoss(problem, OBJECTIVE, counts, DescentSettings(), ReachSettings(), generator)
         values.append(float(loss(T)))
     return values[0] - values[1]
 

@@ -29,7 +29,7 @@ def test_the_cells_of_a_part_can_be_tried_from_the_same_starts(
 ) -> None:
     monkeypatch.syspath_prepend(str(SCRIPT.parent))
     plans = importlib.import_module("paper_tables").PARTS[part](
-        Plan(PLACE, PLACE, method="bid", seed=0), {"rays": 8, "max_steps": 2}, None
+        Plan(PLACE, PLACE, method="bid", seed=0), lambda method: {"rays": 8, "max_steps": 2}, None
     )
     conditions, sizes, each, methods = CELLS[part]
     assert len(plans) == conditions
@@ -49,3 +49,23 @@ def test_a_part_is_recorded(tmp_path: Path) -> None:
     cells = json.loads((tmp_path / "inerf_demo_blobs.json").read_text())["results"]["cells"]
     assert [cell["condition"] for cell in cells] == ["bid", "inerf"]
     assert len((tmp_path / "inerf_demo_blobs.jsonl").read_text().splitlines()) == 2
+
+
+def test_each_variant_of_bid_can_be_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    module = importlib.import_module("bid_variants")
+    for group, (_, variants, sizes) in module.GROUPS.items():
+        found = module.plans(group, Plan(PLACE, PLACE, method="bid", trials=2, seed=0), None, None)
+        trials = [planned(plan) for plan in found]  # raises where there is no such setting
+        assert [len(some) for some in trials] == [2 * len(sizes)] * len(variants)
+        assert len({some[0].config for some in trials}) == len(variants)
+
+
+def test_presets_become_settings_of_each_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    settings_of_preset = importlib.import_module("paper_tables").preset_settings
+    bid = settings_of_preset("paper", {"rays": 7}, "bid")
+    assert bid == {
+        "rays": 7, "pivot": "camera", "max_steps": 1000, "learning_rate": 0.02, "decay": 0.8, "decay_steps": 100,
+    }  # fmt: skip
+    assert settings_of_preset("paper-scene", {}, "inerf") == {"max_steps": 1000}

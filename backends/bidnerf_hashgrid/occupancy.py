@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
+from torch.nn.functional import pad
 
 from bidnerf_core.contraction import RaySpacing
 from bidnerf_core.field import FieldValues, Rays, RaySamples, SceneBounds
 from bidnerf_core.voxel_grid import VoxelGrid
+from bidnerf_core.waiting import may_wait
 
 BLOCK = 8
 """Steps along a ray that are skipped together where no occupied cell is near."""
+
+MOST = 96
+"""Largest number of samples of a ray where the host must not wait to count them: the nearest ones, in occupied cells."""
 
 
 class OccupancyGrid(nn.Module):
@@ -85,6 +91,10 @@ class OccupancyGrid(nn.Module):
         offset = torch.full_like(near, 0.5)
         if jitter is not None:
             offset = torch.rand(near.shape, generator=jitter, device=jitter.device).to(near)
+        if not may_wait(near.device):
+            samples = self._of_known_shape(flat, spacing, near, far, offset)
+            starts, ends = (spacing.distance(x).reshape(*shape, MOST) for x in (samples.starts, samples.ends))
+            return RaySamples(starts, ends, samples.valid.reshape(*shape, MOST))
         ray, start = self._busy_blocks(flat, spacing, near, far)
         steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
         place = start[:, None] + steps + (offset[ray] * self.step)[:, None]
@@ -97,6 +107,27 @@ class OccupancyGrid(nn.Module):
             spacing.distance(part).reshape(*shape, width) for part in (samples.starts, samples.ends)
         )
         return RaySamples(starts, ends, samples.valid.reshape(*shape, width))
+
+    def _of_known_shape(
+        self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor, offset: Tensor
+    ) -> RaySamples:
+        """Return the first ``MOST`` intervals of each ray in occupied cells, without waiting for the device."""
+        box = self.grid.rays(rays.origins, rays.directions)
+        # Steps are counted from ``near``, as everywhere; those before the grid are left out. Contracted space begins there.
+        skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
+        count = math.ceil(2 * self.bounds.side / self.step) + 1  # a cube's diagonal is shorter
+        steps = torch.arange(count, dtype=near.dtype, device=near.device)
+        place = near[:, None] + (skipped[:, None] + steps + offset[:, None]) * self.step
+        positions = rays.at(spacing.distance(place))
+        kept = self.grid.at(self.occupied, positions) & self.grid.contains(positions) & (place < far[:, None])
+        order = (~kept).sort(dim=-1, stable=True).indices[:, :MOST]
+        place, kept = place.gather(-1, order), kept.gather(-1, order)
+        middles = torch.where(kept, place, far[:, None])
+        if middles.shape[-1] < MOST:
+            missing = MOST - middles.shape[-1]
+            middles = torch.cat([middles, far[:, None].expand(-1, missing)], dim=-1)
+            kept = pad(kept, (0, missing))
+        return self._intervals(middles, kept, kept.sum(-1), near, far)
 
     def _busy_blocks(
         self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor
@@ -118,8 +149,14 @@ class OccupancyGrid(nn.Module):
         slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
         middles = far[:, None].expand(-1, width).clone()
         middles[ray, slot] = place
-        number = torch.arange(width, device=ray.device)
-        valid = number < counts[:, None]
+        valid = torch.arange(width, device=ray.device) < counts[:, None]
+        return self._intervals(middles, valid, counts, near, far)
+
+    def _intervals(
+        self, middles: Tensor, valid: Tensor, counts: Tensor, near: Tensor, far: Tensor
+    ) -> RaySamples:
+        """Return intervals of a step about ``middles`` (r s), of which the first ``counts`` (r) are valid, within the rays."""
+        number = torch.arange(middles.shape[-1], device=middles.device)
         half = self.step / 2
         starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
         ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)

@@ -32,9 +32,8 @@ if sys.platform != "win32":
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Dataset
     from bidnerf_core.frames import View
-    from bidnerf_core.localization import Method
 else:
-    Dataset = View = Method = Any  # their modules import torch, which commands such as 'backends' do without
+    Dataset = View = Any  # their modules import torch, which commands such as 'backends' do without
 
 _T = TypeVar("_T")
 
@@ -264,14 +263,6 @@ def _make_writable(out: Path) -> None:
         raise InputError(
             f"{out}: cannot be written ({error.strerror}), expected a folder that can be made and written"
         ) from error
-
-
-def chosen_method(arguments: Sequence[str], usual: str) -> Method:
-    """Return the method that ``--method`` names."""
-    from bidnerf_core.localization import find_method
-
-    with wrong_usage():
-        return find_method(value_of("--method", arguments) or usual)
 
 
 @contextlib.contextmanager

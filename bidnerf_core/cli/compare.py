@@ -17,7 +17,6 @@ from bidnerf_core.cli.common import (
     Flag,
     Names,
     UsageError,
-    chosen_method,
     option,
     output_folder,
     parse,
@@ -28,6 +27,7 @@ from bidnerf_core.cli.common import (
     show,
     wrong_usage,
 )
+from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import changed_settings
 from bidnerf_core.evaluation.closed_form_data import is_closed_form
@@ -52,7 +52,7 @@ Folders = Annotated[
 
 def run(arguments: list[str]) -> None:
     """Run the command; its options include the settings of the method that the arguments name."""
-    kind = chosen_method(arguments, "bid").config_type
+    settings = chosen_settings(arguments, "bid")
 
     def compare(
         folders: Folders,
@@ -71,7 +71,8 @@ def run(arguments: list[str]) -> None:
         seed: Annotated[int | None, option("N", "seed of every random choice", "the protocol's")] = None,
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
-        config: Any = kind(),
+        preset: Preset = None,
+        config: Any = settings,
     ) -> None:
         """Localize the same frames from the same starts in several maps, and compare success, time and memory.
 
@@ -98,7 +99,7 @@ def run(arguments: list[str]) -> None:
         else:
             _print(found)
 
-    compare.__annotations__["config"] = kind
+    compare.__annotations__["config"] = type(settings)
     parse("compare", compare, arguments)
 
 

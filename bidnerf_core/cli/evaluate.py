@@ -17,7 +17,6 @@ from bidnerf_core.cli.common import (
     LARGEST_SEED,
     Names,
     UsageError,
-    chosen_method,
     option,
     parse,
     require,
@@ -26,6 +25,7 @@ from bidnerf_core.cli.common import (
     show,
     wrong_usage,
 )
+from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.trial_progress import TrialProgress
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import (
@@ -51,7 +51,7 @@ Place = Annotated[str, tyro.conf.Positional]
 
 def run(arguments: list[str]) -> None:
     """Run the command; its options include the settings of the method that the arguments name."""
-    kind = chosen_method(arguments, "auto").config_type
+    settings = chosen_settings(arguments, "auto")
 
     def evaluate(
         map: Annotated[Place, option("MAP", "folder of a map, or demo:blobs")],
@@ -103,7 +103,8 @@ def run(arguments: list[str]) -> None:
         ] = None,
         shards: Annotated[int, option("N", "number of parts that the trials are split into")] = 1,
         shard: Annotated[int, option("I", "the part to run, from 0")] = 0,
-        config: Any = kind(),
+        preset: Preset = None,
+        config: Any = settings,
     ) -> None:
         """Localize many frames from wrong starts, or from none, and write one JSON line a trial.
 
@@ -128,7 +129,7 @@ def run(arguments: list[str]) -> None:
         mine = shard_of(trials_of_all, shard, shards)
         _evaluate(mine, out, workers, dask, command_line("bidnerf evaluate", arguments))
 
-    evaluate.__annotations__["config"] = kind
+    evaluate.__annotations__["config"] = type(settings)
     parse("evaluate", evaluate, arguments)
 
 

@@ -15,12 +15,12 @@ from bidnerf_core.cli.common import (
     MapFolder,
     Names,
     UsageError,
-    chosen_method,
     option,
     parse,
     require,
     say,
 )
+from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import (
     DepthPoints,
@@ -43,7 +43,7 @@ one_start = tyro.conf.create_mutex_group(required=False, title="where to start (
 
 def run(arguments: list[str]) -> None:
     """Parse with the settings of the method that the arguments name, and localize."""
-    kind = chosen_method(arguments, "auto").config_type
+    settings = chosen_settings(arguments, "auto")
 
     def localize(
         map: MapFolder,
@@ -105,7 +105,8 @@ def run(arguments: list[str]) -> None:
         seed: Annotated[int, option("N", "seed of every random choice")] = 0,
         json: Annotated[Flag, option(None, "print one JSON object a query, each on a line", "")] = False,
         model_points: SparseChoice = SparseChoice(),
-        config: Any = kind(),
+        preset: Preset = None,
+        config: Any = settings,
     ) -> None:
         """Find the poses of photos, or of frames of a dataset, in a map.
 
@@ -138,7 +139,7 @@ def run(arguments: list[str]) -> None:
         localizer = Localizer(stored, method, config, warm_up=len(source.names) > 1)
         _localize(source, localizer, begin, seed, Answers(stored, output, len(source.names)))
 
-    localize.__annotations__["config"] = kind
+    localize.__annotations__["config"] = type(settings)
     parse("localize", localize, arguments)
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bidnerf_core.localization.first_order import DescentSettings, descended
+from bidnerf_core.localization.first_order import descended
 from bidnerf_core.localization.method_settings import (
     AdamSettings,
     ColourSettings,
     DepthSettings,
+    DescentSettings,
+    ReachSettings,
     objective_of,
 )
 from bidnerf_core.localization.problem import Problem
@@ -25,9 +27,21 @@ class BidConfig(Settings):
     adam: AdamSettings = AdamSettings(learning_rate=0.04, decay=0.4, decay_steps=80)
     colour: ColourSettings = ColourSettings()
     depth: DepthSettings = DepthSettings()
+    reach: ReachSettings = ReachSettings()
+
+
+PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
+"""The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is provisional."""
+
+BID_PRESETS = {
+    "paper": BidConfig(descent=DescentSettings(level=0, pivot="camera"), adam=PAPER_STEPS),
+    "paper-scene": BidConfig(descent=DescentSettings(level=0, pivot="scene"), adam=PAPER_STEPS),
+}
+"""The paper's settings with updates as in its Alg. 1, in the camera's frame, and with ours, about the middle of the scene."""
 
 
 def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
     """Descend from ``problem.start``; pixels are drawn from ``seed``."""
     objective = objective_of(config.colour, config.depth)
-    return descended(problem, config.descent, config.adam, objective, config.depth.depth_rays, seed, "bid")
+    depth_rays = config.depth.depth_rays
+    return descended(problem, config.descent, config.adam, objective, depth_rays, seed, "bid", config.reach)

@@ -7,11 +7,16 @@ frame, the world's. The two differ in second order, and an update has no axis th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.first_order import DescentSettings, descended
-from bidnerf_core.localization.method_settings import AdamSettings, ColourSettings, objective_of
+from bidnerf_core.localization.first_order import descended
+from bidnerf_core.localization.method_settings import (
+    AdamSettings,
+    ColourSettings,
+    DescentSettings,
+    objective_of,
+)
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.settings import Settings
@@ -24,6 +29,10 @@ class InerfConfig(Settings):
     descent: DescentSettings = DescentSettings(pixels="interest-regions", pivot="world")
     adam: AdamSettings = AdamSettings(max_steps=300)
     colour: ColourSettings = ColourSettings(colour_loss="l2")
+
+
+INERF_PRESETS = {"paper": replace(InerfConfig(), adam=AdamSettings(max_steps=1000))}
+"""The settings with which BID-NeRF compares: iNeRF's own learning rate, 1000 steps of 2048 rays."""
 
 
 def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:

@@ -41,10 +41,12 @@ class Localizer:
         config: Any = None,
         device: torch.device | str | None = None,
         warm_up: bool = True,
+        preset: str | None = None,
     ) -> None:
         """Prepare ``map`` for ``method``.
 
         ``config``: an instance of the method's settings (``METHODS[method].config_type``), by default with its defaults.
+        ``preset``: the name of other settings (``METHODS[method].presets``), in place of ``config``.
         ``device``: where the field computes, by default where it is; a field that lies elsewhere is copied. ``warm_up``:
         do now what the first call would otherwise have to wait for. Raises ``InputError`` for what does not fit.
         """
@@ -57,7 +59,7 @@ class Localizer:
             raise InputError(f"Localizer: got a {type(map).__name__}, expected a Map{hint}")
         self.method = method
         self.map: SceneMap = map if device is None else _on_device(map, torch.device(device))
-        self.config = _checked_config(find_method(method), method, config)
+        self.config = _checked_config(find_method(method), method, config, preset)
         landmarks = getattr(self.map, "landmarks", None)
         self.matcher = None if landmarks is None or method != "auto" else LandmarkMatcher(landmarks)
         if warm_up:
@@ -99,9 +101,13 @@ class Localizer:
             self.map.surface.warm_up()
 
 
-def _checked_config(method: Method, name: str, config: Any) -> Any:
+def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:
     if config is None:
-        return method.config_type()
+        return method.settings(preset)
+    if preset is not None:
+        raise InputError(
+            f"preset {preset!r} and a config are given; expected one, or settings_of({name!r}, ..., preset={preset!r})"
+        )
     if not isinstance(config, method.config_type):
         expected, found = method.config_type.__name__, type(config).__name__
         raise InputError(f"method {name!r} takes a {expected}, got a {found}")
@@ -130,9 +136,10 @@ def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
         return [query]
     if isinstance(query, Sequence) and all(isinstance(item, View) for item in query):
         return query
-    if isinstance(query, Sequence) and len(query) == 1 and isinstance(query[0], Frame):
-        return [View(query[0], SE3.identity())]
-    if isinstance(query, Sequence) and any(isinstance(item, Frame) for item in query):
+    items: list[Any] = list(query) if isinstance(query, Sequence) else []
+    if len(items) == 1 and isinstance(items[0], Frame):
+        return [View(items[0], SE3.identity())]
+    if any(isinstance(item, Frame) for item in items):
         raise InputError(
             f"{len(query)} frames without relative poses, expected views: View(frame, T_ref_camera)"
         )

@@ -16,6 +16,7 @@ from bidnerf_core.residuals import (
     colour_term,
     depth_term,
     free_space_term,
+    opacity_term,
 )
 from bidnerf_core.robust import Robust, RobustName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
@@ -47,6 +48,12 @@ class DepthSettings(Settings):
     depth_rays: Annotated[int, Range(0, 10**7), EXPERT] = 512
     # weight of the term that penalises matter in front of measured depth
     free_space_weight: Annotated[float, Range(0.0), EXPERT] = 0.0
+    # weight of the term that penalises transparency where depth was measured
+    opacity_weight: Annotated[float, Range(0.0), EXPERT] = 0.0
+
+    @property
+    def used(self) -> bool:
+        return max(self.depth_weight, self.free_space_weight, self.opacity_weight) > 0
 
 
 def objective_of(
@@ -61,14 +68,46 @@ def objective_of(
     ``miss_scales`` is the depth residual, in depth scales, of a ray that meets nothing; None stands for the paper's.
     """
     terms = [colour_term(colour.robust(colour_scale))]
-    if depth is not None and (depth.depth_weight > 0 or depth.free_space_weight > 0):
+    if depth is not None and depth.used:
         scale = depth.depth_scale if depth_scale is None else depth_scale
         robust = Robust(depth.depth_loss, scale)
         miss = None if miss_scales is None else miss_scales * scale
         terms.append(depth_term(robust, depth.depth_weight, DEPTH_RESIDUALS[depth.depth_residual], miss))
         if depth.free_space_weight > 0:
             terms.append(free_space_term(robust, depth.free_space_weight))
+        if depth.opacity_weight > 0:
+            terms.append(opacity_term(depth.opacity_weight))
     return Objective(tuple(terms))
+
+
+@dataclass(frozen=True)
+class DescentSettings(Settings):
+    """Settings of the rays of a step, and of the frame of updates."""
+
+    rays: Count = 2048  # number of rays a step, shared out equally among the views
+    level: int | None = None  # level of the field: 0 is the coarsest, None the field itself
+    pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
+    pivot: PivotName = "camera"  # what an update turns about: camera, world, or the middle of the scene
+    # length of the sampled interval, in units of [near, far]; the paper's "wide" is 2
+    wide: Annotated[float, Above(0.0, 100.0)] = 1.0
+    renew: Annotated[bool, EXPERT] = True  # draw pixels anew at each step instead of once
+
+
+@dataclass(frozen=True)
+class ReachSettings(Settings):
+    """Settings that widen the reach of first-order steps. By default nothing is added to the paper's objective."""
+
+    # number of pixels drawn for each ray; those that show matter, then those that may meet it, come first
+    candidates: Annotated[int, Range(1, 64), EXPERT] = 1
+    # number of equal intervals of each ray, whether or not they may hold matter; 0: the field's own
+    samples: Annotated[int, Range(0, 4096), EXPERT] = 0
+    # standard deviation of the points at which the field is queried, metres, at the first step; 0: not blurred
+    blur: Annotated[float, Range(0.0), EXPERT] = 0.0
+    blur_steps: Annotated[int, Range(1, 10**7), EXPERT] = (
+        200  # number of steps in which the blur falls by half
+    )
+    # weight of the distance between measured points and the box of the scene
+    box_weight: Annotated[float, Range(0.0), EXPERT] = 0.0
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,10 @@ class Pivot:
         """Return the pivot at a point given in the camera's frame, metres."""
         return Pivot(SE3(torch.eye(3, dtype=torch.float64), point.to("cpu", torch.float64)))
 
+    def to(self, device: torch.device) -> Pivot:
+        """Return the pivot for poses on ``device``."""
+        return self if self.T_camera_pivot is None else Pivot(self.T_camera_pivot.to(device))
+
     @property
     def reach(self) -> float:
         """Distance (metres) by which a rotation of one radian moves the camera, but at least 1.

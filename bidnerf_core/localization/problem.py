@@ -91,6 +91,17 @@ class Problem:
         """Whether the images may have another exposure than the map: photos may, images with an alpha channel do not."""
         return all(view.frame.alpha is None for view in self.views)
 
+    def on_device(self) -> Problem:
+        """Return the problem with images, poses and depth rays where the field computes."""
+        device = self.device
+        rays = self.depth_rays
+        return replace(
+            self,
+            views=tuple(view.to(device) for view in self.views),
+            start=None if self.start is None else self.start.to(device),
+            depth_rays=None if rays is None else rays.to(device, rays.distance.dtype),
+        )
+
     def without_depth(self) -> Problem:
         """Return the problem without measured depth."""
         views = tuple(replace(view, frame=replace(view.frame, depth=None)) for view in self.views)

@@ -26,6 +26,7 @@ from bidnerf_core.localization.search.centring import centred
 from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.se3 import SE3
+from bidnerf_core.waiting import may_wait, without_waiting
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +56,9 @@ def refine(
 
     The answer is the better of the last two stages' poses, compared on rays to which neither was fitted.
     """
-    about = pivot(settings.refinement.pivot, replace(problem, start=start[0]))
-    history = History([start[0]])
-    T, ends = start, []
+    about = pivot(settings.refinement.pivot, replace(problem, start=start[0])).to(problem.device)
+    history = History([start[0].to("cpu")])
+    problem, T, ends = problem.on_device(), start.to(problem.device), []
     for stage in stages:
         cost = settings.drawn(problem, stage, about, generator)
         for _ in range(stage.centring):
@@ -87,25 +88,33 @@ def take_few_steps(
     a step that would not lower the cost. The last pose is assessed on the same rays and without derivatives, which costs half
     as much as ``refine``.
     """
-    name, views = settings.refinement.pivot, len(problem.views)
+    # The surface lies on the CPU. Without it, all steps stay where the field computes.
+    device, name = problem.device if surface is None else torch.device("cpu"), settings.refinement.pivot
     about = pivot(name, replace(problem, start=start)) if surface is None else surface.cloud.pivot
-    cost = settings.drawn(problem, stage, about, generator)
-    poses, here = [start], cost.residuals(start[None])
-    rendered = rendered_term(cost, float(here.cost()[0]), views).weight
-    beside = None if surface is None else surface_term(surface, start, views).scaled
-    aligned = None if beside is None else beside(start[None])
-    for left in reversed(range(stage.steps)):
-        equations = _sum(here.normal_equations().scaled(rendered), aligned)
-        delta = equations.solve(torch.full_like(equations.cost, stage.damping))
-        trial = about.moved(poses[-1][None], delta)
-        there = cost.residuals(trial, derivatives=left > 0)
-        aligned = None if beside is None else beside(trial)
-        reached = rendered * there.cost() + (0 if aligned is None else aligned.cost)
-        if not bool(reached[0] < equations.cost[0]):
-            break
-        poses.append(trial[0])
-        here = there
-    return FewSteps(SE3.stack(poses), float(here.inliers()[0]))
+    about, views = about.to(device), len(problem.views)
+    cost = settings.drawn(problem.on_device(), stage, about, generator)
+    poses, inliers, lower = [start.to(device)], list[Tensor](), list[Tensor]()
+    with without_waiting():
+        here = cost.residuals(poses[0][None])
+        inliers.append(here.inliers()[0])
+        rendered = rendered_term(cost, float(here.cost()[0]), views).weight
+        beside = None if surface is None else surface_term(surface, start, views).scaled
+        aligned = None if beside is None else beside(start[None])
+        for left in reversed(range(stage.steps)):
+            equations = _sum(here.normal_equations().scaled(rendered), aligned)
+            delta = equations.solve(torch.full_like(equations.cost, stage.damping))
+            trial = about.moved(poses[-1][None], delta)
+            here = cost.residuals(trial, derivatives=left > 0)
+            aligned = None if beside is None else beside(trial)
+            reached = rendered * here.cost() + (0 if aligned is None else aligned.cost)
+            lower.append(reached[0] < equations.cost[0])
+            if may_wait(device) and not bool(lower[-1]):
+                break
+            poses.append(trial[0])
+            inliers.append(here.inliers()[0])
+    # Where the host must not wait, steps were taken beyond the first that did not lower the cost: they are left out here.
+    count = 1 + int(torch.stack(lower).cpu().cumprod(0).sum() if lower else 0)
+    return FewSteps(SE3.stack(poses[:count]).to("cpu"), float(inliers[count - 1]))
 
 
 def _sum(equations: NormalEquations, others: NormalEquations | None) -> NormalEquations:
@@ -115,19 +124,21 @@ def _sum(equations: NormalEquations, others: NormalEquations | None) -> NormalEq
 def _ranked(cost: RenderedCost, T: SE3, history: History) -> SE3:
     costs = cost.cost(T)
     order = costs.argsort()
-    history.poses.append(T[order[0]])
+    history.poses.append(T[order[0]].to("cpu"))
     history.losses.append(float(costs[0]) / 2)
     return T[order]
 
 
 def _descended(cost: RenderedCost, T: SE3, history: History) -> SE3:
     stage = cost.stage
-    found = descend(cost, T, stage.steps, cost.pivot.moved, stage.damping, cost.settings.stop_step)
-    history.add_batch(found.poses, found.costs)
+    with without_waiting():
+        found = descend(cost, T, stage.steps, cost.pivot.moved, stage.damping, cost.settings.stop_step)
+    history.add_batch(found.poses.to("cpu"), found.costs.cpu())
     return found.T[found.equations.cost.argsort()].normalized()
 
 
 def _assessed(cost: RenderedCost, T: SE3, history: History) -> RefinementResult:
+    T, about = T.to("cpu"), cost.pivot.to(torch.device("cpu"))
     residuals = cost.residuals(T)
     equations = residuals.normal_equations()
     best = int(equations.cost.argmin())
@@ -137,7 +148,7 @@ def _assessed(cost: RenderedCost, T: SE3, history: History) -> RefinementResult:
         T=T[best],
         loss=float(equations.cost[best]) / 2,
         inliers=float(residuals.inliers()[best]),
-        covariance=cost.pivot.at_camera(T[best], covariance),
+        covariance=about.at_camera(T[best], covariance),
         step=float(torch.linalg.vector_norm(equations.solve(torch.zeros_like(equations.cost))[best])),
         poses=SE3.stack(history.poses),
         losses=torch.tensor(history.losses, dtype=torch.float64),

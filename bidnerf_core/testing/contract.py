@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from bidnerf_core.backend import Backend
 from bidnerf_core.field import RadianceField, levels
 from bidnerf_core.testing import derivatives, recipes, samples, values
+from bidnerf_core.testing.device import check_steps
 from bidnerf_core.testing.faults import calling, query, require_that
 from bidnerf_core.testing.scene import awkward_rays, joined, points, rgb_views, rgbd_views
 from bidnerf_core.testing.subject import Subject, called, frozen, precise
@@ -146,6 +147,9 @@ class BackendContract(Subject):
     def test_rendering_carries_gradients_to_the_pose(self) -> None:
         for level in levels(self._trained()):
             derivatives.check_pose_gradient(*precise(level))
+
+    def test_steps_stay_on_the_device(self) -> None:
+        check_steps(self._trained())
 
     # Storage.
 

@@ -17,6 +17,7 @@ from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import Rendering, render_samples
 from bidnerf_core.residuals import Residual
 from bidnerf_core.se3 import SE3
+from bidnerf_core.waiting import may_wait
 
 BackgroundColour = tuple[float, float, float]
 
@@ -83,12 +84,17 @@ def _ray_gradients(
 ) -> tuple[Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]:  # fmt: skip
     """Return the derivatives of each ray's residuals by its origin and by its direction, from the ``kept`` samples."""
     results = [rays.origins.new_zeros((len(rays.near), count, 3)) for _ in range(2)]
-    busy = kept.any(-1).nonzero()[:, 0]
+    if may_wait(kept.device):
+        busy = kept.any(-1).nonzero()[:, 0]
+        samples = _gathered(samples, kept, busy) if len(busy) else samples
+    else:
+        busy = torch.arange(len(kept), device=kept.device)
+        samples = replace(samples, valid=kept)
     if len(busy) == 0 or not channels:
         return results[0], results[1]
     leaves = [part[busy].detach().requires_grad_() for part in (rays.origins, rays.directions)]
     few = Rays(leaves[0], leaves[1], rays.near[busy], rays.far[busy])
-    rendering: Rendering = render_samples(field, few, _gathered(samples, kept, busy), background)
+    rendering: Rendering = render_samples(field, few, samples, background)
     found = residual(rendering, observed[busy])
     for channel in channels:
         gradients = torch.autograd.grad(

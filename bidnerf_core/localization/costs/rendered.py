@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
+from bidnerf_core.constants import constant
 from bidnerf_core.field import RadianceField, Rays
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.costs.weighted_rays import RayCounts, WeightedRays, draw_weighted_rays
@@ -43,6 +44,7 @@ class Residuals:
     weights: Float[Tensor, "n c"]  # of each in the objective; 0 where nothing was measured
     confidence: Float[Tensor, "h n c"]  # 1, or less where a residual is too steep for the map's accuracy
     objective: Objective
+    home: torch.device = torch.device("cpu")  # where the poses came from, and what is asked of residuals goes
 
     @property
     def _pull(self) -> Float[Tensor, "h n c"]:
@@ -55,27 +57,27 @@ class Residuals:
         The confidence weights the equations of a step, but not this cost. Otherwise a step could lower the cost by moving
         rays to where residuals are steep and their confidence is low.
         """
-        return 2 * (self.weights * self.objective.rho(self.value)).sum((-1, -2)).cpu()
+        return 2 * (self.weights * self.objective.rho(self.value)).sum((-1, -2)).to(self.home)
 
     def normal_equations(self) -> NormalEquations:
         """Return the equations of iteratively reweighted least squares."""
         pull = self._pull
         return NormalEquations(
             self.cost(),
-            torch.einsum("hnc,hnci->hi", pull * self.value, self.jacobian).cpu(),
-            torch.einsum("hnc,hnci,hncj->hij", pull, self.jacobian, self.jacobian).cpu(),
+            torch.einsum("hnc,hnci->hi", pull * self.value, self.jacobian).to(self.home),
+            torch.einsum("hnc,hnci,hncj->hij", pull, self.jacobian, self.jacobian).to(self.home),
         )
 
     def scores(self) -> Float[Tensor, "h n 6"]:
         """Return each ray's contribution to the gradient."""
-        return torch.einsum("hnc,hnci->hni", self._pull * self.value, self.jacobian).cpu()
+        return torch.einsum("hnc,hnci->hni", self._pull * self.value, self.jacobian).to(self.home)
 
     def inliers(self) -> Float[Tensor, "h"]:
         """Return the share of rays none of whose residuals exceeds three times the scale at which outliers begin."""
-        limits = self.value.new_tensor(self.objective.scales)
+        limits = constant(tuple(self.objective.scales), self.value)
         off = (self.value.abs() > 3 * limits) & (self.weights > 0)
         agreeing: Bool[Tensor, "h n"] = ~off.any(-1)
-        return agreeing.double().mean(-1).cpu()
+        return agreeing.double().mean(-1).to(self.home)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +100,17 @@ class RenderedCost:
 
     def residuals(self, T: SE3, derivatives: bool = True) -> Residuals:
         """Return the residuals from poses T (h); without ``derivatives`` their Jacobian is 0."""
-        used = (self.rays.weights > 0).any(0).tolist()
-        channels = tuple(c for c, use in enumerate(used) if use and derivatives)
+        home, device = T.translation.device, self.rays.weights.device
+        T, channels = T.to(device), self.rays.channels if derivatives else ()
         rays = self.rays.observed.rays(T, self.problem.bounds)
         found = linearize(
-            self._field(rays), rays, self.rays.observed, self.objective.residuals, self.pivot.at(T),
+            self._field(rays), rays, self.rays.observed, self.objective.residuals, self.pivot.to(device).at(T),
             self.problem.bounds.background, self.settings.least_weight, channels,
         )  # fmt: skip
-        return _residuals(found, self.rays, self.objective, self.settings.exposure, self.stage.surface_sigma)
+        residuals = _residuals(
+            found, self.rays, self.objective, self.settings.exposure, self.stage.surface_sigma
+        )
+        return replace(residuals, home=home)
 
     @property
     def field(self) -> RadianceField:
@@ -137,6 +142,7 @@ class RenderedCostSettings:
         objective = objective_of(self.colour, depth, stage.colour_scale, stage.depth_scale, MISS_SCALES)
         counts = RayCounts(stage.rays, 0 if depth is None else depth.depth_rays)
         rays = draw_weighted_rays(problem, objective, counts, self.refinement.pixels, stage.blur, generator)
+        _ = rays.channels  # counted here, since the host waits for it
         return RenderedCost(problem, rays, objective, stage, self.refinement, pivot)
 
 
@@ -155,7 +161,7 @@ def _residuals(
         value = torch.cat([fitted.applied(rendered.mT).mT - measured, value[..., 3:]], -1)
         jacobian = _without_exposure(rendered, jacobian, weights, fitted)
     confidence = (
-        1 + (surface_sigma / value.new_tensor(objective.scales) * found.steepness.double()) ** 2
+        1 + (surface_sigma / constant(tuple(objective.scales), value) * found.steepness.double()) ** 2
     ).rsqrt()
     return Residuals(torch.where(weights > 0, value, 0), jacobian, weights, confidence, objective)
 

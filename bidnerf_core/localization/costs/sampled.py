@@ -4,17 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from bidnerf_core.field import widened
+from bidnerf_core.blurring import Blurred
+from bidnerf_core.constants import constant
+from bidnerf_core.field import RadianceField, Rays, widened
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
+from bidnerf_core.localization.method_settings import DescentSettings, ReachSettings
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import DrawerName, PixelDrawer, draw, drawer
+from bidnerf_core.pixels import PixelDrawer, draw, drawer
 from bidnerf_core.rendering import render
-from bidnerf_core.residuals import Objective
+from bidnerf_core.residuals import Objective, masked_mean
+from bidnerf_core.robust import Robust
+from bidnerf_core.sampling import Resampled, Stratified
 from bidnerf_core.se3 import SE3
+
+DIFFERENT = 0.02
+"""Colour difference from the background, in [0, 1], above which a pixel shows matter."""
+BOX_SCALE = 0.1
+"""Distance (metres) between a measured point and the box of the scene at which outliers begin."""
 
 
 @dataclass(eq=False)
@@ -24,36 +35,72 @@ class SampledLoss:
     problem: Problem
     objective: Objective
     counts: RayCounts
-    pixels: DrawerName
-    renew: bool  # whether pixels are drawn anew
-    level: int | None
-    wide: float  # length of the sampled interval over [near, far]
+    rays: DescentSettings
+    reach: ReachSettings
     generator: Generator
     _drawer: PixelDrawer = field(init=False)
     _batches: list[Observations] | None = field(default=None, init=False)
+    _calls: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        self._drawer = drawer(self.pixels)
+        self._drawer = drawer(self.rays.pixels)
 
     def __call__(self, T_world_last: SE3) -> Float[Tensor, ""]:
         """Return the loss; differentiable in the pose of the last view's camera."""
-        if self._batches is None or self.renew:
-            self._batches = self._drawn()
-        first, *others = (self._loss(batch, T_world_last) for batch in self._batches)
+        if self._batches is None or self.rays.renew:
+            self._batches = self._drawn(T_world_last.detach())
+        scene = self._field()
+        self._calls += 1
+        first, *others = (self._loss(scene, batch, T_world_last) for batch in self._batches)
         return sum(others, start=first)
 
-    def _loss(self, observed: Observations, T_world_last: SE3) -> Float[Tensor, ""]:
-        bounds = self.problem.bounds
-        rays = observed.rays(T_world_last, bounds)
-        rays = rays if self.wide == 1 else widened(rays, self.wide)
-        return self.objective.loss(render(self.problem.level(self.level), rays, bounds.background), observed)
+    def _field(self) -> RadianceField:
+        """Return the level that is rendered, with the sampling and the blur of this step."""
+        scene, reach = self.problem.level(self.rays.level), self.reach
+        if reach.samples > 0:
+            scene = Resampled(scene, Stratified(reach.samples, self.problem.bounds))
+        if reach.blur > 0:
+            sigma = reach.blur * 0.5 ** (self._calls / reach.blur_steps)
+            scene = Blurred(scene, sigma, self.generator)
+        return scene
 
-    def _drawn(self) -> list[Observations]:
+    def _loss(self, scene: RadianceField, observed: Observations, T_world_last: SE3) -> Float[Tensor, ""]:
+        rays = self._rays(observed, T_world_last)
+        loss = self.objective.loss(render(scene, rays, self.problem.bounds.background), observed)
+        return loss + self.reach.box_weight * self._outside(rays, observed) if self.reach.box_weight else loss
+
+    def _rays(self, observed: Observations, T_world_last: SE3) -> Rays:
+        rays = observed.rays(T_world_last, self.problem.bounds)
+        return rays if self.rays.wide == 1 else widened(rays, self.rays.wide)
+
+    def _outside(self, rays: Rays, observed: Observations) -> Float[Tensor, ""]:
+        """Return the mean robust loss of the distances (metres) between measured points and the box of the scene."""
+        bounds = self.problem.bounds
+        points = rays.origins + observed.distance[..., None] * rays.directions
+        half = constant(bounds.size, points) / 2
+        off = ((points - constant(bounds.centre, points)).abs() - half).clamp(min=0)
+        robust = Robust("huber", BOX_SCALE)
+        return masked_mean(robust(torch.linalg.vector_norm(off, dim=-1)), observed.measured).mean()
+
+    def _drawn(self, T_world_last: SE3) -> list[Observations]:
         """Draw pixels (views, pixels a view) and, where there are any, rays of depth (1, rays)."""
         problem, device = self.problem, self.problem.device
-        batches = [draw(problem.views, self.counts.pixels, self._drawer, self.generator, device=device)]
+        many = self.counts.pixels * self.reach.candidates
+        pixels = draw(problem.views, many, self._drawer, self.generator, device=device)
+        if self.reach.candidates > 1:
+            count = max(1, self.counts.pixels // len(problem.views))
+            order = self._rank(pixels, T_world_last).sort(dim=-1, descending=True, stable=True).indices
+            pixels = pixels.gathered(order[:, :count])
+        batches = [pixels]
         if problem.depth_rays is not None and self.objective.uses_depth and self.counts.depth_rays > 0:
             batches.append(
                 problem.depth_rays.drawn(self.counts.depth_rays, self.generator, device=device)[None]
             )
         return batches
+
+    def _rank(self, pixels: Observations, T_world_last: SE3) -> Int[Tensor, "k p"]:
+        """Return 2 or more for pixels that show matter in the image, and 1 for others that may meet it in the map."""
+        background = constant(self.problem.bounds.background, pixels.rgb)
+        shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
+        sampler = self.problem.level(self.rays.level).sampler
+        return 2 * shows.int() + sampler(self._rays(pixels, T_world_last)).valid.any(-1).int()

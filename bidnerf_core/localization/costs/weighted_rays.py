@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -30,6 +31,12 @@ class WeightedRays:
 
     observed: Observations  # (n)
     weights: Float[Tensor, "n c"]  # 0 where nothing was measured
+
+    @cached_property
+    def channels(self) -> tuple[int, ...]:
+        """The residuals that were measured along any ray."""
+        used = (self.weights > 0).any(0).tolist()
+        return tuple(channel for channel, is_used in enumerate(used) if is_used)
 
 
 def draw_weighted_rays(

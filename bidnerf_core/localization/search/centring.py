@@ -21,9 +21,8 @@ from bidnerf_core.se3 import SE3
 @torch.no_grad()
 def centred(field: RadianceField, observed: Observations, bounds: SceneBounds, T: SE3) -> SE3:
     """Return the poses T (h) after centring; a pose stays as it is if nothing is measured or nothing is rendered."""
-    if not bool(observed.measured.any()):
-        return T
-    measured = observed.points[observed.measured].median(0).values
+    points = torch.where(observed.measured[:, None], observed.points, torch.nan)
+    measured = points.nanmedian(0).values  # NaN where nothing was measured
     shift = rendered_middle(field, observed, bounds, T) - measured
     shift = torch.where(shift.isfinite(), shift, 0).to(T.translation)
     return SE3(T.rotation, T.translation + (T.rotation @ shift[..., None])[..., 0])

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.localization.normal_equations import Cost, NormalEquations
 from bidnerf_core.se3 import SE3
+from bidnerf_core.waiting import may_wait
 
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
 
@@ -39,7 +40,7 @@ def descend(
 
     Damping scales with the diagonal (Marquardt 1963), so that units do not matter. ``stop``: a pose has settled once a
     lightly damped step is shorter than this (norm of the tangent), whether or not it still lowers the cost; the descent
-    ends when all poses have. 0: never.
+    ends when all poses have, unless the host must not wait for the device to say so. 0: never.
     """
     T, here = start, cost(start)
     factor = torch.full_like(here.cost, damping)
@@ -56,7 +57,7 @@ def descend(
         accepted.append(better)
         poses.append(T)
         costs.append(here.cost)
-        if stop and bool(settled.all()):
+        if stop and may_wait(settled.device) and bool(settled.all()):
             break
     history = torch.stack(accepted) if accepted else torch.zeros((0, len(settled))).to(settled)
     return Descent(T, here, history, SE3.stack(poses), torch.stack(costs), settled)

@@ -1,0 +1,198 @@
+"""What a GPU makes of the methods: time of a step by backend and where it goes, no-start localization, the paper's tables.
+
+    python benchmarks/gpu.py DATA --map MAP [--map MAP ...] --out FOLDER [--part steps no_start tables]
+
+- ``steps``: milliseconds of a step of ``bid`` with 2048 rays at each level of each map, timed with events of the device after a
+  warm-up, with the operations that take most of it; the steps run under PyTorch's check that the host never waits;
+- ``no_start``: method ``auto`` on RGB-D and on RGB test frames: median time and success;
+- ``tables``: ``paper_tables.py`` with preset ``paper`` and with ``paper-scene``, on the device.
+
+Finished rows are kept in FOLDER, safe against any kill: the same command goes on where it stopped. When all is done, the record
+``gpu.json`` is written there. Without a GPU the script says so and ends with status 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from paper_tables import RESULTS, test_frames
+
+from bidnerf_core import Localizer
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.evaluation.trials import opened
+from bidnerf_core.field import levels
+from bidnerf_core.frames import View
+from bidnerf_core.localization import METHODS
+from bidnerf_core.localization.costs.sampled import SampledLoss
+from bidnerf_core.localization.costs.weighted_rays import RayCounts
+from bidnerf_core.localization.method_settings import (
+    AdamSettings,
+    DescentSettings,
+    ReachSettings,
+    objective_of,
+)
+from bidnerf_core.localization.pivots import pivot
+from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization.solvers.adam import AdamSteps
+from bidnerf_core.waiting import without_waiting
+
+RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
+FRAMES = 40
+"""Largest number of frames that are localized without a start."""
+
+
+def made_steps(folder: str, data: str, level: int, device: torch.device, rays: int = RAYS) -> AdamSteps:
+    """Return the steps of ``bid`` from 0.1 units beside the first test frame's pose."""
+    stored, dataset = opened(folder, data)
+    there = None if device.type == "cpu" else device
+    scene = Localizer(stored, "bid", device=there, warm_up=False).map
+    view = dataset.views("test", test_frames(folder, data, tuning=False)[:1])[0]
+    problem = rig(scene, [view], perturb(view.T_ref_camera, 0.1, 2.0, seed=0))
+    usual = METHODS["bid"].settings("paper-scene")
+    loss = SampledLoss(
+        problem.on_device(), objective_of(usual.colour, usual.depth), RayCounts(rays),
+        DescentSettings(rays=rays, level=level), ReachSettings(), torch.Generator(device).manual_seed(0),
+    )  # fmt: skip
+    # Poses stay where they are, so that all steps render alike.
+    rate = AdamSettings(learning_rate=1e-9, decay=1.0)
+    return AdamSteps(loss, pivot("scene", problem), rate, problem.start_for("bid").to(device))
+
+
+def timed_steps(steps: AdamSteps, warm_up: int, count: int) -> dict[str, Any]:
+    """Return the median time of a step (ms) by the device's events, and the operations that take most of it."""
+    with without_waiting():
+        for number in range(warm_up):
+            steps(number)
+        torch.cuda.synchronize()
+        marks = [torch.cuda.Event(enable_timing=True) for _ in range(count + 1)]
+        torch.cuda.set_sync_debug_mode("error")  # a step in which the host waits raises
+        try:
+            for number, mark in enumerate(marks[:-1]):
+                mark.record()
+                steps(number)
+            marks[-1].record()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        torch.cuda.synchronize()
+        times = [a.elapsed_time(b) for a, b in pairwise(marks)]
+        return {"ms": statistics.median(times), "ms_most": max(times), "operations": operations(steps)}
+
+
+def operations(steps: AdamSteps) -> list[dict[str, Any]]:
+    """Return the ten operations that take most of the device's time, with their share of it."""
+    kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=kinds) as profile:
+        for number in range(PROFILED):
+            steps(number)
+        torch.cuda.synchronize()
+    rows = profile.key_averages()
+    total = sum(row.self_device_time_total for row in rows) or 1
+    most = sorted(rows, key=lambda row: -row.self_device_time_total)[:10]
+    return [
+        {"name": row.key, "calls": row.count / PROFILED, "share": row.self_device_time_total / total}
+        for row in most
+    ]
+
+
+def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
+    """Return the times of a step at each level of a map."""
+    count = len(levels(opened(folder, data, str(device))[0].field))
+    return {
+        f"level {level}": timed_steps(made_steps(folder, data, level, device), WARM_UP, TIMED)
+        for level in range(count)
+    }
+
+
+def no_start_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
+    """Return the median time (ms) and the success of ``auto`` on frames with and without depth."""
+    stored, dataset = opened(folder, data, str(device))
+    views = dataset.views("test", test_frames(folder, data, tuning=False)[:FRAMES])
+    localizer, found = Localizer(stored), {}
+    for name, problems in (("RGB-D", views), ("RGB", [_without_depth(view) for view in views])):
+        localizer(problems[0].frame)  # warm-up
+        times, right = [], 0
+        for view in problems:
+            began = time.perf_counter()
+            error = pose_error(localizer(view.frame).T_world_camera, view.T_ref_camera)
+            times.append(1000 * (time.perf_counter() - began))
+            right += bool(error.translation < 0.05) and bool(error.rotation_deg < 5)
+        found[name] = {"ms": statistics.median(times), "within 5 degrees, 0.05": right, "frames": len(views)}
+    return found
+
+
+def _without_depth(view: View) -> View:
+    return replace(view, frame=replace(view.frame, depth=None))
+
+
+def table_rows(folder: str, data: str, out: Path, preset: str, device: torch.device) -> dict[str, Any]:
+    """Run the paper's tables in a process of their own, which goes on where it stopped."""
+    script = Path(__file__).with_name("paper_tables.py")
+    began, tables = time.perf_counter(), out / preset
+    subprocess.run(
+        [sys.executable, str(script), data, "--map", folder, "--out", str(tables), "--preset", preset,
+         "--device", str(device), "--workers", "1"],
+        check=True,
+    )  # fmt: skip
+    return {"folder": tables.name, "seconds": time.perf_counter() - began}
+
+
+def attempted(what: str, make: Callable[[], Any]) -> Any:
+    """Return what ``make`` returns, or why it failed: the other rows are worth having all the same."""
+    print(what, flush=True)
+    try:
+        return make()
+    except (RuntimeError, subprocess.CalledProcessError) as error:
+        return {"failed": f"{type(error).__name__}: {str(error).splitlines()[0]}"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data")
+    parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parts = ("steps", "no_start", "tables")
+    parser.add_argument("--part", nargs="+", choices=parts, default=list(parts))
+    given = parser.parse_args()
+    if not torch.cuda.is_available():
+        print("no GPU here: nothing was measured, and no record was written")
+        return
+    device, gpu = torch.device("cuda"), torch.cuda.get_device_name()
+    given.out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Any] = {"gpu": gpu, "rays": RAYS}
+    with RowStore(given.out / "gpu.rows.jsonl") as store:
+        for folder in given.map:
+            name = Path(folder).name
+            rows: dict[str, Callable[[], Any]] = {
+                "steps": partial(step_rows, folder, given.data, device),
+                "no_start": partial(no_start_rows, folder, given.data, device),
+            } | {
+                f"tables {preset}": partial(table_rows, folder, given.data, given.out, preset, device)
+                for preset in ("paper", "paper-scene")
+            }
+            for row, make in rows.items():
+                if row.partition(" ")[0] in given.part:
+                    key = [gpu, name, row]
+                    results.setdefault(row, {})[name] = store.get(
+                        key, partial(attempted, f"{name}: {row}", make)
+                    )
+    print(write_record(given.out / "gpu.json", results, seed=0))
+
+
+if __name__ == "__main__":
+    main()

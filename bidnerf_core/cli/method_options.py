@@ -1,0 +1,21 @@
+"""The options that choose a method's settings, on which the parser of the other settings depends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeAlias
+
+from bidnerf_core.cli.common import option, value_of, wrong_usage
+from bidnerf_core.localization import find_method
+
+Preset: TypeAlias = Annotated[
+    str | None,
+    option("NAME", "settings to begin with: paper or paper-scene for bid, paper for inerf", "the defaults"),
+]
+
+
+def chosen_settings(arguments: Sequence[str], usual: str) -> Any:
+    """Return the settings of the method that ``--method`` names: its defaults, or those that ``--preset`` names."""
+    with wrong_usage():
+        method = find_method(value_of("--method", arguments) or usual)
+        return method.settings(value_of("--preset", arguments))

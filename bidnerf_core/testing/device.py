@@ -1,0 +1,118 @@
+"""The check that a field lets the steps of a localization stay on its device."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.localization.costs.rendered import RenderedCostSettings
+from bidnerf_core.localization.costs.sampled import SampledLoss
+from bidnerf_core.localization.costs.weighted_rays import RayCounts
+from bidnerf_core.localization.method_settings import (
+    AdamSettings,
+    ColourSettings,
+    DepthSettings,
+    DescentSettings,
+    ReachSettings,
+    RefinementSettings,
+    RefinementStage,
+    objective_of,
+)
+from bidnerf_core.localization.pivots import pivot
+from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.solvers.adam import AdamSteps
+from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.testing.elsewhere import DEVICE, DeviceFault, Elsewhere
+from bidnerf_core.testing.faults import calling, require_that
+from bidnerf_core.testing.scene import BOUNDS, rgbd_views
+from bidnerf_core.testing.values import close
+from bidnerf_core.waiting import without_waiting
+
+RAYS = 48
+OFF = (0.05, -0.03, 0.04, 0.01, -0.02, 0.01)
+"""Tangent vector from the true pose to the one that steps begin at: metres, radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    field: RadianceField
+    bounds: SceneBounds = BOUNDS
+    surface: SurfaceMap | None = None
+
+
+def check_steps(field: RadianceField) -> None:
+    """Check that steps at each level neither copy between devices nor wait for one, and lead where they do on the CPU.
+
+    The device is a pretended one, see ``elsewhere``. Fields without parameters and buffers have no device and pass.
+    """
+    for number in range(len(levels(field))):
+        expected = _first_order(_problem(field), number, None)
+        with Elsewhere() as mode:
+            with calling(f"{type(field).__name__}.to(device)"):
+                moved: Any = cast(Any, copy.deepcopy(field)).to(DEVICE)
+            problem = _problem(moved)
+            if problem.device != DEVICE:
+                return
+            who = f"{type(field).__name__}, level {number}"
+            with _naming(f"{who}: a step of Adam"):
+                found = _first_order(problem, number, mode)
+            with _naming(f"{who}: a step of Levenberg-Marquardt"):
+                _second_order(problem, number, mode)
+        same = close(found, expected, 1e-3)
+        require_that(
+            same, f"{who}: steps on another device lead elsewhere than on the CPU; is some state not moved?"
+        )
+
+
+@contextmanager
+def _naming(what: str) -> Iterator[None]:
+    """Turn a ``DeviceFault`` into a failure of the contract that says where it happened."""
+    try:
+        yield
+    except DeviceFault as fault:
+        require_that(
+            False, f"{what}: {fault}; expected all of it on the field's device, in shapes that are known"
+        )
+
+
+def _problem(field: RadianceField) -> Problem:
+    view = rgbd_views(coverage=False)[0]
+    start = view.T_ref_camera.to("cpu", torch.float64).retract(torch.tensor(OFF, dtype=torch.float64))
+    return rig(_Scene(field), [view], start)
+
+
+def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor:
+    """Return the pose (4 4) after two steps; the first fills caches, the second must not leave the device."""
+    device, start = problem.device, problem.start_for("bid")
+    objective = objective_of(ColourSettings(), DepthSettings())
+    settings, generator = DescentSettings(level=level), torch.Generator(device).manual_seed(0)
+    loss = SampledLoss(problem.on_device(), objective, RayCounts(RAYS), settings, ReachSettings(), generator)
+    steps = AdamSteps(loss, pivot("scene", problem), AdamSettings(), start.to(device))
+    with without_waiting():
+        steps(0)
+        if mode is None:
+            steps(1)
+        else:
+            with mode.strict():
+                steps(1)
+    return steps.T.to("cpu").matrix()
+
+
+def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
+    about = pivot("scene", problem).to(DEVICE)
+    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
+    stage, generator = RefinementStage(2, RAYS, level=level), torch.Generator().manual_seed(0)
+    cost = settings.drawn(problem.on_device(), stage, about, generator)
+    start = problem.start_for("bid-lm")[None].to(DEVICE)
+    with without_waiting():
+        descend(cost, start, 1, about.moved)
+        with mode.strict():
+            descend(cost, start, 2, about.moved, stop=settings.refinement.stop_step)
