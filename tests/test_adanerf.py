@@ -380,6 +380,8 @@ def test_settings_are_judged() -> None:
         AdaNerfConfig(bins=0)
     with pytest.raises(InputError, match=r"make 1\.2, expected 1 or less"):
         AdaNerfConfig(dense_part=0.7, soft_part=0.5)
+    with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
+        AdaNerfConfig(learning_rate=0)
 
 
 def test_presets() -> None:

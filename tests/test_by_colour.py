@@ -13,7 +13,9 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import AutoConfig, Localization
+from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.result import Outcome
 from bidnerf_core.mapping import SurfaceMap, bake
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
@@ -71,7 +73,7 @@ def test_measured_depth_that_is_too_little_does_no_harm() -> None:
 def test_a_start_is_one_more_place_to_look() -> None:
     truth = UNSEEN[0]
     aside = replace(surface(), keyframes=surface().keyframes[:1])
-    turned = truth @ SE3.exp(torch.tensor([0.1, 0.0, 0.1, 0.1, 0.3, 0.1], dtype=torch.float64))
+    turned = truth @ SE3.exp(torch.tensor([0.07, 0.0, 0.07, 0.07, 0.2, 0.07], dtype=torch.float64))
     started = rig(FieldMap(FIELD, BOUNDS, aside), [photograph(truth)], turned)
     found = localize(started, "auto", replace(QUICK, hypotheses=96))
     assert_right(found, truth)
@@ -90,3 +92,18 @@ def test_a_map_without_surface_needs_a_start() -> None:
     with pytest.raises(InputError, match=r"no surface .*needs a start") as raised:
         localize(rig(FieldMap(FIELD, BOUNDS), [photograph(UNSEEN[0])], None), "auto", QUICK)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(("typical", "kept"), [(0.0, True), (0.02, True), (0.003, False)])
+def test_an_answer_far_less_certain_than_those_of_the_map_is_rejected(typical: float, kept: bool) -> None:
+    answer = Localization(
+        T_world_camera=SE3.identity(), outcome=Outcome.CONVERGED, reason="well", steps=0, seconds=0.0, loss=0.0,
+        method="auto", poses=SE3.identity()[None], losses=torch.zeros(0, dtype=torch.float64),
+        covariance=0.05**2 * torch.eye(6, dtype=torch.float64),
+    )  # fmt: skip
+    found = without_the_imprecise(answer, typical)
+    assert found.converged == kept
+    if not kept:
+        assert found.outcome is Outcome.IMPRECISE
+        assert "0.05" in found.reason
+        assert "0.003" in found.reason

@@ -8,7 +8,12 @@ from torch import Generator
 
 import baked
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.covariance import INDEPENDENT, sandwich_covariance, surface_covariance
+from bidnerf_core.localization.covariance import (
+    INDEPENDENT,
+    sandwich_covariance,
+    surface_covariance,
+    without_direction,
+)
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.se3 import SE3
 
@@ -28,14 +33,34 @@ def test_the_surface_covariance_is_symmetric_and_positive_definite(number: int) 
     assert torch.equal(found, found.mT)
     assert torch.linalg.eigvalsh(found).min() > 0
     assert found.diagonal()[:3].sum().sqrt() < 0.2
-    rigged = surface_covariance(cost, view.T_ref_camera, views=4)
-    assert torch.allclose(rigged, found / 4, rtol=0.05, atol=1e-7)
+    exact, rigged = (surface_covariance(cost, view.T_ref_camera, views, depth_scale=0.0) for views in (1, 4))
+    assert torch.allclose(rigged, exact / 4, rtol=0.05, atol=1e-7)
+
+
+def test_an_uncertain_scale_of_the_depth_makes_the_way_to_the_scene_uncertain() -> None:
+    view = baked.unseen()[0]
+    cost = baked.point_search(view).judge()
+    exact, uncertain = (surface_covariance(cost, view.T_ref_camera, depth_scale=s) for s in (0.0, 0.02))
+    added = (uncertain - exact)[:3, :3]
+    expected = 0.02 * cost.cloud.middle.double()
+    torch.testing.assert_close(added, expected[:, None] * expected, rtol=1e-6, atol=1e-12)
+    assert (uncertain - exact)[3:].abs().max() < 1e-12
+
+
+def test_information_without_a_direction_is_that_of_a_larger_covariance(generator: Generator) -> None:
+    root = torch.randn((6, 6), generator=generator, dtype=torch.float64)
+    slope = torch.randn(6, generator=generator, dtype=torch.float64)
+    information = root @ root.mT
+    larger = torch.linalg.inv(information) + slope[:, None] * slope
+    torch.testing.assert_close(without_direction(information, slope), torch.linalg.inv(larger))
 
 
 def test_the_surface_covariance_grows_with_the_square_of_noise() -> None:
     surface = baked.patch()
     little, more = (
-        surface_covariance(PointSearch(surface, seen_patch(noise)).judge(), SE3.identity())[2, 2]
+        surface_covariance(PointSearch(surface, seen_patch(noise)).judge(), SE3.identity(), depth_scale=0.0)[
+            2, 2
+        ]
         for noise in (0.002, 0.004)
     )
     assert float(more / little) == pytest.approx(4, rel=0.1)
@@ -68,7 +93,7 @@ def test_the_surface_covariance_of_a_plane_is_that_of_a_few_independent_distance
     noise, surface = 0.003, baked.patch()
     bare = torch.zeros(100, dtype=torch.bool)
     cloud = baked.points(seen_patch(noise).points, torch.zeros((100, 3)), coloured=bare)
-    found = surface_covariance(PointSearch(surface, cloud).judge(), SE3.identity())
+    found = surface_covariance(PointSearch(surface, cloud).judge(), SE3.identity(), depth_scale=0.0)
     assert float(found[2, 2].sqrt()) == pytest.approx(noise / (2 * INDEPENDENT) ** 0.5, rel=0.15)
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import tiny
+from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
 from bidnerf_core.rendering import render
 from bidnerf_core.voxel_grid import VoxelGrid
@@ -252,6 +253,15 @@ def test_what_is_derived_from_the_occupancy_is_brought_up_to_date_on_loading() -
 # The field.
 
 
+def test_settings_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(
+        InputError, match=r"coarse_levels is 99, expected 10 \(levels of the encoding\) or less"
+    ):
+        HashGridConfig(coarse_levels=99)
+    with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
+        HashGridConfig(learning_rate=0)
+
+
 @pytest.fixture(scope="module")
 def field() -> HashGridField:
     """Float64, with features and density of order one, and with more detail at finer levels."""
@@ -376,7 +386,7 @@ def test_a_scene_of_another_size_is_the_same_scene() -> None:
 
 def test_building_leaves_the_global_chance_alone() -> None:
     state = torch.get_rng_state()
-    backend.build(HashGridConfig(encoding=tiny.ENCODING, grid_resolution=8), BOUNDS)
+    backend.build(HashGridConfig(encoding=tiny.ENCODING, grid_resolution=8, coarse_levels=1), BOUNDS)
     assert torch.equal(torch.get_rng_state(), state)
 
 

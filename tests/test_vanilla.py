@@ -326,6 +326,11 @@ def test_settings_that_make_no_sense_are_refused(name: str) -> None:
         VanillaConfig(**{name: -1})
 
 
+def test_a_learning_rate_of_zero_is_refused() -> None:
+    with pytest.raises(InputError, match="learning_rate is 0, expected more than 0"):
+        VanillaConfig(learning_rate=0)
+
+
 def test_an_encoding_of_nothing_is_refused() -> None:
     with pytest.raises(InputError, match="expected one of them"):
         VanillaConfig(position_frequencies=0, include_input=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.settings import Count, NotNegative, Range
+from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import SupervisionConfig
 
 
@@ -38,7 +38,7 @@ class AdaNerfConfig(SupervisionConfig):
     # approximate number of samples shaded a step, which decides the number of rays
     samples_per_step: Count = 8192
     rays_at_most: Count = 4096  # largest number of rays a step
-    learning_rate: NotNegative = 3e-3  # initial learning rate
+    learning_rate: Positive = 3e-3  # initial learning rate
     sparsity_weight: NotNegative = 0.01  # weight of the mean score, once the soft phase is half over
     # weight of the oracle's own loss, whose targets are measured depth and shaded bins
     oracle_weight: NotNegative = 0.1

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
 from bidnerf_core.sampling import Concentrated
 from bidnerf_core.settings import Count, Range, Settings
@@ -36,6 +37,13 @@ class FieldConfig(Settings):
     # largest number where the scene is contracted; elsewhere, or with 0, all intervals in occupied cells
     samples_per_ray: Annotated[int, Range(0)] = 32
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.coarse_levels > self.encoding.levels:
+            raise InputError(
+                f"coarse_levels is {self.coarse_levels}, expected {self.encoding.levels} (levels of the encoding) or less"
+            )
 
 
 class HashGridField(nn.Module):

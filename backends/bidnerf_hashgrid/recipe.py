@@ -13,7 +13,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
-from bidnerf_core.settings import Count, NotNegative, Range
+from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch, fit
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
@@ -25,7 +25,7 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
 
     steps: Count = 1600  # steps of the optimizer
     samples_per_step: Count = 65536  # approximate number of samples a step, which decides the number of rays
-    learning_rate: NotNegative = 1e-2  # learning rate of the tables; the networks have a quarter of it
+    learning_rate: Positive = 1e-2  # learning rate of the tables; the networks have a quarter of it
     # steps from one update of the coarse field to the next; 0: it is not trained
     coarse_every: Annotated[int, Range(0)] = 4
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws

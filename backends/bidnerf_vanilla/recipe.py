@@ -13,7 +13,7 @@ from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
-from bidnerf_core.settings import Count, NotNegative, Range
+from bidnerf_core.settings import Count, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch, fit
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
@@ -29,7 +29,7 @@ class VanillaConfig(FieldConfig, SupervisionConfig):
     # approximate number of samples of the fine network a step, which decides the number of rays
     samples_per_step: Count = 4096
     rays_at_most: Count = 4096  # largest number of rays a step
-    learning_rate: NotNegative = 3e-3  # initial learning rate
+    learning_rate: Positive = 3e-3  # initial learning rate
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
     carve: bool = True  # skip the cells that the views' depth and silhouettes show to be empty
 

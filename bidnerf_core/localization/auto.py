@@ -28,6 +28,7 @@ from bidnerf_core.localization.by_colour import (
     ColourAnswer,
     localization_of,
     refine_by_colour,
+    without_the_imprecise,
 )
 from bidnerf_core.localization.by_landmarks import (
     answer_by_landmarks,
@@ -49,13 +50,14 @@ from bidnerf_core.localization.method_settings import (
 )
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
-from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.by_images import ImageSearch
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import EXPERT, Range, Settings
@@ -100,6 +102,9 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     began, answer, matcher = time.perf_counter(), None, problem.matcher if config.landmarks else None
     if matcher is not None:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
+    if answer is not None and matcher is not None:
+        rejection = _mirror_rejection(problem, matcher, answer.found.log10_nfa, seed)
+        answer = answer if rejection is None else replace(answer, verdict=rejection)
     has_points = _measured_points(problem) >= LEAST_POINTS
     if answer is not None and _is_final(answer.verdict.outcome, has_points):
         return localization_by_landmarks(problem, answer, began)
@@ -111,6 +116,8 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         found = _by_points(problem, problem.surface, config, seed)
     else:
         found = _by_images(problem.without_depth(), problem.surface, config, seed)
+        typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
+        found = without_the_imprecise(found, typical)
     return (
         found if matcher is None else _compared_with_landmarks(found, problem, matcher, config, seed, began)
     )
@@ -121,7 +128,18 @@ def _is_final(outcome: Outcome, has_points: bool) -> bool:
     if outcome is Outcome.UNCERTAIN:
         return not has_points
     # With wrong intrinsics, the surface is not found at the right place either.
-    return outcome in (Outcome.CONVERGED, Outcome.MISCALIBRATED)
+    return outcome in (Outcome.CONVERGED, Outcome.MISCALIBRATED, Outcome.MIRRORED)
+
+
+def _mirror_rejection(
+    problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, seed: int
+) -> Verdict | None:
+    """Return why a pose with this evidence is rejected if the mirror image of the query fits better, else None."""
+    if log10_nfa < SUSPICIOUS:
+        return None
+    twin = mirror_evidence(matcher, problem.views, seed=seed)
+    why = f"{twin.agreeing} landmarks agree with the mirror image"
+    return Verdict(Outcome.MIRRORED, why) if twin.contradicts(log10_nfa) else None
 
 
 def _compared_with_landmarks(
@@ -137,12 +155,22 @@ def _compared_with_landmarks(
     if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
         refined = localization_by_landmarks(problem, answer, began)
-        supported = found.converged and answer.confidence is not None and answer.confidence >= SUPPORTED
+        twin = _mirror_rejection(problem, matcher, near.pose.log10_nfa, seed)
+        supported = (
+            twin is None
+            and found.converged
+            and answer.confidence is not None
+            and answer.confidence >= SUPPORTED
+        )
         outcome = Outcome.CONVERGED if supported else refined.outcome
+        if twin is not None:
+            return replace(refined, outcome=twin.outcome, reason=f"{twin.reason}; {refined.reason}")
         return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
+    if found.converged and (twin := _mirror_rejection(problem, matcher, 0.0, seed)) is not None:
+        return replace(found, outcome=twin.outcome, reason=f"{twin.reason}; {found.reason}")
     return replace(found, seconds=time.perf_counter() - began)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -20,7 +20,7 @@ from bidnerf_core.localization.method_settings import (
 )
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult, refine
-from bidnerf_core.localization.result import Localization, Verdict
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import EXPERT, Range, Settings
@@ -46,6 +46,10 @@ class ByColourConfig(Settings):
     colour: ColourSettings = ColourSettings()
     refinement: RefinementSettings = RefinementSettings(surface_sigma=0.006)
     thresholds: RenderedThresholds = RenderedThresholds()
+
+
+TYPICAL_ERRORS = 4.5
+"""Largest standard deviation of a position, in median errors of the map's own images, with which a pose is accepted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,3 +101,17 @@ def localization_of(
         losses=torch.cat([search.losses, refined.losses]),
         covariance=covariance if bool(covariance.isfinite().all()) else None,
     )
+
+
+def without_the_imprecise(found: Localization, typical: float) -> Localization:
+    """Reject an accepted answer whose position is far less certain than usual: blurred images fit many poses.
+
+    ``typical`` is the median error of the map's own images, metres; 0 where it is not known.
+    """
+    if not found.converged or found.covariance is None or typical <= 0:
+        return found
+    deviation = float(torch.linalg.eigvalsh(found.covariance[:3, :3])[-1].clamp(min=0).sqrt())
+    if deviation <= TYPICAL_ERRORS * typical:
+        return found
+    why = f"the position is uncertain by {deviation:.3g}, the map's own images by {typical:.3g}"
+    return replace(found, outcome=Outcome.IMPRECISE, reason=f"{why}; {found.reason}")

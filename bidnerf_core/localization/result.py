@@ -29,6 +29,7 @@ class Outcome(StrEnum):
     HIGH_LOSS = "high loss"  # a descent ended above the loss that counts as converged
     DIVERGED = "diverged"  # the loss or the pose became infinite or not a number
     MISCALIBRATED = "miscalibrated"  # the image contradicts the camera's intrinsics
+    MIRRORED = "mirrored"  # the mirror image fits the map better than the image
     IMPRECISE = "imprecise"  # the pose is too uncertain, compared with the distance of what is in view
     UNCERTAIN = "uncertain"  # the diagnostics together make a wrong pose too likely
     TOO_FEW_MATCHES = "too few matches"  # of image features with the map's landmarks

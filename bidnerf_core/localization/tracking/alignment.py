@@ -127,5 +127,5 @@ def aligned(
             .normalized()
         )
     judge = SurfaceCost(surface, cloud, PointScales(JUDGED * surface.extent))
-    found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, views)
+    found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, views, depth_scale=0.0)
     return Alignment(T, found, surface_diagnostics(judge, T, torch.inf))

@@ -1,0 +1,59 @@
+"""Whether an image shows the scene as in a mirror, which front cameras and wrong readers produce."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.search.correspondences import query_images
+from bidnerf_core.localization.search.landmark_evidence import log10_agreement
+from bidnerf_core.localization.search.landmark_query import LandmarkQuery
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.ransac import sample_consensus
+from bidnerf_core.localization.search.unguided import unguided_matches
+from bidnerf_core.mapping.calibration import FIXED
+from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.orientation import Orientation
+from bidnerf_core.se3 import SE3
+
+KEYPOINTS = 700
+"""Number of keypoints, the strongest of a mirrored image, that are matched."""
+SUSPICIOUS = -150.0
+"""Logarithm of the number of false alarms below which an image is not compared with its mirror image."""
+SIGNIFICANT, DECISIVE = -30.0, 2.0
+"""Logarithm of the number of false alarms below which a mirror image is recognised, and how many times that of the image it
+has to be: symmetric things resemble their mirror images.
+"""
+
+
+@dataclass(frozen=True)
+class MirrorEvidence:
+    """How many landmarks the mirror image of a query matches."""
+
+    agreeing: int
+    log10_nfa: float  # logarithm of the number of such agreements expected by chance
+
+    def contradicts(self, log10_nfa: float) -> bool:
+        """Whether the mirror image is recognised, and matches much better than the image with this ``log10_nfa``."""
+        return self.log10_nfa < min(DECISIVE * log10_nfa, SIGNIFICANT)
+
+
+def mirror_evidence(
+    matcher: LandmarkMatcher, views: Sequence[View], features: Features = SIFT, seed: int = 0
+) -> MirrorEvidence:
+    """Match the mirror image of the last of ``views``, which no pose explains unless the view itself is mirrored."""
+    frame = mirrored(views[-1].frame)
+    query = LandmarkQuery(query_images([View(frame, SE3.identity())], features), matcher.landmarks, FIXED)
+    matches = unguided_matches(query.images, matcher, KEYPOINTS)
+    found = sample_consensus(query.observed(matches), matches.view, query.threshold, seed)
+    agreeing = 0 if found is None else int(found.inliers.sum())
+    return MirrorEvidence(agreeing, log10_agreement(query, matches, agreeing))
+
+
+def mirrored(frame: Frame) -> Frame:
+    """Return what the frame's camera would see in a mirror: left and right swapped, without depth."""
+    swap = Orientation(mirrors_columns=True)
+    alpha = None if frame.alpha is None else swap.upright(frame.alpha)
+    camera = frame.intrinsics.upright(swap)
+    return replace(frame, rgb=swap.upright(frame.rgb), depth=None, alpha=alpha, intrinsics=camera)
