@@ -553,6 +553,27 @@ def test_poses_without_gradient_are_told(change: Any, said: str) -> None:
     assert said in fault("test_rendering_carries_gradients_to_the_pose", broken)
 
 
+def read_by_the_host(self: Any, positions: Tensor, directions: Tensor) -> FieldValues:
+    values = good(self, positions, directions)
+    assert float(values.density.detach().min()) >= 0
+    return values
+
+
+def chosen_by_a_mask(self: Any, positions: Tensor, directions: Tensor) -> FieldValues:
+    values = good(self, positions, directions)
+    dense = values.density > 0
+    return replace(values, rgb=torch.zeros_like(values.rgb).index_put((dense,), values.rgb[dense]))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"), [(read_by_the_host, "reads a number"), (chosen_by_a_mask, "depends on values")]
+)
+def test_steps_that_wait_for_the_device_are_told(change: Any, said: str) -> None:
+    broken = with_query(change)
+    broken.train = lambda *arguments: None
+    assert said in fault("test_steps_stay_on_the_device", broken)
+
+
 # What is saved.
 
 

@@ -56,6 +56,16 @@ class LandmarkAnswer:
     terms: tuple[str, ...] = ()  # what was fused with the landmarks
     confidence: float | None = None  # probability that the pose is right
 
+    @property
+    def full_covariance(self) -> Float[Tensor, "6 6"]:
+        """The covariance with the errors of the intrinsics that the image does not rule out.
+
+        Landmarks and rendered colours are misled by them alike, whereas measured depth shows the distance.
+        """
+        return (
+            self.covariance if "depth" in self.terms else self.covariance + self.found.unresolved_calibration
+        )
+
 
 def answer_by_landmarks(
     problem: Problem, matcher: LandmarkMatcher, rays: int, seed: int
@@ -176,7 +186,7 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
         method="auto",
         poses=SE3.stack(poses),
         losses=torch.full((len(poses) - 1,), found.noise, dtype=torch.float64),
-        covariance=answer.covariance,
+        covariance=answer.full_covariance,
         focal_factor=found.focal_factor,
         confidence=answer.confidence,
         diagnostics=answer.diagnostics,

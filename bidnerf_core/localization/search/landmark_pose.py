@@ -65,6 +65,15 @@ class LandmarkPose:
         return self.covariance + by_calibration @ by_calibration.mT
 
     @property
+    def unresolved_calibration(self) -> Float[Tensor, "6 6"]:
+        """What errors of the intrinsics that are usual, and that this image does not rule out, add to ``full_covariance``."""
+        if self.estimates_calibration:
+            return torch.zeros_like(self.covariance)
+        judged = self.miscalibration
+        added = (judged.unresolved.square() - judged.deviations.square()).clamp(min=0)
+        return self.slope * added @ self.slope.mT
+
+    @property
     def position_deviation(self) -> float:
         """The standard deviation of the position along its least certain direction, metres."""
         return float(torch.linalg.eigvalsh(self.full_covariance[:3, :3])[-1].clamp(min=0).sqrt())

@@ -15,6 +15,8 @@ from bidnerf_core.mapping.resection import ReprojectionFit
 
 MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
 """Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
+USUAL, USUALLY = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01), 0.35
+"""The same of intrinsics as most devices state them: of another unit of the model, or before focus and temperature changed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +29,15 @@ class Miscalibration:
     apparent: Float[Tensor, "4"]  # the correction that fits best, in the order of ``Calibration``
     noise: Float[Tensor, "4"]  # standard deviations of that estimate by the noise of the keypoints
     probability: Float[Tensor, "4"]  # that the given parameter is wrong
+    unresolved: Float[
+        Tensor, "4"
+    ]  # standard deviation of the true correction about zero, usual errors of cameras included
 
     @staticmethod
     def unknown() -> Miscalibration:
         """Return that of intrinsics that no image has been compared with."""
         zero = torch.zeros(4, dtype=torch.float64)
-        return Miscalibration(zero, zero, zero)
+        return Miscalibration(zero, zero, zero, USUAL.deviations)
 
     @staticmethod
     def of(free: ReprojectionFit, landmarks: LandmarkMap) -> Miscalibration:
@@ -42,7 +47,9 @@ class Miscalibration:
         right, wrong = (noise + prior.deviations.square() for prior in (CALIBRATED, MISTAKEN))
         log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
         log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES))
-        return Miscalibration(value, free.calibration_deviations, log_odds.sigmoid())
+        return Miscalibration(
+            value, free.calibration_deviations, log_odds.sigmoid(), unresolved_deviations(value, noise)
+        )
 
     @property
     def calibration(self) -> Calibration:
@@ -71,3 +78,18 @@ class Miscalibration:
             return f"a radial distortion {value:+.3f} from the given one"
         axis = "right" if number == 1 else "down"
         return f"a principal point {value:+.1%} of the focal length further {axis}"
+
+
+def unresolved_deviations(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
+    """Return the standard deviations about zero of the true corrections, seen as ``apparent`` with the variances ``noise``.
+
+    The prior is a mixture: intrinsics are calibrated, off as usual, or wrong.
+    """
+    parts = ((CALIBRATED, 1 - USUALLY - MISTAKES), (USUAL, USUALLY), (MISTAKEN, MISTAKES))
+    prior = torch.stack([part.deviations.square() for part, _ in parts])
+    shares = torch.tensor([[share] for _, share in parts], dtype=prior.dtype)
+    total = prior + noise
+    log_density = -0.5 * (apparent.square() / total + total.log())
+    weights = torch.softmax(log_density + shares.log(), dim=0)
+    mean, variance = apparent * prior / total, prior * noise / total
+    return (weights * (mean.square() + variance)).sum(0).sqrt()
