@@ -118,10 +118,13 @@ def test_the_field_refines_what_the_surface_found() -> None:
     assert share > 0.9
 
 
-def test_a_field_that_does_not_show_the_surface_does_not_move_the_pose() -> None:
+def test_a_field_that_does_not_show_the_surface_hardly_moves_the_pose() -> None:
+    """Measured points hold the pose on the surface, and the disagreement of the rays rejects it."""
     problem = baked.problem(baked.unseen()[0])
     found = localize(problem, "auto", replace(QUICK, refine_steps=3), 0)
-    assert torch.equal(found.T_world_camera.matrix(), found_for(problem).T_world_camera.matrix())
+    moved = pose_error(found.T_world_camera, found_for(problem).T_world_camera)
+    assert float(moved.translation) < 0.05
+    assert float(moved.rotation_deg) < 2.0
     assert not found.converged
     assert found.outcome is Outcome.RENDERING_MISMATCH
     assert "of the rendered rays agree with what was measured" in found.reason
