@@ -60,11 +60,9 @@ class LandmarkAnswer:
     def full_covariance(self) -> Float[Tensor, "6 6"]:
         """The covariance with the errors of the intrinsics that the image does not rule out.
 
-        Landmarks and rendered colours are misled by them alike, whereas measured depth shows the distance.
+        Landmarks and rendered colours are misled by them alike, and the scale of measured depth is no better known.
         """
-        return (
-            self.covariance if "depth" in self.terms else self.covariance + self.found.unresolved_calibration
-        )
+        return self.covariance + self.found.unresolved_calibration
 
 
 def answer_by_landmarks(
