@@ -8,7 +8,7 @@ import torch
 
 from bidnerf_core import Localizer, Outcome, View
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.mirrored import mirror_evidence, mirrored
+from bidnerf_core.localization.search.mirrored import mirror_evidence, mirror_image
 from textured_field import textured_map, unseen
 
 
@@ -23,12 +23,12 @@ def photo() -> View:
 
 
 def in_a_mirror() -> View:
-    return replace(photo(), frame=mirrored(photo().frame))
+    return replace(photo(), frame=mirror_image(photo().frame))
 
 
 def test_mirroring_twice_gives_the_frame() -> None:
     frame = photo().frame
-    twice = mirrored(mirrored(frame))
+    twice = mirror_image(mirror_image(frame))
     assert torch.equal(twice.rgb, frame.rgb)
     assert twice.intrinsics == frame.intrinsics
 

@@ -95,7 +95,7 @@ def test_a_start_from_which_nothing_is_met_has_a_gradient_towards_the_box_only_b
 
 
 def test_a_blurred_field_is_the_field_convolved_with_a_gaussian() -> None:
-    """Of a plane wave, ``cos(k x)``, the convolution is ``exp(-k^2 sigma^2 / 2) cos(k x)``."""
+    """The convolution of a plane wave ``cos(k x)`` is ``exp(-k^2 sigma^2 / 2) cos(k x)``."""
 
     class Wave(Ball):
         def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:

@@ -16,7 +16,7 @@ from torch import Generator, Tensor
 import baked
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
-from bidnerf_core.mapping.surfel_index import CELLS, SurfelIndex, block_levels, index_bytes
+from bidnerf_core.mapping.surfel_index import CELLS_OF_BLOCK, SurfelIndex, block_levels, index_bytes
 from bidnerf_core.voxel_grid import VoxelGrid
 from voxels import cell_centres
 
@@ -139,7 +139,7 @@ def test_what_cannot_be_indexed_is_refused() -> None:
     with pytest.raises(InputError, match="no surface to bake"):
         SurfelIndex.of(torch.zeros((0, 3)), GRID)
     with pytest.raises(InputError, match="larger cells"):
-        SurfelIndex.of(plane(), VoxelGrid.covering(BOUNDS, 1e-3 / CELLS))
+        SurfelIndex.of(plane(), VoxelGrid.covering(BOUNDS, 1e-3 / CELLS_OF_BLOCK))
 
 
 def test_the_toy_is_found_as_well_as_before(generator: Generator) -> None:

@@ -24,7 +24,7 @@ RATES = 1.0, 60.0
 """Least and largest number of frames a second."""
 USUAL_RATE = 30.0
 """Frames a second of sequences without time stamps."""
-DEEPEST = 5.0
+WHITE_DEPTH = 5.0
 """Metres of depth that are drawn white, where only depth was recorded."""
 
 
@@ -105,7 +105,7 @@ def _observed(frame: Frame, reduced: Float[Tensor, "h w 3"]) -> Float[Tensor, "h
     """Return a frame's colours, or its depth in grey where no colours were recorded."""
     if frame.has_colour or frame.depth is None:
         return reduced
-    grey = (frame.depth.cpu() / DEEPEST).clamp(0, 1)
+    grey = (frame.depth.cpu() / WHITE_DEPTH).clamp(0, 1)
     rows, columns = (
         torch.linspace(0, old - 1, new).round().long()
         for old, new in zip(grey.shape, reduced.shape[:2], strict=True)

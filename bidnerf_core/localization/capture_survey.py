@@ -16,6 +16,7 @@ from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.mirrored import mirror_image
 from bidnerf_core.mapping.capture_coverage import coverage
 from bidnerf_core.mapping.capture_links import groups, linked
 from bidnerf_core.mapping.capture_photos import (
@@ -171,21 +172,14 @@ def _by_others(
     answers: dict[int, _Posed] = {}
     for number in suspects:
         for mirrored in (False, True):
-            view = _mirrored(views[number]) if mirrored else views[number]
+            view = views[number]
+            if mirrored:
+                view = replace(view, frame=mirror_image(view.frame))
             found = propose(matcher, [View(view.frame, SE3.identity())], features)
             if found is not None and landmark_verdict(found).accepted:
                 answers[number] = _compared(found, views[number], mirrored)
                 break
     return answers
-
-
-def _mirrored(view: View) -> View:
-    """Return the view with its image mirrored left to right."""
-    frame, camera = view.frame, view.frame.intrinsics
-    intrinsics = replace(camera, cx=camera.width - camera.cx)
-    return replace(
-        view, frame=replace(frame, rgb=frame.rgb.flip(1), intrinsics=intrinsics, depth=None, alpha=None)
-    )
 
 
 def _compared(found: LandmarkPose, view: View, mirrored: bool) -> _Posed:

@@ -31,7 +31,7 @@ from bidnerf_core.localization.tracking.measuring import (
     determined,
     followed,
     is_vague,
-    precise,
+    precise_enough,
 )
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
 from bidnerf_core.localization.tracking.odometry import Odometry
@@ -180,7 +180,7 @@ class Tracker:
             state = replace(state, motion=predicted, lost=state.lost + 1)
             return tracked_localization(predicted, verdict, predicted, found.loss), state
         motion = predicted.refined(found.pose)
-        verdict = precise(found.verdict, motion.covariance, self._reach(frame))
+        verdict = precise_enough(found.verdict, motion.covariance, self._reach(frame))
         state = replace(state, motion=motion, lost=0 if verdict.accepted else state.lost + 1)
         return tracked_localization(motion, verdict, predicted, found.loss), state
 

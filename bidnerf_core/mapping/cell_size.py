@@ -14,7 +14,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.mapping.posed_depth import PosedDepthImage, witnesses
-from bidnerf_core.mapping.surfel_index import MOST_CELLS, SIDE, block_levels, index_bytes
+from bidnerf_core.mapping.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes
 from bidnerf_core.mapping.surfels import surfel_bytes
 from bidnerf_core.voxel_grid import VoxelGrid
 
@@ -118,7 +118,7 @@ def chosen_grid(
 
 def surface_bytes(points: Float[Tensor, "p 3"], grid: VoxelGrid) -> float:
     """Return the memory that a surface of these points (metres, world) takes; infinite where it has too many cells."""
-    if math.prod(-(-count // SIDE) * SIDE for count in grid.shape) > MOST_CELLS:
+    if math.prod(-(-count // BLOCK_SIDE) * BLOCK_SIDE for count in grid.shape) > MOST_CELLS:
         return math.inf
     surfels = len(grid.numbers(points).unique())
     return surfel_bytes(surfels) + index_bytes(block_levels(points, grid))

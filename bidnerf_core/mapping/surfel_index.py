@@ -21,15 +21,15 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.voxel_grid import VoxelGrid
 
-SIDE = 8
+BLOCK_SIDE = 8
 """Cells along the side of a block."""
-CELLS = SIDE**3
+CELLS_OF_BLOCK = BLOCK_SIDE**3
 MOST_CELLS = 2**31 - 1
 """Largest number of cells of all blocks, since cells are numbered in 32 bits."""
 COARSER_FROM = (2.0, 3.5, 6.0)
 """Distances of a block's nearest octant from the nearest octant with surfels, centre to centre in octants of 4 cells, from
 which 2, 4 and 8 cells along each side share an entry. All surfels are then at least twice as far away as that side is long."""
-CHUNK = 1 << 20
+ENTRIES_AT_ONCE = 1 << 20
 """Number of entries that are looked for at once."""
 
 LEAF = 32
@@ -62,12 +62,16 @@ class SurfelIndex:
     def of_cells(grid: VoxelGrid, nearest: Int[Tensor, "x y z"]) -> SurfelIndex:
         """Return the index that gives each cell of ``grid`` its own entry: the surfel ``nearest`` names for it."""
         shape = block_shape(grid)
-        padded = torch.zeros([SIDE * count for count in shape], dtype=torch.int32)
+        padded = torch.zeros([BLOCK_SIDE * count for count in shape], dtype=torch.int32)
         padded[tuple(slice(count) for count in grid.shape)] = nearest
         x, y, z = shape
-        blocks = padded.view(x, SIDE, y, SIDE, z, SIDE).permute(0, 2, 4, 1, 3, 5).reshape(-1, CELLS)
+        blocks = (
+            padded.view(x, BLOCK_SIDE, y, BLOCK_SIDE, z, BLOCK_SIDE)
+            .permute(0, 2, 4, 1, 3, 5)
+            .reshape(-1, CELLS_OF_BLOCK)
+        )
         entries = torch.empty_like(blocks)
-        entries[:, _morton(torch.cartesian_prod(*3 * [torch.arange(SIDE)]))] = blocks
+        entries[:, _morton(torch.cartesian_prod(*3 * [torch.arange(BLOCK_SIDE)]))] = blocks
         level = torch.zeros(shape, dtype=torch.uint8)
         return SurfelIndex(grid, _firsts(level), level, entries.view(-1))
 
@@ -111,8 +115,8 @@ class SurfelIndex:
         for axis, count in enumerate(self.grid.shape):
             cell = (torch.arange(longest) - 1).clamp(0, count - 1)
             place = torch.zeros((longest, 3), dtype=torch.int64)
-            place[:, axis] = cell % SIDE
-            parts.append(cell // SIDE * strides[axis] * CELLS + _morton(place))
+            place[:, axis] = cell % BLOCK_SIDE
+            parts.append(cell // BLOCK_SIDE * strides[axis] * CELLS_OF_BLOCK + _morton(place))
         rate = torch.eye(3) / self.grid.cell
         offset = 1 - torch.tensor(self.grid.lower, dtype=torch.float64) / self.grid.cell
         base = longest * torch.arange(3, dtype=torch.int32)[:, None]
@@ -122,16 +126,16 @@ class SurfelIndex:
     def _blocks(self) -> tuple[Int[Tensor, "b"], Int[Tensor, "b"]]:
         """Each block's ``start`` and ``shift``: a cell's entry is ``start + (number >> shift)``."""
         shift = 3 * self.level.view(-1).long()
-        start = self.first.view(-1) - (torch.arange(shift.numel()) * CELLS >> shift)
+        start = self.first.view(-1) - (torch.arange(shift.numel()) * CELLS_OF_BLOCK >> shift)
         return start.int(), shift.int()
 
 
 def block_shape(grid: VoxelGrid) -> tuple[int, int, int]:
     """Return the number of blocks along x, y and z. Raises ``InputError`` where they have too many cells to be numbered."""
-    x, y, z = (-(-count // SIDE) for count in grid.shape)
-    if x * y * z * CELLS > MOST_CELLS:
+    x, y, z = (-(-count // BLOCK_SIDE) for count in grid.shape)
+    if x * y * z * CELLS_OF_BLOCK > MOST_CELLS:
         raise InputError(
-            f"a surface's grid of {x * y * z * CELLS} cells, expected {MOST_CELLS} at most; bake it with larger cells"
+            f"a surface's grid of {x * y * z * CELLS_OF_BLOCK} cells, expected {MOST_CELLS} at most; bake it with larger cells"
         )
     return x, y, z
 
@@ -139,7 +143,7 @@ def block_shape(grid: VoxelGrid) -> tuple[int, int, int]:
 def block_levels(positions: Float[Tensor, "n 3"], grid: VoxelGrid) -> UInt8[Tensor, "x y z"]:
     """Return the level of each block of ``grid``, see ``SurfelIndex``, for surfels at ``positions`` (metres, world)."""
     x, y, z = block_shape(grid)
-    octants = VoxelGrid(grid.lower, SIDE / 2 * grid.cell, (2 * x, 2 * y, 2 * z))
+    octants = VoxelGrid(grid.lower, BLOCK_SIDE / 2 * grid.cell, (2 * x, 2 * y, 2 * z))
     empty: Bool[Tensor, "x y z"] = torch.ones(octants.shape, dtype=torch.bool)
     empty.view(-1)[octants.numbers(positions)] = False
     away = torch.from_numpy(distance_transform_edt(empty.numpy()).astype(np.float32))
@@ -154,7 +158,7 @@ def index_bytes(level: UInt8[Tensor, "x y z"]) -> int:
 
 def _counts(level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "b"]:
     """Return the number of entries of each block."""
-    return CELLS >> 3 * level.view(-1).long()
+    return CELLS_OF_BLOCK >> 3 * level.view(-1).long()
 
 
 def _firsts(level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "x y z"]:
@@ -174,18 +178,18 @@ def _morton(place: Int[Tensor, "*c 3"]) -> Int[Tensor, "*c"]:
 
 def _nearest_to_middles(tree: cKDTree, grid: VoxelGrid, level: UInt8[Tensor, "x y z"]) -> Int[Tensor, "e"]:
     """Return the surfel nearest to the middle of the cells that share each entry."""
-    corners = torch.cartesian_prod(*3 * [torch.arange(SIDE)])
+    corners = torch.cartesian_prod(*3 * [torch.arange(BLOCK_SIDE)])
     corners = corners[_morton(corners).argsort()]
     levels, found = level.view(-1).long(), []
-    step = CHUNK // CELLS
+    step = ENTRIES_AT_ONCE // CELLS_OF_BLOCK
     for at in range(0, len(levels), step):
         number = torch.arange(at, min(at + step, len(levels)))
         block = torch.stack(torch.unravel_index(number, level.shape), dim=-1)
-        counts = CELLS >> 3 * levels[number]
+        counts = CELLS_OF_BLOCK >> 3 * levels[number]
         which = torch.arange(len(number)).repeat_interleave(counts)
         within = torch.arange(len(which)) - (counts.cumsum(0) - counts)[which]
         shift = levels[number][which]
-        cell = SIDE * block[which] + corners[within << 3 * shift]
+        cell = BLOCK_SIDE * block[which] + corners[within << 3 * shift]
         middle = cell + 0.5 * (1 << shift)[:, None]
         points = torch.tensor(grid.lower, dtype=torch.float64) + middle.double() * grid.cell
         _, nearest = tree.query(points.numpy(), workers=-1)

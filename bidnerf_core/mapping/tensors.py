@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.mapping.surface_map import SurfaceMap
-from bidnerf_core.mapping.surfel_index import CELLS, COARSER_FROM, SurfelIndex, block_shape
+from bidnerf_core.mapping.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
 from bidnerf_core.mapping.surfels import Surfels
 from bidnerf_core.se3 import SE3
 from bidnerf_core.voxel_grid import VoxelGrid
@@ -104,7 +104,7 @@ def _index(tensors: dict[str, Tensor]) -> SurfelIndex:
         raise ValueError(f"level and first are of other blocks than those of a grid of {shape} cells")
     if int(level.max()) > len(COARSER_FROM):
         raise ValueError(f"level is up to {int(level.max())}, expected {len(COARSER_FROM)} at most")
-    ends = first.long() + (CELLS >> 3 * level.long())
+    ends = first.long() + (CELLS_OF_BLOCK >> 3 * level.long())
     if int(first.min()) < 0 or int(ends.max()) > len(tensors["entries"]):
         raise ValueError("first names entries that do not exist")
     return SurfelIndex(grid, first, level, tensors["entries"])

@@ -43,7 +43,7 @@ def mirror_evidence(
     matcher: LandmarkMatcher, views: Sequence[View], features: Features = SIFT, seed: int = 0
 ) -> MirrorEvidence:
     """Match the mirror image of the last of ``views``, which no pose explains unless the view itself is mirrored."""
-    frame = mirrored(views[-1].frame)
+    frame = mirror_image(views[-1].frame)
     query = LandmarkQuery(query_images([View(frame, SE3.identity())], features), matcher.landmarks, FIXED)
     matches = unguided_matches(query.images, matcher, KEYPOINTS)
     found = sample_consensus(query.observed(matches), matches.view, query.threshold, seed)
@@ -51,7 +51,7 @@ def mirror_evidence(
     return MirrorEvidence(agreeing, log10_agreement(query, matches, agreeing))
 
 
-def mirrored(frame: Frame) -> Frame:
+def mirror_image(frame: Frame) -> Frame:
     """Return what the frame's camera would see in a mirror: left and right swapped, without depth."""
     swap = Orientation(mirrors_columns=True)
     alpha = None if frame.alpha is None else swap.upright(frame.alpha)

@@ -16,7 +16,9 @@ from bidnerf_core.mapping.resection import ReprojectionFit
 MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
 """Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
 USUAL, USUALLY = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01), 0.35
-"""The same of intrinsics as most devices state them: of another unit of the model, or before focus and temperature changed."""
+"""Standard deviations of intrinsics as many devices state them, and the share of cameras whose intrinsics are so: they belong to
+another unit of the model, or to another focus and temperature.
+"""
 
 
 @dataclass(frozen=True, eq=False)

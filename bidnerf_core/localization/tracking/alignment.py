@@ -86,6 +86,11 @@ def fused_with_surface(
             break
     to_pivot = torch.linalg.inv(at_camera)
     information = to_pivot.T @ hessian @ to_pivot
+    return fused_with_points(T, pose, information)
+
+
+def fused_with_points(T: SE3, pose: PoseEstimate, information: Float[Tensor, "6 6"]) -> PoseEstimate:
+    """Return the pose ``T`` with the covariances of ``pose`` after it was fused with points of this information."""
     fused = torch.linalg.inv(torch.linalg.inv(pose.covariance) + information)
     kept, by_points = torch.eye(6).double() - fused @ information, fused @ information @ fused
     return PoseEstimate(

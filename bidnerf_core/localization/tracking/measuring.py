@@ -52,7 +52,7 @@ SIGMAS = 3.0
 """The radius in standard deviations of the prediction."""
 ENOUGH_LANDMARKS = 40
 """The number of followed landmarks that agree from which on no new ones are sought."""
-CALIBRATED = 30
+INTRINSICS_CHECKED_EVERY = 30
 """The number of frames after which recognised landmarks check the given intrinsics again."""
 SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
@@ -126,7 +126,7 @@ class ByLandmarks:
             return None
         measured = self._fused(frame, state, points[found.inliers], *judged)
         motion = predicted.updated(measured.pose)
-        verdict = precise(measured.verdict, motion.covariance, judged[0].distance)
+        verdict = precise_enough(measured.verdict, motion.covariance, judged[0].distance)
         return replace(measured, verdict=verdict, motion=motion)
 
     def _judged(
@@ -150,7 +150,7 @@ class ByLandmarks:
         pose, verdict = judged
         if pose.position_deviation > LandmarkThresholds().precision * pose.distance:
             fused = predicted.updated(self._estimate(pose))  # the prediction may make up for it
-            few |= not precise(verdict, fused.covariance, pose.distance).accepted
+            few |= not precise_enough(verdict, fused.covariance, pose.distance).accepted
         return few or state.age >= self.config.refresh_frames or not verdict.accepted
 
     def _recognized(
@@ -170,7 +170,7 @@ class ByLandmarks:
             radius = max(least, search_radius(predicted, camera))
             if radius > most:
                 return None
-        due = state.calibrated is None or state.frames - state.calibrated >= CALIBRATED
+        due = state.calibrated is None or state.frames - state.calibrated >= INTRINSICS_CHECKED_EVERY
         seen = self.detector(
             frame, T, radius, state.usual_distance, state.noise, state.miscalibration if not due else None
         )
@@ -278,7 +278,7 @@ def by_colour(
     return Measurement(pose, answer.verdict, answer.refined.loss, state)
 
 
-def precise(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
+def precise_enough(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
     """Return the verdict, or that the position is too uncertain for the ``distance`` (metres) of what is in view."""
     deviation = float(torch.linalg.eigvalsh(covariance[:3, :3])[-1].clamp(min=0).sqrt())
     if not verdict.accepted or deviation <= LandmarkThresholds().precision * distance:

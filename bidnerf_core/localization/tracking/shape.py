@@ -19,7 +19,7 @@ from bidnerf_core.localization.costs.surface import PointCloud, PointScales, Sur
 from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.by_points import JUDGED
-from bidnerf_core.localization.tracking.alignment import ALIGNED_STEP, DEPTH_MEASUREMENTS, SURFACE_BIAS
+from bidnerf_core.localization.tracking.alignment import ALIGNED_STEP, DEPTH_MEASUREMENTS, fused_with_points
 from bidnerf_core.localization.tracking.motion import PoseEstimate
 from bidnerf_core.localization.tracking.single_pose import retracted
 from bidnerf_core.mapping import SurfaceMap
@@ -72,7 +72,9 @@ def fit_shape(surface: SurfaceMap, cloud: PointCloud, predicted: PoseEstimate, s
     )
     surprise = float(moved @ torch.linalg.solve(predicted.covariance, moved))
     diagnostics = surface_diagnostics(judge, T, math.inf)
-    return ShapeFit(_fused(T, predicted, information), diagnostics, surprise, round(float(kept.trace())))
+    return ShapeFit(
+        fused_with_points(T, predicted, information), diagnostics, surprise, round(float(kept.trace()))
+    )
 
 
 def _descended(
@@ -107,14 +109,3 @@ def _determined(hessian: Float[Tensor, "6 6"], cloud: PointCloud) -> Float[Tenso
     good = values >= WEAK * values[3:].mean()
     # Back to updates: x = unit * y, where the axes are orthonormal in y.
     return (unit[:, None] * axes[:, good]) @ (axes[:, good] / unit[:, None]).T
-
-
-def _fused(T: SE3, predicted: PoseEstimate, information: Float[Tensor, "6 6"]) -> PoseEstimate:
-    """Return a pose with the covariances of a prediction that was fused with points of this information."""
-    fused = torch.linalg.inv(torch.linalg.inv(predicted.covariance) + information)
-    kept, by_points = torch.eye(6).double() - fused @ information, fused @ information @ fused
-    return PoseEstimate(
-        T.normalized(),
-        kept @ predicted.noise @ kept.T + (1 - SURFACE_BIAS) * by_points,
-        kept @ predicted.bias @ kept.T + SURFACE_BIAS * by_points,
-    )
