@@ -967,9 +967,16 @@ def test_ctrl_c_before_anything_is_made_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_diverging_training_is_told_and_leaves_nothing(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
-    wild = [*tiny.options(), "--learning-rate", "1e30"]
-    outcome = bidnerf("train", shared / "data", "--out", tmp_path / "map", *wild)
+def test_a_diverging_training_is_told_and_leaves_nothing(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def overflow(optimizer: torch.optim.Optimizer) -> None:
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.data.fill_(torch.nan)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", overflow)
+    outcome = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options())
     assert_refused(outcome, 1, "training diverged", "smaller learning rate")
     assert list(tmp_path.iterdir()) == []
 
