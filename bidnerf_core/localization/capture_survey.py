@@ -20,11 +20,13 @@ from bidnerf_core.localization.search.mirrored import mirror_image
 from bidnerf_core.mapping.capture_coverage import coverage
 from bidnerf_core.mapping.capture_links import groups, linked
 from bidnerf_core.mapping.capture_photos import (
+    LEAST_BLUR,
     PhotoMeasures,
     above_neighbours,
     exposures,
     nearby,
     photo_measures,
+    standing_out,
 )
 from bidnerf_core.mapping.capture_report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.mapping.features import SIFT, Features
@@ -36,10 +38,6 @@ from bidnerf_core.mapping.triangulation import noise
 from bidnerf_core.se3 import SE3
 
 DEFAULTS, NOT_TRIED = LandmarkConfig(), HeldOutTrial()
-OUTLYING_UPDATE = 4.0
-"""Deviations (robust) from the other photos of the capture from which on a photo stands out."""
-LEAST_BLUR = 0.5
-"""Octaves of the energy of fine detail that a photo must at least lack to be blurred."""
 LEAST_EXPOSURE = 1.0
 """Stops by which a photo must at least differ to be badly exposed; training corrects less."""
 CLIPPED = 0.25
@@ -221,11 +219,11 @@ def _problems(
     posed: Mapping[int, _Posed | None],
 ) -> list[tuple[PhotoProblem, ...]]:
     """Return the problems of each photo, the gravest first."""
-    blurred = _standing_out(-above_neighbours(measures.sharpness, near), LEAST_BLUR)
+    blurred = standing_out(-above_neighbours(measures.sharpness, near), LEAST_BLUR)
     clipped = torch.maximum(
         above_neighbours(measures.overexposed, near), above_neighbours(measures.underexposed, near)
     )
-    badly_exposed = _standing_out(exposure.abs(), LEAST_EXPOSURE) | (clipped > CLIPPED)
+    badly_exposed = standing_out(exposure.abs(), LEAST_EXPOSURE) | (clipped > CLIPPED)
     names: list[tuple[PhotoProblem, ...]] = []
     grouped = bool((group >= 0).any())  # where no photo is linked to others, no photo stands out for it
     for i in range(len(exposure)):
@@ -241,11 +239,6 @@ def _problems(
 
 def _place(group: int) -> PhotoProblem | None:
     return "isolated" if group < 0 else "apart" if group > 0 else None
-
-
-def _standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
-    """Return which values exceed both ``least`` and ``OUTLYING_UPDATE`` robust standard deviations of all about zero."""
-    return values > max(least, OUTLYING_UPDATE * 1.4826 * float(values.abs().median()))
 
 
 def _three(vector: Float[Tensor, "3"]) -> tuple[float, float, float]:

@@ -35,6 +35,10 @@ EXPOSURE_ROUNDS = 20
 """Rounds of alternation between the brightness of landmarks and the exposure of photos."""
 NEIGHBOURS = 8
 """Number of photos from nearby places with which a photo is compared."""
+LEAST_BLUR = 0.5
+"""Octaves of the energy of fine detail that a photo must at least lack to be blurred."""
+OUTLYING = 4.0
+"""Deviations (robust) from the other photos of the capture from which on a photo stands out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,21 @@ def photo_measures(views: Sequence[View]) -> PhotoMeasures:
     """Measure each photo by itself."""
     rows = torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 4)
     return PhotoMeasures(*rows.unbind(-1))
+
+
+def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
+    """Return the share of the energy of fine detail that each photo has of what photos from nearby have.
+
+    It is 1 for all photos but those that stand out as blurred.
+    """
+    sharpness = torch.tensor([_sharpness(_clean(view.frame.rgb).mean(-1)) for view in views])
+    lacking = -above_neighbours(sharpness, nearby(views))
+    return torch.where(standing_out(lacking, LEAST_BLUR), torch.exp2(-lacking), 1.0)
+
+
+def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
+    """Return which values exceed both ``least`` and ``OUTLYING`` robust standard deviations of all about zero."""
+    return values > max(least, OUTLYING * 1.4826 * float(values.abs().median()))
 
 
 def _measured(frame: Frame) -> tuple[float, float, float, float]:

@@ -13,14 +13,22 @@ from bidnerf_core.training.ray_bank import TrainingBatch
 
 
 def supervised_loss(
-    rendering: Rendering, batch: TrainingBatch, side: float, depth_weight: float
+    rendering: Rendering,
+    batch: TrainingBatch,
+    side: float,
+    depth_weight: float,
+    colour_weight: Float[Tensor, "r"] | None = None,
 ) -> tuple[Float[Tensor, ""], float]:
-    """Return the squared error of colour plus ``depth_weight`` times the depth term, and the colour term alone for display.
+    """Return the squared error of colour plus ``depth_weight`` times the depth term, and the mean squared error of colour
+    for display.
 
-    The depth term (``ray_termination``) is a fraction of ``side``, the scene's longest side (metres).
+    The depth term (``ray_termination``) is a fraction of ``side``, the scene's longest side (metres). ``colour_weight`` is
+    the weight of each ray's colour, 1 by default.
     """
     error = (rendering.rgb - batch.observed.rgb) ** 2
     mse = float(error.detach().mean())
+    if colour_weight is not None:
+        error = error * colour_weight[:, None]
     return error.mean() + depth_weight * ray_termination(rendering, batch) / side, mse
 
 

@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
+from bidnerf_core.mapping.capture_photos import detail_kept
 from bidnerf_core.rendering import Rendering
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.colour_transform import ColourTransforms
@@ -29,6 +30,8 @@ class SupervisionConfig(Settings):
     depth_weight: NotNegative = 0.1
     distortion_weight: NotNegative = 0.0  # weight of the term that gathers a ray's weight in one place
     exposure: bool = True  # learn a colour transform of each image, unless images have alpha
+    # weigh the colours of a blurred image by the share of fine detail that it has of what images from nearby have
+    sharpness: bool = True
 
 
 class Supervision:
@@ -40,6 +43,9 @@ class Supervision:
         self.side = bounds.side
         learned = config.exposure and not self.bank.has_alpha
         self.colours = ColourTransforms(len(views)) if learned else None
+        kept = detail_kept(views) if config.sharpness else None
+        # None where no image is blurred, so that nothing changes
+        self.image_weight = None if kept is None or bool((kept == 1).all()) else kept.float()
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         return self.bank.draw(count, generator)
@@ -54,7 +60,8 @@ class Supervision:
         """Return the loss of a rendering of the batch's rays, and its colour term alone for display."""
         if self.colours is not None:
             rendering = replace(rendering, rgb=self.colours(rendering.rgb, batch.image))
-        loss, mse = supervised_loss(rendering, batch, self.side, self.config.depth_weight)
+        weight = None if self.image_weight is None else self.image_weight[batch.image]
+        loss, mse = supervised_loss(rendering, batch, self.side, self.config.depth_weight, weight)
         if self.colours is not None:
             loss = loss + COLOUR_PENALTY * self.colours.penalty()
         if self.config.distortion_weight:
