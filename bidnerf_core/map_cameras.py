@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import median
+
+import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import View
+from bidnerf_core.se3 import SE3
+
+Rows = tuple[tuple[float, float, float, float], ...]
+"""The rows of a 4x4 matrix."""
 
 
 @dataclass(frozen=True)
@@ -15,14 +23,104 @@ class StoredCamera:
 
     name: str
     intrinsics: Intrinsics
-    T_world_camera: tuple[tuple[float, float, float, float], ...]  # 4x4, rows
+    T_world_camera: Rows
+    given_T_world_camera: Rows | None = None  # the dataset's, where training refined it
+    moved_pixels: float | None = None  # how far the points that the image shows move in it from there, median
+
+    @property
+    def moved(self) -> MovedCamera | None:
+        """How far refinement moved the camera; None where it kept the given pose."""
+        if self.given_T_world_camera is None:
+            return None
+        update = (_pose(self.given_T_world_camera).inverse() @ _pose(self.T_world_camera)).log()
+        metres, radians = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
+        return MovedCamera(self.name, metres, math.degrees(radians), self.moved_pixels or 0.0)
+
+
+@dataclass(frozen=True)
+class MovedCamera:
+    """How far the refined pose of an image is from the given one."""
+
+    name: str
+    translation: float  # metres
+    rotation_deg: float
+    pixels: float  # that points in the image move, median
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """How well the given poses of a map's images fit the keypoints that the images share, and how well refined ones do."""
+
+    noise_before: float  # pixels: standard deviation of the keypoints about their points
+    noise_after: float
+    refined: bool  # whether training took the refined poses
+    replaced: tuple[str, ...] = ()  # images whose given pose was wrong; landmarks of the others placed them
+
+    @property
+    def inconsistency(self) -> float:
+        """The deviation of keypoints (pixels) that errors of the given poses add to the keypoints' own noise."""
+        return max(0.0, self.noise_before**2 - self.noise_after**2) ** 0.5
 
 
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
     """Return the cameras of training views in the form that ``map.json`` holds."""
+    return tuple(StoredCamera(v.frame.name, v.frame.intrinsics, _rows(v.T_ref_camera)) for v in views)
+
+
+def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
+    """Return the cameras with the poses that the dataset gives them."""
     return tuple(
-        StoredCamera(
-            v.frame.name, v.frame.intrinsics, tuple(tuple(r) for r in v.T_ref_camera.matrix().tolist())
-        )
-        for v in views
+        StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras
     )
+
+
+def moved_from(
+    given: Sequence[View], refined: Sequence[StoredCamera], pixels: Sequence[float]
+) -> tuple[StoredCamera, ...]:
+    """Return refined cameras with the poses of the ``given`` views, for those whose pose changed."""
+    return tuple(
+        camera
+        if camera.T_world_camera == (rows := _rows(view.T_ref_camera))
+        else replace(camera, given_T_world_camera=rows, moved_pixels=moved)
+        for view, camera, moved in zip(given, refined, pixels, strict=True)
+    )
+
+
+def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> list[str]:
+    """Return in a line or two what was found of the given poses, and how far they were moved."""
+    moved = [camera.moved for camera in cameras if camera.moved is not None]
+    wrong = [m for m in moved if m.name in found.replaced]
+    error = f"errors of the given poses add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
+    lines = [f"{error}; the poses are kept" if not found.refined else f"{error}; {_typical_motion(moved)}"]
+    if wrong:
+        listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in wrong)
+        lines.append(f"moved to where the landmarks of the other images place them: {listed}")
+    return lines
+
+
+def _typical_motion(moved: Sequence[MovedCamera]) -> str:
+    typical = [
+        median(part) for part in zip(*((m.translation, m.rotation_deg, m.pixels) for m in moved), strict=True)
+    ]
+    most = max(moved, key=lambda m: m.pixels)
+    return (
+        f"the poses are refined by {typical[0]:.3g} and {typical[1]:.2g}° or {typical[2]:.1f} px (median), {most.name} most,"
+        f" by {most.translation:.3g} and {most.rotation_deg:.2g}° or {most.pixels:.1f} px"
+    )
+
+
+def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
+    """Return the views with refined poses, those that are among ``cameras`` with the pose that the view has."""
+    known = {
+        (c.name, c.given_T_world_camera): _pose(c.T_world_camera) for c in cameras if c.given_T_world_camera
+    }
+    poses = [known.get((view.frame.name, _rows(view.T_ref_camera)), view.T_ref_camera) for view in views]
+    return [replace(view, T_ref_camera=T) for view, T in zip(views, poses, strict=True)]
+
+
+def _rows(T: SE3) -> Rows:
+    return tuple(tuple(row) for row in T.matrix().tolist())
+
+
+def _pose(rows: Rows) -> SE3:
+    return SE3.from_matrix(torch.tensor(rows, dtype=torch.float64))

@@ -24,7 +24,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.files import read_file, write_file
-from bidnerf_core.map_cameras import StoredCamera
+from bidnerf_core.map_cameras import PoseRefinement, StoredCamera
 from bidnerf_core.map_parts import load_landmarks, load_surface
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
 from bidnerf_core.mapping.capture_report import CaptureReport
@@ -61,6 +61,7 @@ class MapInfo:
     data: str = ""  # name of the dataset's folder
     seconds: float = 0.0  # of training
     cameras: tuple[StoredCamera, ...] = ()
+    pose_refinement: PoseRefinement | None = None  # of the cameras; None where their given poses were kept
     sparse_depth: int = 0  # pixels of the training images that had their depth from structure from motion
     weights: str = ""  # file names
     training: str | None = None  # what resuming needs; dropped when training is complete
@@ -227,11 +228,11 @@ def load_info(folder: Path) -> MapInfo:
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
     for camera in info.cameras:
-        rows = camera.T_world_camera
-        if len(rows) != 4 or not bool(SE3.from_matrix(torch.tensor(rows).double()).is_rigid()):
-            raise InputError(
-                f"{path}: pose of camera {camera.name!r} is not a rigid transform, expected 4x4 rows"
-            )
+        for rows in (camera.T_world_camera, camera.given_T_world_camera or camera.T_world_camera):
+            if len(rows) != 4 or not bool(SE3.from_matrix(torch.tensor(rows).double()).is_rigid()):
+                raise InputError(
+                    f"{path}: pose of camera {camera.name!r} is not a rigid transform, expected 4x4 rows"
+                )
     return info
 
 

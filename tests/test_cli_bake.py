@@ -16,7 +16,7 @@ import torch
 import tiny
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli import bake as module
-from bidnerf_core.cli import main, train
+from bidnerf_core.cli import main, train, training_views
 from bidnerf_core.cli.common import read_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames import View
@@ -267,7 +267,7 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(
         seen.append(sum(len(v.landmarks.distance) for v in views if v.landmarks is not None))
         hashgrid.train(field, views, *rest)
 
-    for part in (module, train):
+    for part in (module, training_views):
         monkeypatch.setattr(part, "tracked_views", tracked)
     monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
@@ -283,7 +283,7 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(
 
 def test_images_with_silhouettes_are_trained_on_without_landmarks() -> None:
     bare = [replace(v, frame=replace(v.frame, depth=None)) for v in tiny.views(3)]
-    tracked, views = train.located(bare)
+    tracked, views = training_views.located(bare)
     assert tracked is None
     assert all(view.landmarks is None for view in views)
 

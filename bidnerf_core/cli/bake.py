@@ -14,6 +14,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.capture_survey import surveyed
 from bidnerf_core.localization.landmark_trial import tried_landmarks
+from bidnerf_core.map_cameras import at_stored_poses
 from bidnerf_core.map_parts import load_landmarks
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.capture_advice import summary
@@ -63,9 +64,10 @@ def _bake(
     """
     if rendered_landmarks and data is not None:
         raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
-    background = load_info(map).bounds.background
+    info = load_info(map)
     with locked(map):
-        views = [] if data is None else read_views(open_dataset(data, background), split)
+        views = [] if data is None else read_views(open_dataset(data, info.bounds.background), split)
+        views = at_stored_poses(views, info.cameras)
         bake_map(map, views, config, rendered_landmarks)
 
 

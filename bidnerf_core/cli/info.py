@@ -9,6 +9,7 @@ from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json, 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.capture_figure import draw_capture
 from bidnerf_core.field import levels
+from bidnerf_core.map_cameras import pose_sentences
 from bidnerf_core.map_parts import load_capture
 from bidnerf_core.mapping.capture_advice import sentences
 from bidnerf_core.mapping.capture_report import CaptureReport
@@ -35,11 +36,17 @@ def info(
         _draw(map, stored, capture, draw)
     facts = describe(map, stored)
     if json:
-        print_json(facts | {"capture": None if capture is None else to_plain(capture)})
+        poses = [to_plain(camera.moved) for camera in stored.info.cameras if camera.moved is not None]
+        print_json(facts | {"moved": poses, "capture": None if capture is None else to_plain(capture)})
         return
     for key, value in facts.items():
         show(f"{key + ':':<12} {_shown(value)}")
-    for line in [] if capture is None else sentences(capture):
+    remarks = (
+        []
+        if stored.info.pose_refinement is None
+        else pose_sentences(stored.info.cameras, stored.info.pose_refinement)
+    )
+    for line in remarks if capture is None else [*remarks, *sentences(capture)]:
         show(f"- {line}")
 
 
@@ -65,6 +72,7 @@ def describe(folder: Path, stored: Map) -> dict[str, Any]:
         "backend": info.backend,
         "data": info.data,
         "cameras": len(info.cameras),
+        "poses": None if info.pose_refinement is None else to_plain(info.pose_refinement),
         "step": info.step,
         "complete": info.complete,
         "seconds": round(info.seconds, 1),

@@ -122,7 +122,8 @@ class StoredTraining(StoppableBar):
 def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable[[int, int], None]]:
     """Show how many of ``unit`` are done, their rate and the time left: a bar on a terminal, else a line now and then.
 
-    Yields a function of the number done and of the total. Nothing is shown for a total of 1.
+    Yields a function of the number done and of the total. Nothing is shown for a total of 1. A call with 0 done begins
+    anew.
     """
     columns = (
         TextColumn(what), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit),
@@ -136,8 +137,9 @@ def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable
         task = bar.add_task("", total=total, rate="")
 
         def report(done: int, of: int) -> None:
-            nonlocal spoke
+            nonlocal began, spoke
             now = time.monotonic()
+            began, spoke = (began, spoke) if done else (now, now)
             each = (now - began) / max(1, done)
             rate = f"{each:.1f} s each" if each >= 1 else f"{1 / max(each, 1e-9):.1f} a second"
             bar.update(task, completed=done, total=of, rate=rate)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf_core.backend import Backend
-from bidnerf_core.carving import estimate_bounds, has_outline
+from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.cli.bake import bake_map
 from bidnerf_core.cli.common import (
     DEFAULT_BACKEND,
@@ -25,15 +24,16 @@ from bidnerf_core.cli.common import (
     value_of,
     wrong_usage,
 )
-from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining, counted
+from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
+from bidnerf_core.cli.training_views import Refinement, located, prepared
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.images import background_colour
-from bidnerf_core.map_cameras import stored_cameras
+from bidnerf_core.map_cameras import as_given, at_stored_poses, stored_cameras
 from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
+from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import MapInfo, build_field, load_info, load_state
@@ -98,6 +98,13 @@ def run(arguments: list[str]) -> None:
             Path | None,
             option("MODEL", "COLMAP sparse model whose points give depth to images that have none", ""),
         ] = None,
+        refine_poses: Annotated[
+            Refinement,
+            option(
+                "WHEN",
+                "refine the given poses by the keypoints that images share: always, never, or auto: if inconsistent",
+            ),
+        ] = "auto",
         no_bake: Annotated[
             Flag, option(None, "leave the surface and the landmarks to 'bidnerf bake'", "")
         ] = False,
@@ -125,7 +132,7 @@ def run(arguments: list[str]) -> None:
                     _resume(info, source, out, checkpoint_every, not no_bake)
             else:
                 with output_folder(out, overwrite):
-                    _start(chosen, name, source, out, config, checkpoint_every, not no_bake)
+                    _start(chosen, name, source, out, config, checkpoint_every, not no_bake, refine_poses)
         except TrainingStopped as stopped:
             say(f"{out}: saved after step {stopped.step}; the same with --resume goes on from there")
             raise KeyboardInterrupt from stopped
@@ -137,32 +144,16 @@ def run(arguments: list[str]) -> None:
 def train_map(
     backend: Backend, name: str, views: Sequence[View], config: Any, out: Path, data: str,
     background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS, baked: bool = True,
-    sparse_depth: int = 0,
+    sparse_depth: int = 0, refinement: Refinement = "auto",
 ) -> None:  # fmt: skip
     """Train a new map into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
-    tracked, views = located(views)
-    bounds = estimate_bounds(views, background)
-    settings = to_plain(config, "config")
+    taken = prepared(views, refinement)
+    bounds = estimate_bounds(taken.views, background)
     info = MapInfo(
-        name, settings, bounds, 0, False, data, cameras=stored_cameras(views), sparse_depth=sparse_depth
-    )
-    _run(backend, info, out, views, tracked, checkpoint_seconds, baked)
-
-
-def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:
-    """Track the keypoints of the views, unless all have dense depth or a silhouette: training takes distances from landmarks.
-
-    Return the tracks, of which ``bake_map`` makes the map's landmarks, and the views with the landmarks that each shows.
-    """
-    if all(view.frame.has_dense_depth or has_outline(view) for view in views):
-        return None, list(views)
-    began = time.monotonic()
-    with counted("landmarks", "steps") as report:
-        tracked = tracked_views(views, progress=report)
-    seen = tracked.seen(LandmarkConfig())
-    count = sum(len(part.distance) for part in seen)
-    say(f"{count} sightings of landmarks in {len(views)} views, {time.monotonic() - began:.1f} s")
-    return tracked, [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]
+        name, to_plain(config, "config"), bounds, 0, False, data, cameras=taken.cameras,
+        pose_refinement=taken.refinement, sparse_depth=sparse_depth,
+    )  # fmt: skip
+    _run(backend, info, out, taken.views, taken.tracked, checkpoint_seconds, baked)
 
 
 def load_interrupted(out: Path, baking: bool) -> MapInfo:
@@ -204,7 +195,8 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
 
 
 def _start(
-    backend: Backend, name: str, source: Source, out: Path, config: Any, checkpoint_seconds: float, baked: bool
+    backend: Backend, name: str, source: Source, out: Path, config: Any, checkpoint_seconds: float, baked: bool,
+    refinement: Refinement,
 ) -> None:  # fmt: skip
     dataset = open_dataset(source.data, source.background)
     views, sparse_depth = source.views(dataset)
@@ -212,7 +204,7 @@ def _start(
         say(f"{source.data}: no measured depth in split {source.split!r}; training on colour only")
     train_map(
         backend, name, views, config, out, source.data.resolve().name, dataset.background, checkpoint_seconds,
-        baked, sparse_depth,
+        baked, sparse_depth, refinement,
     )  # fmt: skip
 
 
@@ -224,7 +216,7 @@ def _resume(
     if dataset.background != info.bounds.background:
         raise UsageError(f"{out}: was begun over background {info.bounds.background}, got {background!r}")
     views, sparse_depth = source.views(dataset)
-    if stored_cameras(views) != info.cameras:
+    if stored_cameras(views) != as_given(info.cameras):
         raise InputError(
             f"{data}: split {split!r} has other frames or poses than {out} was begun with, expected those of"
             f" {info.data!r} unchanged"
@@ -234,6 +226,7 @@ def _resume(
             f"{out}: was begun with the depth of {info.sparse_depth} pixels from points, got {sparse_depth}; "
             "--resume keeps --depth-points and what goes with it"
         )
+    views = at_stored_poses(views, info.cameras)
     if info.complete:  # stopped between training and baking
         say(f"{out}: training is complete ({info.step} steps); baking its surface")
         bake_map(out, views, BakeConfig())

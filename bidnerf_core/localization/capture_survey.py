@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
-from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.mirrored import mirror_image
+from bidnerf_core.localization.relocated_photos import Relocation, image_motion, relocated, suspects
 from bidnerf_core.mapping.capture_coverage import coverage
 from bidnerf_core.mapping.capture_links import groups, linked
 from bidnerf_core.mapping.capture_photos import (
@@ -35,55 +28,12 @@ from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.landmarks import HeldOutTrial
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, pose_updates, robust_covariance
 from bidnerf_core.mapping.triangulation import noise
-from bidnerf_core.se3 import SE3
 
 DEFAULTS, NOT_TRIED = LandmarkConfig(), HeldOutTrial()
 LEAST_EXPOSURE = 1.0
 """Stops by which a photo must at least differ to be badly exposed; training corrects less."""
 CLIPPED = 0.25
 """Share of the pixels that may be clipped in a photo beyond those in its neighbours."""
-SUSPECT = 0.5
-"""A photo is a suspect if the share of its keypoints that are landmarks is below so much of the capture's median."""
-MOST_SUSPECTS = 32
-"""Largest number of photos that are localized anew."""
-POSE_DEVIATIONS, POSE_PIXELS = 6.0, 4.0
-"""A pose is bad if the landmarks' pose is so many standard deviations away and the image moves by so many pixels between
-them, which is twice as far as a match may lie from its epipolar line.
-"""
-TURNED_ANGLE = 60.0
-"""Degrees of rotation about the optical axis from which on a photo is turned rather than badly posed."""
-ALONG_AXIS = 0.9
-"""Least cosine between that rotation's axis and the optical axis."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Posed:
-    """The pose of a photo by the landmarks of others, compared with the given one."""
-
-    update: Float[Tensor, "6"]  # right update from the given pose, translation (metres) first
-    deviations: float
-    pixels: float  # how far the image moves by the update
-    mirrored: bool = False
-
-    @property
-    def problem(self) -> PhotoProblem | None:
-        angle = float(torch.linalg.vector_norm(self.update[3:]))
-        if self.mirrored:
-            return "mirrored"
-        if self.deviations < POSE_DEVIATIONS or self.pixels < POSE_PIXELS:
-            return None
-        about_axis = abs(float(self.update[5])) >= ALONG_AXIS * angle
-        return "turned" if about_axis and math.degrees(angle) >= TURNED_ANGLE else "badly posed"
-
-    def onto(self, record: PhotoRecord) -> PhotoRecord:
-        """Return the record with how far the given pose is off; a mirrored photo has no pose to compare."""
-        if self.mirrored:
-            return record
-        translation, rotation = (float(torch.linalg.vector_norm(part)) for part in self.update.split(3))
-        return replace(
-            record, pose_translation=translation, pose_rotation_deg=math.degrees(rotation),
-            pose_deviations=self.deviations,
-        )  # fmt: skip
 
 
 def surveyed(
@@ -103,9 +53,9 @@ def surveyed(
     group = groups(links)
     near = _comparable(nearby(views), group)
     count = torch.bincount(seen.image, minlength=len(views))
-    suspects = _suspects(seen, count, group)
-    posed: dict[int, _Posed | None] = dict(_by_own_landmarks(seen, positions, views))
-    posed |= dict.fromkeys(suspects) | _by_others(tracked, views, suspects, features, config)
+    doubtful = suspects(seen, count, group)
+    posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
+    posed |= dict.fromkeys(doubtful) | relocated(tracked, views, doubtful, features, config)
     exposure = exposures(views, seen, measures.brightness, near)
     problems = _problems(measures, exposure, near, group, posed)
     sharpness = above_neighbours(measures.sharpness, near)
@@ -141,61 +91,9 @@ def _sound(views: Sequence[View], problems: Sequence[tuple[PhotoProblem, ...]]) 
     return [v for v, p in zip(views, problems, strict=True) if not wrong & set(p)] or views
 
 
-def _suspects(seen: TrackedKeypoints, count: Int[Tensor, "v"], group: Int[Tensor, "v"]) -> list[int]:
-    """Return the photos outside the largest group, or whose keypoints are much seldomer landmarks than those of others."""
-    keypoints = torch.tensor([len(image.keypoints) for image in seen.images])
-    share = count / keypoints.clamp(min=1)
-    main = group == 0
-    if not bool(main.any()):
-        return []
-    found = (~main | (share < SUSPECT * share[main].median())).nonzero()[:, 0].tolist()
-    step = max(1.0, len(found) / MOST_SUSPECTS)
-    return [found[int(i * step)] for i in range(min(len(found), MOST_SUSPECTS))]
-
-
-def _by_others(
-    tracked: TrackedViews,
-    views: Sequence[View],
-    suspects: Sequence[int],
-    features: Features,
-    config: LandmarkConfig,
-) -> dict[int, _Posed]:
-    """Localize the suspects by landmarks that are built without them, as they are and then mirrored."""
-    if not suspects:
-        return {}
-    try:
-        matcher = LandmarkMatcher(tracked.without(suspects).landmarks(config))
-    except InputError:  # what is left shows nothing in common
-        return {}
-    answers: dict[int, _Posed] = {}
-    for number in suspects:
-        for mirrored in (False, True):
-            view = views[number]
-            if mirrored:
-                view = replace(view, frame=mirror_image(view.frame))
-            found = propose(matcher, [View(view.frame, SE3.identity())], features)
-            if found is not None and landmark_verdict(found).accepted:
-                answers[number] = _compared(found, views[number], mirrored)
-                break
-    return answers
-
-
-def _compared(found: LandmarkPose, view: View, mirrored: bool) -> _Posed:
-    T = view.T_ref_camera.to("cpu", torch.float64)
-    update = (T.inverse() @ found.T_world_camera).log()
-    deviations = float((update @ torch.linalg.solve(found.full_covariance, update)).clamp(min=0).sqrt())
-    return _Posed(update, deviations, _pixels(update, view, found.distance), mirrored)
-
-
-def _pixels(update: Float[Tensor, "6"], view: View, distance: float) -> float:
-    """Return how far the image of a point at ``distance`` (metres) moves by an update of the pose, at most."""
-    translation, rotation = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
-    return view.frame.intrinsics.fx * (rotation + translation / max(distance, 1e-9))
-
-
 def _by_own_landmarks(
     seen: TrackedKeypoints, positions: Float[Tensor, "n 3"], views: Sequence[View]
-) -> dict[int, _Posed]:
+) -> dict[int, Relocation]:
     """Compare the poses that fit the photos' own landmarks with the given ones, by their scatter in this capture."""
     sightings = seen.sightings
     updates = pose_updates(seen, positions, noise(sightings, positions))
@@ -207,7 +105,7 @@ def _by_own_landmarks(
     for number, update in updates.items():
         deviations = float((update @ torch.linalg.solve(scatter, update)).clamp(min=0).sqrt())
         distance = float(depth[image == number].median())
-        found[number] = _Posed(update, deviations, _pixels(update, views[number], distance))
+        found[number] = Relocation(update, deviations, image_motion(update, views[number], distance))
     return found
 
 
@@ -216,7 +114,7 @@ def _problems(
     exposure: Float[Tensor, "v"],
     near: Bool[Tensor, "v v"],
     group: Int[Tensor, "v"],
-    posed: Mapping[int, _Posed | None],
+    posed: Mapping[int, Relocation | None],
 ) -> list[tuple[PhotoProblem, ...]]:
     """Return the problems of each photo, the gravest first."""
     blurred = standing_out(-above_neighbours(measures.sharpness, near), LEAST_BLUR)

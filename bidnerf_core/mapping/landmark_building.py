@@ -29,7 +29,8 @@ from bidnerf_core.mapping.triangulation import (
     parallax,
     refined,
 )
-from bidnerf_core.mapping.view_pairs import likely_pairs
+from bidnerf_core.mapping.view_pairs import likely_pairs_of_poses
+from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import Above, Range, Settings
 
 _Item = TypeVar("_Item")
@@ -96,6 +97,30 @@ class TrackedViews:
         kept, positions, _ = _triangulated(self.observations, radians(config.parallax))
         return kept, positions
 
+    @property
+    def T_world_camera(self) -> SE3:
+        """The poses of the images (v)."""
+        return SE3.stack([image.T_world_camera for image in self.observations.images])
+
+    def at(self, T_world_camera: SE3) -> TrackedViews:
+        """Return the same tracks in images with other poses (v)."""
+        images = [
+            replace(p, T_world_camera=T_world_camera[i]) for i, p in enumerate(self.observations.images)
+        ]
+        return replace(self, observations=replace(self.observations, images=images))
+
+    def matched_anew(
+        self, config: LandmarkConfig, progress: Callable[[int, int], None] = lambda done, total: None
+    ) -> TrackedViews:
+        """Return the tracks that the same keypoints give when they are matched by the present poses.
+
+        ``progress`` is called with the number of image pairs done, first with 0, and their total.
+        """
+        images = self.observations.images
+        pairs = _pairs([image.T_world_camera for image in images], config)
+        progress(0, len(pairs))
+        return replace(self, observations=_joined(images, pairs, _Counter(progress, len(pairs))))
+
     def without(self, images: Sequence[int]) -> TrackedViews:
         """Return the tracks without the keypoints of some images."""
         left = ~torch.isin(self.observations.image, torch.tensor(images))
@@ -111,15 +136,27 @@ def tracked_views(
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks."""
     if not views:
         raise InputError("nothing to build landmarks from: expected at least one view")
-    pairs = likely_pairs(views, config.neighbours).tolist() if len(views) > 1 else []
+    pairs = _pairs([view.T_ref_camera for view in views], config)
     counter = _Counter(progress, len(views) + len(pairs))
     images = counter.over(_mapped(lambda view: _detected(view, features), views))
-    matches = counter.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
-    label = joined_tracks(
-        [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)], [len(p.keypoints) for p in images]
-    )
     depth = [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
-    return TrackedViews(TrackedKeypoints(images, label, torch.arange(len(label))), torch.cat(depth))
+    return TrackedViews(_joined(images, pairs, counter), torch.cat(depth))
+
+
+def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:
+    """Return the pairs of images that are matched."""
+    pairs: list[list[int]] = (
+        likely_pairs_of_poses(poses, config.neighbours).tolist() if len(poses) > 1 else []
+    )
+    return pairs
+
+
+def _joined(images: Sequence[PosedKeypoints], pairs: list[list[int]], counter: _Counter) -> TrackedKeypoints:
+    """Match the keypoints of the pairs of images, and join the matches into tracks."""
+    matches = counter.over(_mapped(lambda ij: epipolar_matches(images[ij[0]], images[ij[1]]), pairs))
+    found = [(i, j, m) for (i, j), m in zip(pairs, matches, strict=True)]
+    label = joined_tracks(found, [len(image.keypoints) for image in images])
+    return TrackedKeypoints(images, label, torch.arange(len(label)))
 
 
 def _detected(view: View, features: Features) -> PosedKeypoints:

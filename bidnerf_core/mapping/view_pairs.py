@@ -9,18 +9,24 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.frames import View
+from bidnerf_core.se3 import SE3
 
 
 def likely_pairs(views: Sequence[View], neighbours: int) -> Int[Tensor, "p 2"]:
-    """Return pairs (i < j) of each view with ``neighbours`` views that are likely to show the same, without duplicates.
+    """Return pairs (i < j) of each view with ``neighbours`` views that are likely to show the same, without duplicates."""
+    return likely_pairs_of_poses([view.T_ref_camera for view in views], neighbours)
+
+
+def likely_pairs_of_poses(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, "p 2"]:
+    """Return pairs (i < j) of cameras with similar ``poses`` (T_world_camera), without duplicates.
 
     Half of the neighbours are those with the most similar poses. The others are spread over the next ones, every third,
     because successive images of a video have too little baseline for triangulation.
     """
-    order = _unlikeness(views).argsort(dim=1, stable=True)
-    ranks = _ranks(neighbours, len(views) - 1)
+    order = _unlikeness(poses).argsort(dim=1, stable=True)
+    ranks = _ranks(neighbours, len(poses) - 1)
     chosen = order[:, ranks]
-    own = torch.arange(len(views))[:, None].expand_as(chosen)
+    own = torch.arange(len(poses))[:, None].expand_as(chosen)
     pairs = torch.stack([own.minimum(chosen), own.maximum(chosen)], dim=-1).reshape(-1, 2)
     return pairs.unique(dim=0)
 
@@ -32,13 +38,13 @@ def _ranks(count: int, others: int) -> list[int]:
     return [rank for rank in ranks if rank < others] or list(range(others))
 
 
-def _unlikeness(views: Sequence[View]) -> Float[Tensor, "v v"]:
+def _unlikeness(poses: Sequence[SE3]) -> Float[Tensor, "v v"]:
     """Return how dissimilar two poses are: relative distance of the centres plus 1 - cosine between the optical axes.
 
     It is infinite between a view and itself.
     """
-    centres = torch.stack([view.T_ref_camera.translation.cpu().double() for view in views])
-    axes = torch.stack([view.T_ref_camera.rotation[:, 2].cpu().double() for view in views])
+    centres = torch.stack([pose.translation.cpu().double() for pose in poses])
+    axes = torch.stack([pose.rotation[:, 2].cpu().double() for pose in poses])
     away = torch.cdist(centres, centres)
     unlike = away / away.mean().clamp(min=1e-12) + 1 - axes @ axes.T
     return unlike.fill_diagonal_(torch.inf)

@@ -1,0 +1,87 @@
+"""The views that a training takes: with refined poses, and with the landmarks that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from bidnerf_core.carving import has_outline
+from bidnerf_core.cli.common import say
+from bidnerf_core.cli.progress import counted
+from bidnerf_core.frames import View
+from bidnerf_core.localization.training_poses import INCONSISTENT, training_poses
+from bidnerf_core.map_cameras import (
+    PoseRefinement,
+    StoredCamera,
+    moved_from,
+    pose_sentences,
+    stored_cameras,
+)
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
+
+Refinement = Literal["auto", "always", "never"]
+"""When to refine the given poses: ``auto`` does where they are inconsistent."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingViews:
+    """Views as training takes them, and what is known of their poses."""
+
+    views: list[View]
+    tracked: TrackedViews | None  # their keypoints, of which ``bake_map`` makes landmarks
+    cameras: tuple[StoredCamera, ...]
+    refinement: PoseRefinement | None = None  # None where nothing is known of the given poses
+
+
+def prepared(views: Sequence[View], refinement: Refinement = "auto") -> TrainingViews:
+    """Refine the poses of the views where that is wanted, and find the landmarks that they show."""
+    if refinement == "never":
+        tracked, seeing = located(views)
+        return TrainingViews(seeing, tracked, stored_cameras(views))
+    tracked = _tracked(views)
+    with counted("poses", "image pairs") as report:
+        least = 0.0 if refinement == "always" else INCONSISTENT
+        found = training_poses(tracked, views, least, progress=report)
+    poses = found.tracked.T_world_camera
+    moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
+    if not (found.refined or found.replaced):
+        moved = list(views)
+    cameras = moved_from(views, stored_cameras(moved), found.pixels.tolist())
+    names = tuple(views[number].frame.name for number in found.replaced)
+    noise = (found.noise_before, found.noise_after)
+    summary = PoseRefinement(*noise, found.refined, names) if found.inconsistency is not None else None
+    for line in [] if summary is None else pose_sentences(cameras, summary):
+        say(line)
+    return TrainingViews(_with_landmarks(moved, found.tracked), found.tracked, cameras, summary)
+
+
+def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:
+    """Track the keypoints of the views, unless all have dense depth or a silhouette: training takes distances from landmarks.
+
+    Return the tracks, of which ``bake_map`` makes the map's landmarks, and the views with the landmarks that each shows.
+    """
+    if not any(map(_lacks_distances, views)):
+        return None, list(views)
+    tracked = _tracked(views)
+    return tracked, _with_landmarks(views, tracked)
+
+
+def _lacks_distances(view: View) -> bool:
+    """Return whether neither depth nor a silhouette tells training where the matter is."""
+    return not (view.frame.has_dense_depth or has_outline(view))
+
+
+def _tracked(views: Sequence[View]) -> TrackedViews:
+    with counted("landmarks", "steps") as report:
+        return tracked_views(views, progress=report)
+
+
+def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
+    """Return the views with the landmarks that each shows, unless no view needs them for its distances."""
+    if not any(map(_lacks_distances, views)):
+        return list(views)
+    seen = tracked.seen(LandmarkConfig())
+    count = sum(len(part.distance) for part in seen)
+    say(f"{count} sightings of landmarks in {len(views)} views")
+    return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]

@@ -1,0 +1,97 @@
+"""The poses with which photos train a map: the given ones, or better ones where the photos contradict them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.frames import View
+from bidnerf_core.localization.relocated_photos import Relocation, relocated, suspects
+from bidnerf_core.mapping.capture_links import groups, linked
+from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
+from bidnerf_core.mapping.pose_refinement import RefinedPoses, refined_poses
+
+INCONSISTENT = 0.25
+"""Deviation (pixels) that errors of the given poses must at least add to that of the keypoints for the poses to be refined.
+Poses by structure from motion or a renderer add less than a tenth.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingPoses:
+    """The poses to train with, and how far they are from the given ones."""
+
+    tracked: TrackedViews  # with these poses
+    pixels: Float[
+        Tensor, "v"
+    ]  # how far the points that an image shows move in it, median; 0 where the pose was kept
+    replaced: list[int]  # images whose given pose was wrong, and which landmarks of the others placed
+    refined: bool  # whether all poses were refined
+    inconsistency: (
+        float | None
+    )  # pixels that errors of the given poses add to the keypoints; None if that is not known
+    noise_before: float = 0.0  # pixels: standard deviation of the keypoints about their points
+    noise_after: float = 0.0
+
+
+def training_poses(
+    tracked: TrackedViews,
+    views: Sequence[View],
+    least: float = INCONSISTENT,
+    features: Features = SIFT,
+    config: LandmarkConfig | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TrainingPoses:
+    """Return the poses to train with, for ``views`` whose keypoints are ``tracked``.
+
+    A photo that the landmarks of the others find at another place than its given pose is moved there. All poses are refined
+    if errors of the given ones add ``least`` pixels to the deviation of the keypoints; otherwise they are kept.
+    """
+    config = LandmarkConfig() if config is None else config
+    given = tracked.T_world_camera
+    wrong = _wrongly_posed(tracked, views, features, config)
+    if wrong:
+        updates = torch.zeros(len(views), 6, dtype=torch.float64)
+        for number, found in wrong.items():
+            updates[number] = found.update
+        tracked = tracked.at(given.retract(updates)).matched_anew(config, progress)
+    fit = refined_poses(tracked, config, progress, least)
+    answer = _chosen(tracked, fit, list(wrong), least)
+    for number, found in wrong.items():
+        answer.pixels[number] = found.pixels
+    return answer
+
+
+def _chosen(tracked: TrackedViews, fit: RefinedPoses | None, wrong: list[int], least: float) -> TrainingPoses:
+    """Return the refined poses if they are wanted, else the present ones, of which those that were wrong are refined."""
+    still = torch.zeros(len(tracked.observations.images), dtype=torch.float64)
+    if fit is None:
+        return TrainingPoses(tracked, still, wrong, False, None)
+    noise = fit.noise_before, fit.noise_after
+    if fit.inconsistency >= least:
+        return TrainingPoses(fit.tracked, fit.pixels, wrong, True, fit.inconsistency, *noise)
+    poses, better = tracked.T_world_camera, fit.tracked.T_world_camera
+    for number in wrong:
+        poses.rotation[number], poses.translation[number] = (
+            better.rotation[number],
+            better.translation[number],
+        )
+    return TrainingPoses(
+        tracked.at(poses) if wrong else tracked, still, wrong, False, fit.inconsistency, *noise
+    )
+
+
+def _wrongly_posed(
+    tracked: TrackedViews, views: Sequence[View], features: Features, config: LandmarkConfig
+) -> dict[int, Relocation]:
+    """Return the photos that the landmarks of the others find at another place, by number."""
+    seen, _ = tracked.triangulated(config)
+    count = torch.bincount(seen.image, minlength=len(views))
+    doubtful = suspects(seen, count, groups(linked(seen)))
+    found = relocated(tracked, views, doubtful, features, config)
+    return {number: photo for number, photo in found.items() if photo.problem in ("badly posed", "turned")}

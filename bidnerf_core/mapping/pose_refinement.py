@@ -1,0 +1,121 @@
+"""Refinement of the given poses of images by the keypoints that the images share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.mapping.bundle_adjustment import MeasuredSightings, PosePrior, adjusted
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, pose_updates
+from bidnerf_core.mapping.resection import LEAST_NOISE
+from bidnerf_core.mapping.triangulation import noise
+from bidnerf_core.se3 import SE3
+
+ROUNDS = 4
+"""Largest number of adjustments. After each, the keypoints are matched anew, which finds those that wrong poses hid."""
+SETTLED_PIXELS = 0.25
+"""Largest motion of an image by an adjustment after which no other one is needed."""
+CORRELATION = 10.0
+"""Number of keypoints that count as one: lenses and rolling shutters give the keypoints of an image errors in common."""
+LEAST_DEVIATION = 1e-9
+"""Standard deviation of the poses (metres, radians) that is assumed at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """The poses that fit the keypoints best, and how well the given ones fit them."""
+
+    tracked: TrackedViews  # with these poses, and matched by them
+    pixels: Float[Tensor, "v"]  # how far the points that an image shows move in it, median; 0 without points
+    noise_before: float  # pixels: standard deviation of the keypoints about their points at the given poses
+    noise_after: float
+
+    @property
+    def inconsistency(self) -> float:
+        """The deviation of keypoints (pixels) that errors of the given poses add to the keypoints' own noise."""
+        return max(0.0, self.noise_before**2 - self.noise_after**2) ** 0.5
+
+
+def refined_poses(
+    tracked: TrackedViews,
+    config: LandmarkConfig,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    least: float = 0.0,
+) -> RefinedPoses | None:
+    """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
+
+    The errors of the given poses are taken as independent of each other, and as large as resection of the images
+    suggests. This prior alone holds the whole arrangement in its place, so that the mean motion of the images is zero. If the
+    first adjustment finds an inconsistency of less than ``least`` pixels, its poses are returned at once.
+    """
+    given = tracked.T_world_camera
+    seen, points = tracked.triangulated(config)
+    before = max(LEAST_NOISE, noise(seen.sightings, points))
+    deviations = _deviations(seen, points, before)
+    if deviations is None:
+        return None
+    for number in range(ROUNDS):
+        pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
+        unmeasured = torch.zeros(len(seen.point), dtype=torch.float64)
+        sightings = MeasuredSightings(seen.sightings, seen.image, unmeasured, pixel_noise, 1.0, CORRELATION)
+        fit = adjusted(sightings, points, PosePrior(given, *deviations), tracked.T_world_camera)
+        step = _motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
+        moved = (given.inverse() @ fit.T_world_camera).log()
+        deviations = max(deviations[0], _spread(moved[:, :3])), max(deviations[1], _spread(moved[:, 3:]))
+        pixels = _motion(seen, fit.points, given, fit.T_world_camera)
+        tracked = tracked.at(fit.T_world_camera)
+        if number == 0 and _found(tracked, pixels, before, config).inconsistency < least:
+            break
+        tracked = tracked.matched_anew(config, progress)
+        if float(step.max()) <= SETTLED_PIXELS:
+            break
+        seen, points = tracked.triangulated(config)
+    return _found(tracked, pixels, before, config)
+
+
+def _found(
+    tracked: TrackedViews, pixels: Float[Tensor, "v"], before: float, config: LandmarkConfig
+) -> RefinedPoses:
+    seen, points = tracked.triangulated(config)
+    return RefinedPoses(tracked, pixels, before, max(LEAST_NOISE, noise(seen.sightings, points)))
+
+
+def _deviations(
+    seen: TrackedKeypoints, points: Float[Tensor, "n 3"], pixel_noise: float
+) -> tuple[float, float] | None:
+    """Return the standard deviations of the given poses (metres, radians) along and about each axis."""
+    updates = list(pose_updates(seen, points, pixel_noise).values())
+    if len(updates) < ENOUGH_IMAGES:
+        return None
+    values = torch.stack(updates)
+    return _spread(values[:, :3]), _spread(values[:, 3:])
+
+
+def _spread(values: Float[Tensor, "v 3"]) -> float:
+    """Return a robust standard deviation about zero."""
+    return max(LEAST_DEVIATION, 1.4826 * float(values.abs().median()))
+
+
+def _motion(
+    seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3
+) -> Float[Tensor, "v"]:
+    """Return how far (pixels) the points move in each image between two poses, median."""
+    shown, image = points[seen.point], seen.image
+    focal = seen.sightings.focal[:, None]
+    places = [_projected(T, image, shown) * focal for T in (given, found)]
+    away = torch.linalg.vector_norm(places[1] - places[0], dim=-1)
+    medians = torch.zeros(len(seen.images), dtype=torch.float64)
+    for number in image.unique().tolist():
+        medians[number] = away[image == number].median()
+    return medians
+
+
+def _projected(T: SE3, image: Tensor, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 2"]:
+    local = T[image].inverse().apply(points)
+    return local[:, :2] / local[:, 2:].clamp(min=1e-9)

@@ -1,0 +1,226 @@
+"""Bundle adjustment: derivatives, laws, and known errors of poses that it must take back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core import SE3
+from bidnerf_core.mapping.bundle_adjustment import (
+    Adjustment,
+    MeasuredSightings,
+    PosePrior,
+    adjusted,
+    linearized,
+)
+from bidnerf_core.mapping.triangulation import Sightings
+from landmark_scene import looking_in
+
+VIEWS, POINTS, FOCAL = 12, 150, 300.0
+MILLIMETRES, RADIANS = 0.008, 0.004
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Cameras on a ring that see all points of a box, each with an error."""
+
+    noise: float = 0.0  # pixels
+    depth: float = 0.0  # relative error; nothing is measured for 0
+    outliers: float = 0.0  # share of the sightings that are anywhere
+
+    @property
+    def poses(self) -> SE3:
+        return SE3.stack([looking_in(0.2 * i, 0.4 * (i % 3), 3.0) for i in range(VIEWS)])
+
+    @property
+    def points(self) -> Tensor:
+        return 2 * torch.rand(POINTS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 1
+
+    def seen(self, given: SE3, correlation: float = 1.0) -> MeasuredSightings:
+        """What the true cameras saw, under the ``given`` poses."""
+        generator = torch.Generator().manual_seed(2)
+        image = torch.arange(VIEWS).repeat_interleave(POINTS)
+        point = torch.arange(POINTS).repeat(VIEWS)
+        local = self.poses[image].inverse().apply(self.points[point])
+        noise = torch.randn(len(image), 3, dtype=torch.float64, generator=generator)
+        flat = local[:, :2] / local[:, 2:] + self.noise / FOCAL * noise[:, :2]
+        wrong = torch.rand(len(image), generator=generator) < self.outliers
+        flat = torch.where(wrong[:, None], 0.3 * noise[:, [1, 2]], flat)
+        depth = local[:, 2] * (1 + self.depth * noise[:, 2]) if self.depth else torch.zeros(len(image))
+        focal = torch.full((len(image),), FOCAL, dtype=torch.float64)
+        sightings = Sightings(point, given.rotation[image].mT, given.translation[image], flat, focal)
+        accuracy = max(0.1, self.noise), max(1e-3, self.depth)
+        return MeasuredSightings(sightings, image, depth.double(), *accuracy, correlation)
+
+
+def errors(seed: int = 3) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor([MILLIMETRES] * 3 + [RADIANS] * 3, dtype=torch.float64)
+    return size * torch.randn(VIEWS, 6, dtype=torch.float64, generator=generator)
+
+
+def prior(given: SE3) -> PosePrior:
+    return PosePrior(given, MILLIMETRES, RADIANS)
+
+
+def relative(T: SE3) -> SE3:
+    """The poses relative to the first camera's, which no prior has a part in."""
+    return T[:1].inverse() @ T
+
+
+def off(found: SE3, true: SE3) -> tuple[float, float]:
+    """The largest error of translation (metres) and rotation (radians)."""
+    parts = (true.inverse() @ found).log().split(3, dim=-1)
+    translation, rotation = (float(part.norm(dim=-1).max()) for part in parts)
+    return translation, rotation
+
+
+def spread(T: SE3) -> float:
+    """The size of the arrangement of the cameras, metres."""
+    return float((T.translation - T.translation.mean(0)).norm())
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.02])
+def test_the_gradient_is_the_numerical_one(depth: float) -> None:
+    capture = Capture(noise=1.0, depth=depth, outliers=0.1)
+    given = capture.poses.retract(errors())
+    seen, held = capture.seen(given, correlation=3.0), prior(given)
+    points = capture.points + 0.01
+
+    def cost(of_poses: Tensor, of_points: Tensor) -> float:
+        moved = Adjustment(capture.poses.retract(of_poses), points + of_points, 0.0)
+        return linearized(seen, moved, held).cost
+
+    system, still = (
+        linearized(seen, Adjustment(capture.poses, points, 0.0), held),
+        torch.zeros(VIEWS, 6).double(),
+    )
+    fixed, step = torch.zeros(POINTS, 3, dtype=torch.float64), 1e-6
+    for column in range(6):
+        change = torch.zeros_like(still)
+        change[4, column] = step
+        slope = (cost(change, fixed) - cost(-change, fixed)) / (2 * step)
+        assert slope == pytest.approx(float(system.pose_gradient[4, column]), rel=1e-5, abs=1e-3)
+    for column in range(3):
+        change = torch.zeros_like(fixed)
+        change[7, column] = step
+        slope = (cost(still, change) - cost(still, -change)) / (2 * step)
+        assert slope == pytest.approx(float(system.point_gradient[7, column]), rel=1e-5, abs=1e-3)
+
+
+def test_the_schur_complement_gives_the_step_of_the_whole_equations() -> None:
+    capture = Capture(noise=1.0, depth=0.02)
+    given = capture.poses.retract(errors())
+    system = linearized(capture.seen(given), Adjustment(given, capture.points, 0.0), prior(given))
+    rows, columns = 6 * VIEWS, 3 * POINTS
+    whole = torch.zeros(rows + columns, rows + columns, dtype=torch.float64)
+    for i, block in enumerate(system.pose_blocks):
+        whole[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = block
+    for i, block in enumerate(system.point_blocks):
+        at = rows + 3 * i
+        whole[at : at + 3, at : at + 3] = block
+    for block, image, point in zip(system.mixed_blocks, system.image, system.point, strict=True):
+        i, at = 6 * int(image), rows + 3 * int(point)
+        whole[i : i + 6, at : at + 3] = block
+        whole[at : at + 3, i : i + 6] = block.mT
+    damping = 0.01
+    whole += damping * torch.diag(whole.diagonal())
+    right = -torch.cat([system.pose_gradient.ravel(), system.point_gradient.ravel()])
+    of_poses, of_points = system.step(damping)
+    found = torch.cat([of_poses.ravel(), of_points.ravel()])
+    torch.testing.assert_close(found, torch.linalg.solve(whole, right), rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.02])
+def test_exact_poses_do_not_move(depth: float) -> None:
+    capture = replace(Capture(), depth=depth and 1e-12)
+    found = adjusted(capture.seen(capture.poses), capture.points, prior(capture.poses))
+    assert max(off(found.T_world_camera, capture.poses)) < 1e-9
+    torch.testing.assert_close(found.points, capture.points, rtol=0, atol=1e-9)
+
+
+def test_exact_sightings_take_errors_of_poses_back() -> None:
+    """What is left is what no image shows: a motion and a scale of everything, about which the prior has an opinion."""
+    capture = Capture()
+    given = capture.poses.retract(errors())
+    found = adjusted(capture.seen(given), capture.points, prior(given), settled=1e-12).T_world_camera
+    translation, rotation = off(relative(found), relative(capture.poses))
+    before = off(relative(given), relative(capture.poses))
+    assert translation < 0.15 * before[0]  # the scale
+    assert rotation < 0.01 * before[1]
+
+
+def test_the_mean_motion_is_zero() -> None:
+    capture = Capture(noise=0.3)
+    given = capture.poses.retract(errors())
+    found = adjusted(
+        capture.seen(given), capture.points, replace(prior(given), translation=1.0, rotation=0.5)
+    )
+    mean = (found.T_world_camera.translation - given.translation).mean(0)
+    typical = (found.T_world_camera.translation - given.translation).norm(dim=-1).median()
+    assert float(mean.norm()) < 1e-3 * float(typical)
+
+
+def test_a_moved_world_has_moved_poses() -> None:
+    capture = Capture(noise=0.5, depth=0.02)
+    given = capture.poses.retract(errors())
+    T = SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.3], dtype=torch.float64))
+    here = adjusted(capture.seen(given), capture.points, prior(given))
+    moved = T @ given
+    there = adjusted(capture.seen(moved), T.apply(capture.points), prior(moved))
+    assert max(off(there.T_world_camera, T @ here.T_world_camera)) < 1e-6
+    assert there.cost == pytest.approx(here.cost, rel=1e-6)
+
+
+def test_depth_finds_the_scale_that_colour_leaves_open() -> None:
+    capture = Capture(depth=0.01)
+    larger = SE3(capture.poses.rotation, 1.02 * capture.poses.translation)
+    loose = PosePrior(larger, 0.1, RADIANS)
+    with_depth = adjusted(capture.seen(larger), capture.points, loose, settled=1e-12).T_world_camera
+    without = adjusted(Capture().seen(larger), capture.points, loose, settled=1e-12).T_world_camera
+    assert spread(with_depth) / spread(capture.poses) == pytest.approx(1, abs=2e-3)
+    assert spread(without) / spread(capture.poses) > 1.01
+
+
+def test_outliers_and_a_wrong_pose_do_not_pull_the_others_away() -> None:
+    capture = Capture(noise=0.3, outliers=0.1)
+    wrong = errors()
+    wrong[5] = torch.tensor([0.2, 0, 0.1, 0, 0.05, 0], dtype=torch.float64)
+    given = capture.poses.retract(wrong)
+    found = adjusted(capture.seen(given), capture.points, prior(given)).T_world_camera
+    translation, rotation = off(found, capture.poses)
+    assert translation < 1.5 * MILLIMETRES  # the common motion remains
+    assert rotation < RADIANS
+
+
+def test_an_image_without_sightings_stays() -> None:
+    capture = Capture(noise=0.3)
+    given = capture.poses.retract(errors())
+    seen = capture.seen(given)
+    kept = seen.image != 3
+    seen = replace(seen, sightings=seen.sightings[kept], image=seen.image[kept], depth=seen.depth[kept])
+    found = adjusted(seen, capture.points, prior(given)).T_world_camera
+    assert max(off(found[3], given[3])) < 1e-12
+    assert max(off(found[4], given[4])) > 1e-3
+
+
+def test_points_without_parallax_do_no_harm() -> None:
+    """Cameras that only turn about their centre show nothing of distances."""
+    capture = Capture(noise=0.3)
+    turned = SE3.stack(
+        [
+            looking_in(0.0, 0.3, 3.0).retract(torch.tensor([0, 0, 0, 0, 0.01 * i, 0]).double())
+            for i in range(VIEWS)
+        ]
+    )
+    image = torch.arange(VIEWS).repeat_interleave(POINTS)
+    local = turned[image].inverse().apply(capture.points.repeat(VIEWS, 1))
+    seen = capture.seen(turned)
+    seen = replace(seen, sightings=replace(seen.sightings, image=local[:, :2] / local[:, 2:]))
+    given = turned.retract(errors())
+    found = adjusted(seen, capture.points, prior(given)).T_world_camera
+    assert bool(found.is_rigid().all())
+    assert off(relative(found), relative(turned))[1] < 0.5 * off(relative(given), relative(turned))[1]
