@@ -5,7 +5,9 @@
 Records wall time and peak memory of ``bidnerf train`` as a process, the size of the map, and on the test split the PSNR
 of images, the absolute error of depth where depth was measured, and how many samples a ray takes. A map does not have the
 exposure of a photo that it was not trained on: PSNR is measured as rendered, and after the gain and the offset of each colour
-channel that fit the photo best. Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the choice of samples that makes it fast, is
+channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
+measured at the poses that the map's landmarks give the test frames, and on training frames at the poses that the map has of
+them. Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the choice of samples that makes it fast, is
 judged beside that on every fifth frame.
 """
 
@@ -27,10 +29,17 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import View
+from bidnerf_core.localization.search.landmarks import confirm
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.map_cameras import at_stored_poses
 from bidnerf_core.rendering import render_image
-from bidnerf_core.storage import load_map
+from bidnerf_core.se3 import SE3
+from bidnerf_core.serialization import to_plain
+from bidnerf_core.storage import Map, load_map
 from bidnerf_core.training import fitted_colours
 
+LEAST_LANDMARKS = 30
+"""Least number of landmarks from which the pose of a test frame is refined."""
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -86,6 +95,42 @@ def samples_per_ray(field: RadianceField, bounds: SceneBounds, views: list[View]
     return taken / rays
 
 
+def at_landmark_poses(stored: Map, views: list[View]) -> dict[str, Any] | None:
+    """Return the quality at the poses that fit the map's landmarks best near the given ones, and how far those are away.
+
+    Frames that show too few landmarks are left out, of both ``given`` and ``refined``.
+    """
+    if stored.landmarks is None:
+        return None
+    matcher, placed, given, updates = LandmarkMatcher(stored.landmarks), [], [], []
+    for view in views:
+        T = view.T_ref_camera.to("cpu", torch.float64)
+        found = confirm(matcher, [View(view.frame, SE3.identity())], T).pose
+        if found is not None and found.inliers >= LEAST_LANDMARKS:
+            given.append(view)
+            placed.append(View(view.frame, found.T_world_camera))
+            updates.append((T.inverse() @ found.T_world_camera).log())
+    if not placed:
+        return None
+    translation, rotation = (
+        torch.linalg.vector_norm(p, dim=-1) for p in torch.stack(updates).split(3, dim=-1)
+    )
+    return {
+        "translation_median": float(translation.median()),
+        "rotation_deg_median": float(rotation.rad2deg().median()),
+        "given": judge(stored.field, stored.bounds, given),
+        "refined": judge(stored.field, stored.bounds, placed),
+    }
+
+
+def on_training_frames(stored: Map, data: Path) -> dict[str, float | None]:
+    """Return the quality on a few training frames, at the poses that the map has of them."""
+    views = open_dataset(data, stored.bounds.background).views("train")
+    return judge(
+        stored.field, stored.bounds, at_stored_poses(views, stored.info.cameras)[:: max(1, len(views) // 20)]
+    )
+
+
 def beside_dense(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, Any] | None:
     """Return the quality of the field and of its ``dense`` counterpart, which is slow, on every fifth frame."""
     dense = getattr(field, "dense", None)
@@ -119,6 +164,12 @@ def main() -> None:
             for level in levels(stored.field)
         ],
     }
+    results["at_landmark_poses"] = at_landmark_poses(stored, views)
+    results["training_frames"] = on_training_frames(stored, given.data)
+    if stored.info.pose_refinement is not None:
+        moved = [camera.moved for camera in stored.info.cameras if camera.moved is not None]
+        results["pose_refinement"] = to_plain(stored.info.pose_refinement)
+        results["pixels_moved_median"] = statistics.median(m.pixels for m in moved) if moved else 0.0
     if compared := beside_dense(stored.field, stored.bounds, views):
         results["beside_dense"] = compared
     print(write_record(RESULTS / f"{given.name}.json", results, seed=stored.info.config.get("seed", 0)))

@@ -1,0 +1,120 @@
+"""``bidnerf train --refine-poses``: what a map keeps of given and refined poses, and who takes which."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import tiny
+from bidnerf_core import View
+from bidnerf_core.cli import training_views
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.localization.training_poses import TrainingPoses
+from bidnerf_core.map_cameras import as_given, stored_cameras
+from bidnerf_core.map_parts import load_capture
+from bidnerf_core.mapping.landmark_building import TrackedViews
+from bidnerf_core.storage import cameras_of, load_info
+from commands import Run
+from test_cli import assert_same_map, stop_at
+from tiny import backends_listed_once  # noqa: F401
+
+pytestmark = pytest.mark.usefixtures("backends_listed_once")
+UPDATE = torch.tensor([0.01, -0.02, 0.0, 0.0, 0.03, 0.0], dtype=torch.float64)
+
+
+@pytest.fixture
+def refining(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refinement that turns every camera by the same right update: images of a few pixels have no keypoints for any."""
+
+    def moved(tracked: TrackedViews, views: Sequence[View], *_: Any, **__: Any) -> TrainingPoses:
+        pixels = torch.full((len(views),), 0.9, dtype=torch.float64)
+        pixels[2] = 1.4
+        there = tracked.at(tracked.T_world_camera.retract(UPDATE))
+        return TrainingPoses(there, pixels, [1], True, 0.6, 0.7, 0.36)
+
+    monkeypatch.setattr(training_views, "training_poses", moved)
+
+
+def views_of(data: Path) -> list[View]:
+    return open_dataset(data, tiny.BACKGROUND).views("train")
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return tiny.write_dataset(tmp_path / "data")
+
+
+@pytest.mark.usefixtures("refining")
+def test_a_map_holds_refined_and_given_poses(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    outcome = bidnerf("train", data, "--out", tmp_path / "map", *tiny.options(2))
+    assert outcome.status == 0
+    views, info = views_of(data), load_info(tmp_path / "map")
+    assert as_given(info.cameras) == stored_cameras(views)
+    for view, (_, T) in zip(views, cameras_of(info), strict=True):
+        torch.testing.assert_close((view.T_ref_camera.inverse() @ T).log(), UPDATE, rtol=0, atol=1e-9)
+    line = f"0.60 px to the 0.36 px of keypoints; the poses are refined by {UPDATE[:3].norm():.3g} and"
+    assert line in outcome.err
+    name = views[2].frame.name
+    assert f"{name} most" in outcome.err
+    shown = bidnerf("info", tmp_path / "map").out
+    assert line in shown
+    assert f"landmarks of the other images place them: {views[1].frame.name} by" in shown
+    facts = json.loads(bidnerf("info", tmp_path / "map", "--json").out)
+    assert [moved["name"] for moved in facts["moved"]] == [view.frame.name for view in views]
+    assert facts["moved"][2]["pixels"] == 1.4
+    assert facts["poses"]["replaced"] == [views[1].frame.name]
+
+
+def test_never_and_images_without_keypoints_keep_the_given_poses(
+    bidnerf: Run, data: Path, tmp_path: Path
+) -> None:
+    for when in ("never", "auto", "always"):
+        words = ["train", data, "--out", tmp_path / when, "--refine-poses", when, *tiny.options(2)]
+        assert bidnerf(*words).status == 0
+        info = load_info(tmp_path / when)
+        assert info.cameras == stored_cameras(views_of(data))
+        assert info.pose_refinement is None
+        assert json.loads(bidnerf("info", tmp_path / when, "--json").out)["moved"] == []
+    assert bidnerf("train", data, "--out", tmp_path / "x", "--refine-poses", "maybe").status == 2
+
+
+@pytest.mark.usefixtures("refining")
+def test_a_resumed_training_takes_the_refined_poses_again(
+    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train = ["train", data, *tiny.options()]
+    assert bidnerf(*train, "--out", tmp_path / "whole").status == 0
+    with monkeypatch.context() as patch:
+        stop_at(patch, 5)
+        assert bidnerf(*train, "--out", tmp_path / "half").status == 130
+    monkeypatch.setattr(training_views, "training_poses", None)  # it is not called again
+    assert bidnerf("train", data, "--resume", "--no-bake", "--out", tmp_path / "half").status == 0
+    assert_same_map(tmp_path / "half", tmp_path / "whole")
+    assert load_info(tmp_path / "half").cameras == load_info(tmp_path / "whole").cameras
+
+
+@pytest.mark.usefixtures("refining")
+def test_photos_that_are_baked_later_have_the_refined_poses(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    assert bidnerf("train", data, "--out", tmp_path / "map", *tiny.options(2)).status == 0
+    assert bidnerf("bake", tmp_path / "map", "--data", data, "--measured", "5000").status == 0
+    info = load_info(tmp_path / "map")
+    photos = load_capture(tmp_path / "map" / str(info.capture)).photos
+    for photo, (_, T) in zip(photos, cameras_of(info), strict=True):
+        torch.testing.assert_close(torch.tensor(photo.position).double(), T.translation, rtol=0, atol=1e-6)
+
+
+@pytest.mark.usefixtures("refining")
+def test_a_damaged_given_pose_is_named(bidnerf: Run, data: Path, tmp_path: Path) -> None:
+    assert bidnerf("train", data, "--out", tmp_path / "map", *tiny.options(2)).status == 0
+    file = tmp_path / "map" / "map.json"
+    described = json.loads(file.read_text())
+    described["cameras"][1]["given_T_world_camera"][0] = [0, 0, 0, 0]
+    file.write_text(json.dumps(described))
+    status, _, err = bidnerf("info", tmp_path / "map")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "not a rigid transform" in err
