@@ -62,6 +62,9 @@ class MapInfo:
     seconds: float = 0.0  # of training
     cameras: tuple[StoredCamera, ...] = ()
     pose_refinement: PoseRefinement | None = None  # of the cameras; None where their given poses were kept
+    distances: bool = (
+        True  # whether the training images showed how far things are; photos from one place do not
+    )
     sparse_depth: int = 0  # pixels of the training images that had their depth from structure from motion
     weights: str = ""  # file names
     training: str | None = None  # what resuming needs; dropped when training is complete
@@ -87,6 +90,11 @@ class Map:
     @property
     def bounds(self) -> SceneBounds:
         return self.info.bounds
+
+    @property
+    def has_distances(self) -> bool:
+        """Whether the training images showed how far things are. Where not, depth is arbitrary, and so are positions."""
+        return self.info.distances
 
     @property
     def colour_noise(self) -> float | None:

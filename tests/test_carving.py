@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.carving import FreeSpace, estimate_bounds, occupied_cells
-from bidnerf_core.carving.bounds import measured_points
+from bidnerf_core.carving.bounds import ONE_PLACE, ROOM, measured_points
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
@@ -322,11 +322,15 @@ def test_a_flat_scene_gets_some_thickness() -> None:
 def test_too_little_to_go_by_is_said() -> None:
     with pytest.raises(InputError, match="no views"):
         estimate_bounds([])
+
+
+def test_views_from_one_place_have_an_assumed_scale_and_matter_beyond() -> None:
     view = ball_view((4, 0, 0), depth=False, alpha=False)
-    with pytest.raises(
-        InputError, match="2 views from one place without depth, expected depth, or views from several"
-    ):
-        estimate_bounds([view, view])
+    bounds = estimate_bounds([view, view])
+    assert bounds.contracted
+    inside = torch.tensor(bounds.lower) <= torch.tensor([4.0, 0.0, 0.0])
+    assert bool((inside & (torch.tensor([4.0, 0.0, 0.0]) <= torch.tensor(bounds.upper))).all())
+    assert bounds.side == pytest.approx(ROOM * ONE_PLACE, rel=0.8)
 
 
 # Recorded scenes

@@ -27,6 +27,8 @@ LANDMARKS_BEYOND = 0.05  # fraction of the landmarks, at either end of each axis
 LANDMARKS_NEARER = 0.01  # fraction of the landmarks that is disregarded where the nearest one is sought
 ROOM = 4.0  # assumed range of a hand-held camera's view, in multiples of the extent of its positions
 
+ONE_PLACE = 1.0  # extent (scene units) that is assumed of the positions where all of them are the same
+
 
 def estimate_bounds(
     views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -38,8 +40,8 @@ def estimate_bounds(
     middle 90 % of the landmarks that the views see. Without landmarks it is a guess: for cameras that look inward, a cube
     around the point they look at, as large as what an image shows there; for others (a room), the box of the cameras and of
     what they see within ``ROOM`` times the extent of their positions. Unless half of the views have dense depth or
-    silhouettes, there may be matter beyond the box, and the scene is contracted. Raises ``InputError`` where there is only
-    colour and all cameras are in one place.
+    silhouettes, there may be matter beyond the box, and the scene is contracted. Images from exactly one place show no
+    scale, and ``ONE_PLACE`` stands for it. Raises ``InputError`` where there are no views.
     """
     if not views:
         raise InputError("scene bounds: no views to estimate them from")
@@ -122,10 +124,8 @@ def _guessed_box(views: Sequence[View]) -> AxisBox:
         half = (torch.linalg.vector_norm(places - middle, dim=-1) * _tangents(views)).amax()
         return middle - half, middle + half
     extent = (places.amax(dim=0) - places.amin(dim=0)).amax()
-    if extent <= 0:
-        found = f"{len(views)} views from one place without depth"
-        raise InputError(f"scene bounds: {found}, expected depth, or views from several places")
-    ends = [view.T_ref_camera.to(torch.float64).apply(_corner_rays(view) * ROOM * extent) for view in views]
+    reach = ROOM * (float(extent) or ONE_PLACE)
+    ends = [view.T_ref_camera.to(torch.float64).apply(_corner_rays(view) * reach) for view in views]
     points = torch.cat([places, *ends])
     return points.amin(dim=0), points.amax(dim=0)
 

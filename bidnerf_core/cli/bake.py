@@ -142,6 +142,8 @@ def _bake_landmarks(
     if tracked is None:
         with counted("landmarks", "steps") as report:
             tracked = tracked_views(views, progress=report)
+    if source == "photos" and not stored.info.distances:
+        tracked = tracked.at_distance(stored.bounds.side / 2)  # they still tell directions
     trial = HeldOutTrial()
     try:
         landmarks = tried_landmarks(tracked, views, report=say)

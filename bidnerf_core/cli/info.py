@@ -72,6 +72,7 @@ def describe(folder: Path, stored: Map) -> dict[str, Any]:
         "backend": info.backend,
         "data": info.data,
         "cameras": len(info.cameras),
+        "distances": info.distances,
         "poses": None if info.pose_refinement is None else to_plain(info.pose_refinement),
         "step": info.step,
         "complete": info.complete,

@@ -148,10 +148,15 @@ def train_map(
 ) -> None:  # fmt: skip
     """Train a new map into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
     taken = prepared(views, refinement)
+    if not taken.distances:
+        say(
+            f"{data}: the photos are from one place and show no distances; the map's depth will be arbitrary, and"
+            " localization in it will tell directions, never positions"
+        )
     bounds = estimate_bounds(taken.views, background)
     info = MapInfo(
         name, to_plain(config, "config"), bounds, 0, False, data, cameras=taken.cameras,
-        pose_refinement=taken.refinement, sparse_depth=sparse_depth,
+        pose_refinement=taken.refinement, distances=taken.distances, sparse_depth=sparse_depth,
     )  # fmt: skip
     _run(backend, info, out, taken.views, taken.tracked, checkpoint_seconds, baked)
 

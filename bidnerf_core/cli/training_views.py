@@ -18,6 +18,7 @@ from bidnerf_core.map_cameras import (
     pose_sentences,
     stored_cameras,
 )
+from bidnerf_core.mapping.capture_coverage import shows_distances
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
 
 Refinement = Literal["auto", "always", "never"]
@@ -32,13 +33,16 @@ class TrainingViews:
     tracked: TrackedViews | None  # their keypoints, of which ``bake_map`` makes landmarks
     cameras: tuple[StoredCamera, ...]
     refinement: PoseRefinement | None = None  # None where nothing is known of the given poses
+    distances: bool = True  # whether the views show how far things are
 
 
 def prepared(views: Sequence[View], refinement: Refinement = "auto") -> TrainingViews:
     """Refine the poses of the views where that is wanted, and find the landmarks that they show."""
     if refinement == "never":
         tracked, seeing = located(views)
-        return TrainingViews(seeing, tracked, stored_cameras(views))
+        return TrainingViews(
+            seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
+        )
     tracked = _tracked(views)
     with counted("poses", "image pairs") as report:
         least = 0.0 if refinement == "always" else INCONSISTENT
@@ -53,7 +57,8 @@ def prepared(views: Sequence[View], refinement: Refinement = "auto") -> Training
     summary = PoseRefinement(*noise, found.refined, names) if found.inconsistency is not None else None
     for line in [] if summary is None else pose_sentences(cameras, summary):
         say(line)
-    return TrainingViews(_with_landmarks(moved, found.tracked), found.tracked, cameras, summary)
+    seeing, distances = _with_landmarks(moved, found.tracked), shows_distances(views, tracked)
+    return TrainingViews(seeing, found.tracked, cameras, summary, distances)
 
 
 def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:

@@ -69,7 +69,7 @@ def surveyed(
         )  # fmt: skip
         photos.append(found.onto(record) if found else record)
     spread = exposure.quantile(torch.tensor([0.1, 0.9], dtype=exposure.dtype))
-    covered = coverage(_sound(views, problems), _matched(tracked), seen, config.parallax)
+    covered = coverage(_sound(views, problems), tracked.matched, seen, config.parallax)
     return CaptureReport(tuple(photos), covered, trial, float(spread[1] - spread[0]))
 
 
@@ -77,12 +77,6 @@ def _comparable(near: Bool[Tensor, "v v"], group: Int[Tensor, "v"]) -> Bool[Tens
     """Return which nearby photos also belong to the same group; all that are nearby where none does."""
     same = near & (group[:, None] == group)
     return torch.where(same.any(dim=1, keepdim=True), same, near)
-
-
-def _matched(tracked: TrackedViews) -> TrackedKeypoints:
-    """Return the keypoints that were matched with those of other images."""
-    point = tracked.observations.point
-    return tracked.observations[torch.bincount(point)[point] > 1].compacted()[0]
 
 
 def _sound(views: Sequence[View], problems: Sequence[tuple[PhotoProblem, ...]]) -> Sequence[View]:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only, has_distances
 from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Localization
@@ -85,7 +86,8 @@ class Localizer:
         problem = rig(
             self.map, _views(query), None if start is None else start_pose(start), depth_rays, self.matcher
         )
-        return METHODS[self.method].run(problem, self.config, seed)
+        found = METHODS[self.method].run(problem, self.config, seed)
+        return found if has_distances(self.map) else direction_only(found)
 
     @torch.no_grad()
     def _warm_up(self) -> None:
@@ -99,6 +101,15 @@ class Localizer:
         render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
         if self.map.surface is not None:
             self.map.surface.warm_up()
+
+
+def map_with_distances(localizer: Localizer) -> SceneMap:
+    """Return the localizer's map. Raises ``InputError`` where it was made from one place: nothing has a position in it."""
+    if not has_distances(localizer.map):
+        raise InputError(
+            f"tracking needs positions, but {NO_DISTANCES}; expected a map of photos from several places"
+        )
+    return localizer.map
 
 
 def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:

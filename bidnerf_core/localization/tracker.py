@@ -11,7 +11,7 @@ import torch
 
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization.auto import AutoConfig
-from bidnerf_core.localization.localizer import Localizer, Start, start_pose
+from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.tracking.answers import (
     METHOD,
@@ -63,12 +63,12 @@ class Tracker:
     def __init__(
         self, localizer: Localizer, config: TrackerConfig | None = None, start: Start | None = None
     ) -> None:
-        """Track in the map of ``localizer``. ``start`` is a guess at T_world_camera of the first frame."""
+        """Track in the map of ``localizer``, which must have distances. ``start``: a guess at the first T_world_camera."""
         config = TrackerConfig() if config is None else config
         self.localizer, self.config = localizer, config
         self._state = TrackerState(Clock(None, config.frame_seconds))
         self._start = None if start is None else start_pose(start)
-        scene = localizer.map
+        scene = map_with_distances(localizer)
         self._by_landmarks: ByLandmarks | None = None
         if uses_landmarks(localizer) and localizer.matcher is not None:
             detector = LandmarkDetector(localizer.matcher.landmarks, Sift(count=config.keypoints))

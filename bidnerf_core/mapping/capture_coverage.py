@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.frames import View
 from bidnerf_core.mapping.capture_report import Arrangement, CoverageRecord, Gap
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
 
@@ -28,6 +29,9 @@ RARE = 0.01
 """Probability that a capture whose cameras are spread at random has a gap that counts."""
 STEEP = 75.0
 """Degrees above or below the horizon from which on a camera has no direction along it."""
+FEW_POINTS = 50
+"""Number of triangulated points below which a capture shows hardly any distances."""
+DEFAULTS = LandmarkConfig()
 FEW = 4
 """Number of photos below which nothing is said of gaps."""
 
@@ -40,7 +44,7 @@ def coverage(
     ``matched`` are all keypoints that were matched, ``seen`` those that agree on a triangulated point, and
     ``least_parallax`` is the angle (degrees) between rays below which a point cannot be placed.
     """
-    angle = _parallax_deg(matched.sightings, matched.count)
+    angle = parallax_deg(matched)
     centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
     rotations = torch.stack([v.T_ref_camera.rotation.cpu().double() for v in views])
     up = torch.nn.functional.normalize(-rotations[:, :, 1].sum(0), dim=0)
@@ -122,9 +126,26 @@ def _field_of_view_deg(views: Sequence[View]) -> float:
     return _median(torch.tensor([2 * math.degrees(math.atan(0.5 * c.width / c.fx)) for c in cameras]))
 
 
-def _parallax_deg(sightings: Sightings, count: int) -> float | None:
+def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool:
+    """Return whether views show how far things are: by depth, or from places far enough apart.
+
+    They do not if hardly any point can be triangulated because the rays to the same point differ too little, or if all
+    cameras are exactly in one place.
+    """
+    if any(view.frame.has_depth for view in views):
+        return True
+    centres = torch.stack([view.T_ref_camera.translation.double() for view in views])
+    if float((centres - centres[:1]).abs().max()) <= 0:
+        return False
+    angle = None if tracked is None else parallax_deg(tracked.matched)
+    if tracked is None or angle is None or angle >= DEFAULTS.parallax:
+        return True
+    return len(tracked.triangulated(DEFAULTS)[1]) >= FEW_POINTS
+
+
+def parallax_deg(matched: TrackedKeypoints) -> float | None:
     """Return the median angle of the rays to a matched point; None without points."""
-    return _median(_cones_deg(sightings, count)) if count else None
+    return _median(_cones_deg(matched.sightings, matched.count)) if matched.count else None
 
 
 def _cones_deg(sightings: Sightings, count: int) -> Float[Tensor, "n"]:

@@ -102,12 +102,22 @@ class TrackedViews:
         """The poses of the images (v)."""
         return SE3.stack([image.T_world_camera for image in self.observations.images])
 
+    @property
+    def matched(self) -> TrackedKeypoints:
+        """The keypoints that were matched with those of other images."""
+        return self.observations[_tracked(self.observations)].compacted()[0]
+
     def at(self, T_world_camera: SE3) -> TrackedViews:
         """Return the same tracks in images with other poses (v)."""
         images = [
             replace(p, T_world_camera=T_world_camera[i]) for i, p in enumerate(self.observations.images)
         ]
         return replace(self, observations=replace(self.observations, images=images))
+
+    def at_distance(self, distance: float) -> TrackedViews:
+        """Return the tracks with all keypoints at one ``distance`` (metres) from their cameras, as if it were measured."""
+        rays = torch.cat([image.rays for image in self.observations.images])
+        return replace(self, depth=distance / torch.linalg.vector_norm(rays, dim=-1))
 
     def matched_anew(
         self, config: LandmarkConfig, progress: Callable[[int, int], None] = lambda done, total: None
