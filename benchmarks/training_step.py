@@ -89,6 +89,7 @@ class Training:
 
 def reopened(data: Path, folder: Path) -> Training:
     stored = load_map(folder)
+    stored.field.requires_grad_(True)  # type: ignore[attr-defined]
     dataset = open_dataset(data, stored.bounds.background)
     config = load_backend(stored.info.backend).config_type
     settings = dict(vars(stored.field.config))  # type: ignore[attr-defined]
