@@ -2,7 +2,7 @@
 
     python benchmarks/map_quality.py DATA --out MAP --name map_lego [-- OPTIONS OF bidnerf train]
 
-Records wall time and peak memory of ``bidnerf train`` as a process, the size of the map, and on the test split the PSNR
+Records wall time, CPU time and peak memory of ``bidnerf train`` as a process, the size of the map, and on the test split the PSNR
 of images, the absolute error of depth where depth was measured, and how many samples a ray takes. A map does not have the
 exposure of a photo that it was not trained on: PSNR is measured as rendered, and after the gain and the offset of each colour
 channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
@@ -44,12 +44,16 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def train(data: Path, out: Path, options: list[str]) -> dict[str, float]:
-    """Wall seconds and peak resident memory (GB) of the training process."""
+    """Return wall seconds, CPU seconds and peak resident memory (GiB) of the training process."""
     command = [sys.executable, "-c", "import sys; from bidnerf_core.cli import main; sys.exit(main())"]
     began = time.perf_counter()
     subprocess.run([*command, "train", str(data), "--out", str(out), "--overwrite", *options], check=True)
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-    return {"seconds": time.perf_counter() - began, "peak_resident_GiB": peak}
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {
+        "seconds": time.perf_counter() - began,
+        "cpu_seconds": used.ru_utime + used.ru_stime,
+        "peak_resident_GiB": used.ru_maxrss / 2**20,
+    }
 
 
 def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, float | None]:

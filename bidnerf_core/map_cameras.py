@@ -28,11 +28,25 @@ class StoredCamera:
     moved_pixels: float | None = None  # how far the points that the image shows move in it from there, median
 
     @property
+    def pose(self) -> SE3:
+        """T_world_camera, float64."""
+        return _pose(self.T_world_camera)
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether all poses are rigid transforms."""
+        rows = [
+            self.T_world_camera,
+            *([] if self.given_T_world_camera is None else [self.given_T_world_camera]),
+        ]
+        return all(len(part) == 4 and bool(_pose(part).is_rigid()) for part in rows)
+
+    @property
     def moved(self) -> MovedCamera | None:
         """How far refinement moved the camera; None where it kept the given pose."""
         if self.given_T_world_camera is None:
             return None
-        update = (_pose(self.given_T_world_camera).inverse() @ _pose(self.T_world_camera)).log()
+        update = (_pose(self.given_T_world_camera).inverse() @ self.pose).log()
         metres, radians = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
         return MovedCamera(self.name, metres, math.degrees(radians), self.moved_pixels or 0.0)
 
@@ -111,9 +125,7 @@ def _typical_motion(moved: Sequence[MovedCamera]) -> str:
 
 def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
     """Return the views with refined poses, those that are among ``cameras`` with the pose that the view has."""
-    known = {
-        (c.name, c.given_T_world_camera): _pose(c.T_world_camera) for c in cameras if c.given_T_world_camera
-    }
+    known = {(c.name, c.given_T_world_camera): c.pose for c in cameras if c.given_T_world_camera}
     poses = [known.get((view.frame.name, _rows(view.T_ref_camera)), view.T_ref_camera) for view in views]
     return [replace(view, T_ref_camera=T) for view, T in zip(views, poses, strict=True)]
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +13,7 @@ from torch.nn.functional import max_pool1d, pad
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.rendering import query_samples, rendering_weights
 from bidnerf_core.voxel_grid import OccupancyMask
+from bidnerf_core.waiting import may_wait
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,16 @@ class Resampled:
         return self.field.query(positions, directions)
 
 
+Rows = TypeVar("Rows", Rays, RaySamples)
+
+
+def _rows(of: Rows, index: Int[Tensor, "n"]) -> Rows:
+    """Return the rays, or the samples of the rays, with these numbers."""
+    leading = (of.near if isinstance(of, Rays) else of.starts[..., 0]).dim()
+    parts = (getattr(of, field.name) for field in fields(of))
+    return type(of)(*(part.reshape(-1, *part.shape[leading:])[index] for part in parts))
+
+
 def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:
     """Return the samples ``yes`` for some rays and ``no`` for the others, padded to a common number a ray."""
     width = max(yes.starts.shape[-1], no.starts.shape[-1])
@@ -149,14 +161,26 @@ class Concentrated:
         rough = _gathered(self.guide.sampler(rays, jitter))
         if rough.starts.shape[-1] <= self.count:
             return rough
-        thickest = LARGEST_THICKNESS / (rough.ends - rough.starts).clamp(
-            min=torch.finfo(rough.ends.dtype).tiny
-        )
-        density = torch.minimum(query_samples(self.guide, rays, rough).density, thickest)
-        weights = rendering_weights(density, rough)
+        kept = RaySamples(*(part[..., : self.count] for part in _parts(rough)))
         few = rough.valid.sum(-1) <= self.count
-        kept = RaySamples(*(part[..., : self.count] for part in (rough.starts, rough.ends, rough.valid)))
-        return _either(few, kept, concentrated(rough, weights, self.count, jitter))
+        if not may_wait(few.device):
+            return _either(few, kept, self._concentrated(rays, rough, jitter))
+        many = (~few).reshape(-1).nonzero()[:, 0]
+        found = self._concentrated(_rows(rays, many), _rows(rough, many), jitter)
+        merged = (
+            old.reshape(-1, self.count).index_copy(0, many, new).reshape(old.shape)
+            for old, new in zip(_parts(kept), _parts(found), strict=True)
+        )
+        return RaySamples(*merged)
+
+    def _concentrated(self, rays: Rays, rough: RaySamples, jitter: Generator | None) -> RaySamples:
+        length = (rough.ends - rough.starts).clamp(min=torch.finfo(rough.ends.dtype).tiny)
+        density = torch.minimum(query_samples(self.guide, rays, rough).density, LARGEST_THICKNESS / length)
+        return concentrated(rough, rendering_weights(density, rough), self.count, jitter)
+
+
+def _parts(samples: RaySamples) -> tuple[Tensor, Tensor, Tensor]:
+    return samples.starts, samples.ends, samples.valid
 
 
 def concentrated(
@@ -239,8 +263,11 @@ def inverse_transform(
 
 def _gathered(samples: RaySamples) -> RaySamples:
     """Return the samples with valid intervals first, and without the overlaps that rounding makes."""
-    order = (~samples.valid).sort(dim=-1, stable=True).indices
-    starts, ends, valid = (part.gather(-1, order) for part in (samples.starts, samples.ends, samples.valid))
+    starts, ends, valid = _parts(samples)
+    # Sorting costs more than all the rest; most samplers return the valid intervals first.
+    if not (may_wait(valid.device) and bool((valid[..., 1:] <= valid[..., :-1]).all())):
+        order = (~valid).sort(dim=-1, stable=True).indices
+        starts, ends, valid = (part.gather(-1, order) for part in (starts, ends, valid))
     following = torch.where(valid, starts, torch.inf)[..., 1:]
     following = torch.cat([following, torch.full_like(ends[..., :1], torch.inf)], dim=-1)
     return RaySamples(starts, torch.maximum(starts, torch.minimum(ends, following)), valid)

@@ -93,7 +93,7 @@ class Map:
 
     @property
     def has_distances(self) -> bool:
-        """Whether the training images showed how far things are. Where not, depth is arbitrary, and so are positions."""
+        """Whether the training images showed how far things are."""
         return self.info.distances
 
     @property
@@ -206,10 +206,7 @@ def _save_part(
 
 def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
     """Return the cameras of the training images with their ``T_world_camera`` (float64)."""
-    return [
-        (c.intrinsics, SE3.from_matrix(torch.tensor(c.T_world_camera, dtype=torch.float64)))
-        for c in info.cameras
-    ]
+    return [(c.intrinsics, c.pose) for c in info.cameras]
 
 
 def load_info(folder: Path) -> MapInfo:
@@ -235,12 +232,8 @@ def load_info(folder: Path) -> MapInfo:
     for name in (info.weights, info.training, info.surface, info.landmarks, info.capture):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
-    for camera in info.cameras:
-        for rows in (camera.T_world_camera, camera.given_T_world_camera or camera.T_world_camera):
-            if len(rows) != 4 or not bool(SE3.from_matrix(torch.tensor(rows).double()).is_rigid()):
-                raise InputError(
-                    f"{path}: pose of camera {camera.name!r} is not a rigid transform, expected 4x4 rows"
-                )
+    for name in (camera.name for camera in info.cameras if not camera.is_rigid):
+        raise InputError(f"{path}: pose of camera {name!r} is not a rigid transform, expected 4x4 rows")
     return info
 
 

@@ -404,14 +404,35 @@ def test_a_state_without_densities_is_taken_and_samples_as_it_did(field: HashGri
     assert torch.equal(samples.starts, before.starts)
 
 
-def test_samples_are_concentrated_in_contracted_scenes_only(field: HashGridField) -> None:
-    assert field.sampler is field.occupancy
+def test_a_ray_has_no_more_samples_than_the_limit_once_density_was_observed(field: HashGridField) -> None:
+    """The intervals of rays that cross few occupied cells stay what they are; those of others keep their total length."""
+    limited = backend.build(replace(field.config, samples_per_ray=12), BOUNDS)
+    for level in limited.levels:
+        assert level.sampler is level.occupancy
+    limited.occupancy.restrict(
+        torch.rand(limited.occupancy.grid.shape, generator=torch.Generator().manual_seed(0)) < 0.6
+    )
+    limited.occupancy.observe(torch.zeros(1, 3), torch.ones(1), torch.ones(1), fade=1.0)
+    rays = limited.bounds.rays(*(getattr(random_rays(), part).float() for part in ("origins", "directions")))
+    every, some = limited.occupancy(rays), limited.sampler(rays)
+    counts = every.valid.sum(-1)
+    few = counts <= 12
+    assert bool(few.any())
+    assert bool((~few).any())
+    assert torch.equal(some.valid.sum(-1), counts.clamp(max=12))
+    assert torch.equal(some.starts[few], every.starts[few][:, :12])
+    length, expected = (((s.ends - s.starts) * s.valid).sum(-1) for s in (some, every))
+    torch.testing.assert_close(length[~few], expected[~few], atol=1e-4, rtol=1e-4)
+
+
+def test_the_limit_holds_from_the_beginning_where_the_scene_is_contracted(field: HashGridField) -> None:
     opened = backend.build(
         replace(field.config, samples_per_ray=12), replace(BOUNDS, far=90.0, contracted=True)
     )
     rays = opened.bounds.rays(*(getattr(random_rays(), part).float() for part in ("origins", "directions")))
-    assert int(opened.occupancy(rays).valid.sum(-1).max()) > 12
-    assert int(opened.sampler(rays).valid.sum(-1).max()) <= 12
+    for level in opened.levels:
+        assert int(level.occupancy(rays).valid.sum(-1).max()) > 12
+        assert int(level.sampler(rays).valid.sum(-1).max()) <= 12
 
 
 def test_todays_state_is_taken_as_it_is(field: HashGridField) -> None:

@@ -224,7 +224,7 @@ def test_the_schedule_warms_up_and_then_falls_to_its_last_value() -> None:
     assert max(abs(a - b) for a, b in pairwise(factors)) <= 0.0101
 
 
-@pytest.mark.parametrize(("depth_weight", "left"), [(0.1, 0.5), (0.0, 0.7)], ids=["depth", "colour"])
+@pytest.mark.parametrize(("depth_weight", "left"), [(0.1, 0.5), (0.0, 0.8)], ids=["depth", "colour"])
 def test_loss_falls_on_a_closed_form_scene(
     depth_weight: float, left: float, scene: tuple[list[View], SceneBounds]
 ) -> None:

@@ -34,7 +34,7 @@ class FieldConfig(Settings):
     geometry_features: Count = 15
     # cells of the occupancy grid along the longest side of the scene
     grid_resolution: Annotated[int, Range(2, 1024)] = 128
-    # largest number where the scene is contracted; elsewhere, or with 0, all intervals in occupied cells
+    # largest number of intervals along a ray; with 0, all those in occupied cells
     samples_per_ray: Annotated[int, Range(0)] = 32
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 
@@ -65,19 +65,15 @@ class HashGridField(nn.Module):
             nn.Linear(config.width, 3),
             nn.Sigmoid(),
         )
-        # Samples are concentrated within steps by the density of whole cells, so that shorter steps would tell nothing more.
-        self.occupancy = OccupancyGrid(bounds, config.grid_resolution, steps_per_cell=1 if self.guided else 2)
+        # Most rays of a contracted scene have their samples concentrated by the density of whole cells, of which shorter steps
+        # would tell nothing more.
+        single = bounds.contracted and config.samples_per_ray > 0
+        self.occupancy = OccupancyGrid(bounds, config.grid_resolution, steps_per_cell=1 if single else 2)
         self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
 
     @property
-    def guided(self) -> bool:
-        """Whether samples are concentrated where the occupancy grid has observed density."""
-        return self.bounds.contracted and self.config.samples_per_ray > 0
-
-    @property
     def sampler(self) -> RaySampler:
-        grid = self.occupancy
-        return Concentrated(GridDensity(grid), self.config.samples_per_ray) if self.guided else grid
+        return limited(self.occupancy, self.config.samples_per_ray)
 
     @property
     def levels(self) -> tuple[CoarseField, HashGridField]:
@@ -122,6 +118,14 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
     return [part for a, b in pairwise(widths) for part in (nn.Linear(a, b), nn.ReLU())]
 
 
+def limited(grid: OccupancyGrid, count: int) -> RaySampler:
+    """Return a sampler of at most ``count`` intervals a ray, concentrated where the grid has observed density, or of all of them.
+
+    All are sampled with a count of 0, and by a grid that has observed nothing, as in maps that earlier versions stored.
+    """
+    return Concentrated(GridDensity(grid), count) if count and grid.observed else grid
+
+
 @dataclass(frozen=True)
 class CoarseField:
     """A hash-grid field with its coarse encoding levels only: blurred, cheaper, with gradients of wider range."""
@@ -129,8 +133,8 @@ class CoarseField:
     fine: HashGridField
 
     @property
-    def sampler(self) -> OccupancyGrid:
-        return self.fine.coarse_sampler
+    def sampler(self) -> RaySampler:
+        return limited(self.fine.coarse_sampler, self.fine.config.samples_per_ray)
 
     @property
     def occupancy(self) -> OccupancyGrid:

@@ -50,7 +50,9 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("samples_per_ray", torch.full((), float(resolution)))
         self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool))
         self.register_buffer("near_occupied", torch.ones(shape, dtype=torch.bool), persistent=False)
-        self.register_load_state_dict_post_hook(lambda module, _: module._refresh())
+        # A contracted scene is too large for equal steps from the beginning.
+        self.observed = bounds.contracted
+        self.register_load_state_dict_post_hook(lambda module, _: module._loaded())
 
     @torch.no_grad()
     def restrict(self, allowed: Bool[Tensor, "n n n"]) -> None:
@@ -67,6 +69,7 @@ class OccupancyGrid(nn.Module):
         fade: float,
     ) -> None:
         """Update peaks and densities by the rendering weights and densities at one batch's samples, ``positions`` (metres, world)."""
+        self.observed = True
         cells = self.grid.numbers(positions)
         for known, values in ((self.peak, weights), (self.density, density)):
             seen = torch.zeros_like(known).view(-1).scatter_reduce_(0, cells, values.to(known), "amax")
@@ -166,6 +169,10 @@ class OccupancyGrid(nn.Module):
             rest = (number == counts[:, None] - 1) & (far[:, None] - ends < self.step)
             ends = torch.where(rest, far[:, None], ends)
         return RaySamples(starts, ends, valid)
+
+    def _loaded(self) -> None:
+        self.observed = self.bounds.contracted or bool(self.density.any())
+        self._refresh()
 
     def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))
