@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
 from bidnerf_core.cli.common import Flag, MapFolder, UsageError, locked, option, parse, read_views, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
@@ -49,6 +50,8 @@ def _bake(
         ),
     ] = None,
     split: Annotated[str, option("NAME", "split of the dataset")] = "train",
+    camera: DatasetCamera = None,
+    register_depth: RegisterDepth = None,
     rendered_landmarks: Annotated[
         Flag, option(None, "replace landmarks of photos by landmarks of rendered images", "")
     ] = False,
@@ -63,9 +66,12 @@ def _bake(
     """
     if rendered_landmarks and data is not None:
         raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
-    background = load_info(map).bounds.background
+    background, registration = load_info(map).bounds.background, depth_registration(register_depth)
     with locked(map):
-        views = [] if data is None else read_views(open_dataset(data, background), split)
+        views = list[View]()
+        if data is not None:
+            dataset = open_dataset(data, background, camera=camera, register_depth=registration)
+            views = read_views(dataset, split)
         bake_map(map, views, config, rendered_landmarks)
 
 
