@@ -75,13 +75,14 @@ def backwards(frames: Frames) -> Run:
 
 def covered(frames: Frames) -> Run:
     """Cover the camera for 15 frames; what it takes then is dark noise."""
-    generator = torch.Generator().manual_seed(0)
-
-    def dark(frame: Frame) -> Frame:
-        noise = 0.02 + 0.01 * torch.rand(frame.rgb.shape, generator=generator)
-        return replace(frame, rgb=noise, depth=None if frame.depth is None else torch.zeros_like(frame.depth))
-
+    dark = partial(covered_frame, generator=torch.Generator().manual_seed(0))
     return changed(frames, range(FIRST, FIRST + 15), dark)
+
+
+def covered_frame(frame: Frame, generator: torch.Generator) -> Frame:
+    """Return what the camera takes with its lens covered: dark noise, and no depth."""
+    noise = 0.02 + 0.01 * torch.rand(frame.rgb.shape, generator=generator)
+    return replace(frame, rgb=noise, depth=None if frame.depth is None else torch.zeros_like(frame.depth))
 
 
 def plain_wall(frames: Frames) -> Run:
