@@ -21,7 +21,8 @@ from typing import Any
 
 import cv2
 import torch
-from tracking import RESULTS, WRONG, Frames, covered_frame, sift_milliseconds
+from tracking import RESULTS, WRONG, sift_milliseconds
+from tracking_runs import Frames, covered_frame
 
 from bidnerf_core import Localizer, Tracker, load_map
 from bidnerf_core.datasets import TimedFrame, open_sequence
