@@ -22,21 +22,26 @@ from bidnerf_core.localization.tracking.answers import (
 from bidnerf_core.localization.tracking.clock import Clock
 from bidnerf_core.localization.tracking.detection import LandmarkDetector
 from bidnerf_core.localization.tracking.flow import Grey
+from bidnerf_core.localization.tracking.judging import as_certain_as_usual, determined, precise_enough
 from bidnerf_core.localization.tracking.measuring import (
     ByLandmarks,
     Measurement,
     by_colour,
     by_shape,
     by_surface,
-    determined,
     followed,
     is_vague,
-    precise_enough,
 )
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
 from bidnerf_core.localization.tracking.odometry import Odometry
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints
-from bidnerf_core.localization.tracking.relocalization import has_points, relocalized, uses_landmarks
+from bidnerf_core.localization.tracking.relocalization import (
+    has_points,
+    relocalized,
+    scene_extent,
+    typical_error,
+    uses_landmarks,
+)
 from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
 from bidnerf_core.mapping import SurfaceMap
@@ -150,14 +155,8 @@ class Tracker:
         if measured is not None and measured.verdict.accepted:
             return self._accepted(frame, image, measured, predicted)
         if state.lost or is_vague(predicted, frame.intrinsics):
-            found = relocalized(
-                self.localizer,
-                frame,
-                predicted.T_world_camera,
-                state.searchable,
-                self.config.patience,
-                state.frames,
-            )
+            T, lost, patience = predicted.T_world_camera, state.searchable, self.config.patience
+            found = relocalized(self.localizer, frame, T, lost, patience, state.frames)
             if found is not None and found.converged:
                 return self._found(frame, image, state, found)
         state = self._adrift(frame, image, state, points, predicted)
@@ -181,6 +180,7 @@ class Tracker:
             return tracked_localization(predicted, verdict, predicted, found.loss), state
         motion = predicted.refined(found.pose)
         verdict = precise_enough(found.verdict, motion.covariance, self._reach(frame))
+        verdict = as_certain_as_usual(verdict, motion.covariance, typical_error(self.localizer))
         state = replace(state, motion=motion, lost=0 if verdict.accepted else state.lost + 1)
         return tracked_localization(motion, verdict, predicted, found.loss), state
 
@@ -242,8 +242,7 @@ class Tracker:
             points=FollowedPoints.none(),
             window=(),
             motion=motion,
-            focal_factor=state.focal_factor
-            * found.focal_factor,  # other than 1 for approximate focal lengths
+            focal_factor=state.focal_factor * found.focal_factor,  # not 1 for approximate focal lengths
         )
         frame = with_focal_factor(frame, found.focal_factor)
         measured = self._measured(frame, image, state, state.points, motion)
@@ -275,11 +274,7 @@ class Tracker:
     @property
     def _extent(self) -> float:
         """The size of the scene (metres)."""
-        scene = self.localizer.map
-        if scene.surface is not None:
-            return scene.surface.extent
-        corners = torch.tensor([scene.bounds.lower, scene.bounds.upper])
-        return float(torch.linalg.vector_norm(corners[1] - corners[0]))
+        return scene_extent(self.localizer.map)
 
     def _reach(
         self, frame: Frame, points: FollowedPoints | None = None, T_world_camera: SE3 | None = None

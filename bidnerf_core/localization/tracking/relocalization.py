@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 
+import torch
+
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import FLAT
 from bidnerf_core.localization.auto import LEAST_POINTS, MANY_LANDMARKS, AutoConfig
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.localizer import Localizer
-from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.se3 import SE3
 
@@ -54,6 +56,19 @@ def uses_landmarks(localizer: Localizer) -> bool:
     """Return whether the map has landmarks and the method of the localizer makes use of them."""
     config = localizer.config
     return localizer.matcher is not None and isinstance(config, AutoConfig) and config.landmarks
+
+
+def typical_error(localizer: Localizer) -> float:
+    """Return the median error (metres) of positions of the map's own images, 0 where it is not known."""
+    return 0.0 if localizer.matcher is None else localizer.matcher.landmarks.trial.translation
+
+
+def scene_extent(scene: SceneMap) -> float:
+    """Return the size of the scene (metres)."""
+    if scene.surface is not None:
+        return scene.surface.extent
+    corners = torch.tensor([scene.bounds.lower, scene.bounds.upper])
+    return float(torch.linalg.vector_norm(corners[1] - corners[0]))
 
 
 def has_points(frame: Frame) -> bool:
