@@ -9,7 +9,12 @@ import torch
 
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.tracking.alignment import measured_cloud
-from bidnerf_core.localization.tracking.judging import as_certain_as_usual, not_by_chance, precise_enough
+from bidnerf_core.localization.tracking.judging import (
+    as_certain_as_usual,
+    not_by_chance,
+    precise_enough,
+    shape_verdict,
+)
 from flights import flight_frame, without_depth
 
 ACCEPTED = Verdict(Outcome.CONVERGED, "30 landmarks agree")
@@ -68,3 +73,11 @@ def test_sparse_depth_is_used_whole() -> None:
     cloud = measured_cloud(replace(frame, depth=depth), 200, 1.0, torch.Generator().manual_seed(0))
     assert len(cloud) == 20
     torch.testing.assert_close(cloud.points[:, 2], torch.full((20,), 1.5))
+
+
+def test_a_shape_without_a_time_is_not_accepted() -> None:
+    small = covariance(1e-3)
+    assert shape_verdict(ACCEPTED, small, 1.0, 0.01, stamped=True) is ACCEPTED
+    assert "time stamp" in shape_verdict(ACCEPTED, small, 1.0, 0.01, stamped=False).reason
+    assert shape_verdict(ACCEPTED, covariance(0.05), 1.0, 1.0, stamped=True).outcome is Outcome.IMPRECISE
+    assert shape_verdict(ACCEPTED, covariance(0.02), 1.0, 0.004, stamped=True).outcome is Outcome.IMPRECISE

@@ -56,3 +56,17 @@ def as_certain_as_usual(verdict: Verdict, covariance: Float[Tensor, "6 6"], typi
         return verdict
     why = f"but the position is uncertain by {deviation:.3g} m, that of images by {typical:.3g} m"
     return Verdict(Outcome.IMPRECISE, f"{verdict.reason}, {why}")
+
+
+def shape_verdict(
+    verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float, typical: float, stamped: bool
+) -> Verdict:
+    """Judge a pose by depth without colours, of which the motion before it is a part.
+
+    Without a time stamp, nothing says how far the camera has moved along what the shape leaves open.
+    """
+    if verdict.accepted and not stamped:
+        return Verdict(
+            Outcome.IMPRECISE, f"{verdict.reason}, but without a time stamp the motion is not known"
+        )
+    return as_certain_as_usual(precise_enough(verdict, covariance, distance), covariance, typical)

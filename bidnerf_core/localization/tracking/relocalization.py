@@ -18,22 +18,31 @@ from bidnerf_core.se3 import SE3
 
 FIRST_FULL_SEARCH = 4
 """The number of lost frames after which the whole surface is searched; then again whenever that number has doubled."""
+LONG_WAIT = 0.25
+"""Seconds without a search after which every frame is searched: such frames come slowly enough."""
 
 
 def relocalized(
-    localizer: Localizer, frame: Frame, predicted: SE3 | None, lost: int, patience: int, seed: int
+    localizer: Localizer,
+    frame: Frame,
+    predicted: SE3 | None,
+    lost: int,
+    patience: int,
+    seed: int,
+    waited: float = 0.0,
 ) -> Localization | None:
     """Return what a search for the pose gives, or None in frames that are left out to save time.
 
-    Where the map has landmarks, they are sought in the first ``patience`` frames after a loss and then in every second. The
-    search of the whole surface, which takes longer, comes at growing intervals; it is the only one in maps without
-    landmarks. ``lost`` is the number of frames since the last accepted pose, 0 at the beginning of a sequence.
+    Where the map has landmarks, they are sought in the first ``patience`` frames after a loss and then in every second, or
+    in every frame where ``waited``, the time (seconds) without a search, is long. The search of the whole surface, which takes
+    longer, comes at growing intervals; it is the only one in maps without landmarks. ``lost`` is the number of frames since
+    the last accepted pose that could be searched, 0 at the beginning of a sequence.
     """
-    if is_blank(frame) and not has_points(frame):
+    if not is_searchable(frame):
         return None
     if uses_landmarks(localizer):
         assert localizer.matcher is not None
-        if lost > patience and lost % 2:
+        if lost > patience and lost % 2 and waited < LONG_WAIT:
             return None
         began = time.perf_counter()
         problem = rig(localizer.map, [View(frame, SE3.identity())], None, None, localizer.matcher)
@@ -69,6 +78,11 @@ def scene_extent(scene: SceneMap) -> float:
         return scene.surface.extent
     corners = torch.tensor([scene.bounds.lower, scene.bounds.upper])
     return float(torch.linalg.vector_norm(corners[1] - corners[0]))
+
+
+def is_searchable(frame: Frame) -> bool:
+    """Return whether the frame shows anything that can be recognised."""
+    return has_points(frame) or not is_blank(frame)
 
 
 def has_points(frame: Frame) -> bool:
