@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
-from bidnerf_core.datasets.depth_registration import register_depth
+from bidnerf_core.datasets.depth_registration import DepthSensor, register_depth
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH, SevenScenesReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.se3 import SE3
@@ -83,7 +83,7 @@ def wrong_share(dataset: Dataset) -> float:
 def test_registered_depth_lies_under_its_colours(scene: Path) -> None:
     registered = open_dataset(scene)
     assert wrong_share(registered) < 0.005
-    assert wrong_share(open_dataset(scene, readers=[SevenScenesReader(register_depth=False)])) > 0.03
+    assert wrong_share(open_dataset(scene, register_depth=False)) > 0.03
     for view in registered.views("test"):
         depth = view.frame.depth
         assert depth is not None
@@ -95,7 +95,7 @@ def test_registered_depth_lies_under_its_colours(scene: Path) -> None:
 
 
 def test_without_registration_everything_is_as_stored(scene: Path) -> None:
-    dataset = open_dataset(scene, readers=[SevenScenesReader(register_depth=False)])
+    dataset = open_dataset(scene, register_depth=False)
     for number, view in enumerate(dataset.views("test")):
         assert view.frame.intrinsics == DEPTH
         torch.testing.assert_close(view.T_ref_camera.matrix(), pose_of(number).matrix(), atol=1e-9, rtol=0)
@@ -155,7 +155,7 @@ def test_a_rendered_room_is_that_of_transforms_json(data_dir: Path, tmp_path: Pa
         iio.imwrite(f"{stem}.color.png", (view.frame.rgb.numpy() * 255).round().astype(np.uint8))
         iio.imwrite(f"{stem}.depth.png", (view.frame.depth.numpy() * 1000).round().astype(np.uint16))
         np.savetxt(f"{stem}.pose.txt", view.T_ref_camera.matrix().numpy(), fmt="%.17g")
-    reader = SevenScenesReader(register_depth=False, camera=expected[0].frame.intrinsics)
+    reader = SevenScenesReader(sensor=None, camera=expected[0].frame.intrinsics)
     for timed, view in zip(open_sequence(folder, readers=[reader]), expected, strict=True):
         assert timed.frame.intrinsics == view.frame.intrinsics
         assert torch.equal(timed.frame.rgb, view.frame.rgb)
@@ -216,7 +216,22 @@ def test_broken_split_files_name_the_line(text: str, message: str, scene: Path) 
 def test_depth_of_another_size_is_refused(scene: Path) -> None:
     iio.imwrite(scene / "seq-02" / "frame-000000.depth.png", np.ones((6, 8), np.uint16))
     with pytest.raises(InputError, match=r"frame-000000\.depth\.png: depth is 8x6, expected 160x120"):
+        open_dataset(scene, register_depth=False).views("test")
+    iio.imwrite(scene / "seq-02" / "frame-000000.depth.png", np.ones((8, 8), np.uint16))
+    with pytest.raises(
+        InputError, match=r"frame-000000\.depth\.png: depth is 8x8, expected the aspect ratio"
+    ):
         open_dataset(scene).views("test")
+
+
+def test_another_calibration_moves_depth_and_poses(scene: Path) -> None:
+    """A sensor at the colour camera's place: depth and poses are then those of the files."""
+    same = DepthSensor(COLOUR_CAMERA, SE3.identity())
+    found = open_dataset(scene, camera=COLOUR_CAMERA, register_depth=same).views("test")
+    stored = open_dataset(scene, camera=COLOUR_CAMERA, register_depth=False).views("test")
+    for view, other in zip(found, stored, strict=True):
+        assert torch.equal(view.T_ref_camera.matrix(), other.T_ref_camera.matrix())
+        torch.testing.assert_close(view.frame.depth, other.frame.depth)
 
 
 def test_registration_hides_what_lies_behind() -> None:

@@ -81,6 +81,28 @@ def test_a_covered_camera_is_reported_at_once_and_the_way_is_found_again(depth: 
     assert tracker.tracking
 
 
+@pytest.mark.parametrize("count", [4, 5])
+def test_frames_that_show_nothing_do_not_delay_the_search(count: int) -> None:
+    tracker = Tracker(localizer())
+    frames = [(t, covered(f) if 3 <= i < 3 + count else f, T) for i, (t, f, T) in enumerate(flight())]
+    answers = tracked(frames[: 4 + count], tracker)
+    assert [answer.converged for answer in answers[3:]] == [False] * count + [True]
+
+
+@pytest.mark.parametrize("count", [4, 5])
+def test_frames_that_come_slowly_are_all_searched(count: int) -> None:
+    """Lost for more frames than are all searched, by images of another place."""
+    generator = torch.Generator().manual_seed(0)
+    tracker, frames = Tracker(localizer(), TrackerConfig(patience=1)), flight()
+    slow = [(0.5 * i, f, T) for i, (_, f, T) in enumerate(frames)]
+    elsewhere = [
+        (t, replace(without_depth(f), rgb=torch.rand(f.rgb.shape, generator=generator)), T)
+        for t, f, T in slow[2 : 2 + count]
+    ]
+    answers = tracked([*slow[:2], *elsewhere, *slow[2 + count : 3 + count]], tracker)
+    assert [answer.converged for answer in answers[2:]] == [False] * count + [True]
+
+
 def test_a_camera_that_is_carried_elsewhere_is_lost_and_found() -> None:
     """The motion cannot be foreseen, so no answer may follow the prediction."""
     elsewhere = [

@@ -173,3 +173,14 @@ def test_a_pose_that_is_fused_already_corrects_the_velocity_as_the_measurement_w
     again = predicted.refined(pose)
     assert torch.allclose(again.velocity, direct.velocity, atol=1e-6)
     assert torch.allclose(again.noise, direct.noise, atol=1e-8)
+
+
+def test_a_way_of_unknown_duration_is_uncertain_by_its_length() -> None:
+    motion = Motion.at(smooth(0.0), 1.0).moved(path(0.1), covariance(1e-3), 0.1)
+    known, unknown = motion.predicted(0.1), motion.predicted(0.1, stamped=False)
+    added = (unknown.noise - known.noise).diagonal()
+    way = motion.velocity[:3].norm() * 0.1
+    turn = motion.velocity[3:].norm() * 0.1
+    expected = torch.cat([(0.5 * way).expand(3), (0.5 * turn).expand(3), torch.zeros(6).double()]) ** 2
+    assert torch.allclose(added, expected)
+    assert torch.equal(unknown.T_world_camera.matrix(), known.T_world_camera.matrix())

@@ -141,10 +141,18 @@ def test_a_camera_that_is_given_goes_first(folder: Path, tmp_path: Path) -> None
     assert open_dataset(folder, camera=file).views("test")[0].frame.intrinsics == other
 
 
+@pytest.mark.parametrize(("name", "sensor"), [("freiburg1", "1"), ("fr2", "2"), ("freiburg3", "3")])
+def test_a_camera_may_be_given_by_the_sensors_name(name: str, sensor: str, folder: Path) -> None:
+    expected = CAMERAS[sensor].resized(16, 12)
+    assert next(iter(open_sequence(folder, camera=name))).frame.intrinsics == expected
+    assert open_dataset(folder, camera=Path(name)).views("test")[0].frame.intrinsics == expected
+
+
 def test_an_unknown_sensor_names_the_ways_to_a_camera(folder: Path) -> None:
     (folder / "camera.json").unlink()
     with pytest.raises(
-        InputError, match=r"freiburg1.*camera\.json or cameras\.txt in the folder, or camera="
+        InputError,
+        match=r"freiburg1.*camera\.json or cameras\.txt in the folder, or --camera with one of freiburg1, ",
     ):
         open_dataset(folder)
 

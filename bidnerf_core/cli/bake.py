@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
 from bidnerf_core.cli.common import Flag, MapFolder, UsageError, locked, option, parse, read_views, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
@@ -50,6 +51,8 @@ def _bake(
         ),
     ] = None,
     split: Annotated[str, option("NAME", "split of the dataset")] = "train",
+    camera: DatasetCamera = None,
+    register_depth: RegisterDepth = None,
     rendered_landmarks: Annotated[
         Flag, option(None, "replace landmarks of photos by landmarks of rendered images", "")
     ] = False,
@@ -64,10 +67,12 @@ def _bake(
     """
     if rendered_landmarks and data is not None:
         raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
-    info = load_info(map)
+    info, registration = load_info(map), depth_registration(register_depth)
     with locked(map):
-        views = [] if data is None else read_views(open_dataset(data, info.bounds.background), split)
-        views = at_stored_poses(views, info.cameras)
+        views = list[View]()
+        if data is not None:
+            dataset = open_dataset(data, info.bounds.background, camera=camera, register_depth=registration)
+            views = at_stored_poses(read_views(dataset, split), info.cameras)
         bake_map(map, views, config, rendered_landmarks)
 
 

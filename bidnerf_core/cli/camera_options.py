@@ -1,4 +1,4 @@
-"""The options that give the camera of images which have none in their format; at most one of them may be given."""
+"""The options that give the cameras of images which have none in their format."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from typing import Annotated
 import tyro
 
 from bidnerf_core.cli.common import option
+from bidnerf_core.datasets import DepthRegistration
+
+NO = "no"
+"""The value of ``--register-depth`` that takes depth as it is."""
 
 one_camera = tyro.conf.create_mutex_group(
     required=False, title="the camera of images that have none in their format (default: as EXIF has it)"
@@ -15,7 +19,12 @@ one_camera = tyro.conf.create_mutex_group(
 CameraFile = Annotated[
     Path | None,
     one_camera,
-    option("CAMERA.json", "file with intrinsics: transforms.json, cameras.json, COLMAP's cameras.txt", ""),
+    option(
+        "CAMERA.json",
+        "file with intrinsics: transforms.json, cameras.json, COLMAP's cameras.txt; of a folder of TUM RGB-D also freiburg1,"
+        " freiburg2 or freiburg3",
+        "",
+    ),
 ]
 FocalLength = Annotated[
     float | None, one_camera, option("PX", "focal length in pixels of the image file", "")
@@ -23,3 +32,26 @@ FocalLength = Annotated[
 FieldOfView = Annotated[
     float | None, one_camera, option("DEG", "horizontal field of view of the upright image", "")
 ]
+DatasetCamera = Annotated[
+    Path | None,
+    option(
+        "CAMERA.json",
+        "camera of a dataset in whose files there is none (TUM RGB-D: freiburg1, freiburg2, freiburg3, or a file; 7-Scenes:"
+        " a file)",
+        "as the folder has it",
+    ),
+]
+RegisterDepth = Annotated[
+    str | None,
+    option(
+        "SENSOR.json",
+        "file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour"
+        " images; 'no' where it belongs to them already",
+        "as the format has it",
+    ),
+]
+
+
+def depth_registration(given: str | None) -> DepthRegistration | None:
+    """Return what ``--register-depth`` says."""
+    return None if given is None else False if given == NO else Path(given)

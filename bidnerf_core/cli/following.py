@@ -59,10 +59,7 @@ class FrameRequest:
 
     def read(self, camera: GivenCamera, background: Background) -> Frame:
         """Read the image and its depth. Raises ``InputError`` where they are not readable or the camera is not known."""
-        return Frame.open(
-            self.image, depth=self.depth, depth_unit=self.depth_unit, camera=camera.camera, focal=camera.focal,
-            hfov=camera.hfov, background=background,
-        )  # fmt: skip
+        return camera.read(self.image, self.depth, self.depth_unit, background)
 
 
 def requests(source: str) -> Iterator[FrameRequest | InputError]:

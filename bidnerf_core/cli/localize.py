@@ -8,7 +8,13 @@ from typing import Annotated, Any
 import tyro
 
 from bidnerf_core.cli.answers import Answer, Answers, OutputSpec
-from bidnerf_core.cli.camera_options import CameraFile, FieldOfView, FocalLength
+from bidnerf_core.cli.camera_options import (
+    CameraFile,
+    FieldOfView,
+    FocalLength,
+    RegisterDepth,
+    depth_registration,
+)
 from bidnerf_core.cli.common import (
     LARGEST_SEED,
     Flag,
@@ -64,6 +70,7 @@ def run(arguments: list[str]) -> None:
             float | None,
             option("METRES", "length of one unit of --depth", "0.001 for integers, 1 for floats"),
         ] = None,
+        register_depth: RegisterDepth = None,
         frame: Annotated[
             Names,
             option("NAME...", "frames of a dataset, together as a rig", "each of the split, on its own"),
@@ -118,7 +125,7 @@ def run(arguments: list[str]) -> None:
         require("--seed", seed, 0, LARGEST_SEED)
         if frame and not any(frame):
             raise UsageError("--frame names no frame, expected the stem of an image file")
-        photos = PhotoOptions(depth, camera, focal, hfov, depth_unit)
+        photos = PhotoOptions(depth, camera, focal, hfov, depth_unit, depth_registration(register_depth))
         frames = FrameOptions(split, tuple(name for group in frame for name in group), window)
         output = OutputSpec(out, draw, json)
         begin = StartSpec(None if start is None else read_pose(start), perturb)

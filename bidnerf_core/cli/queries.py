@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from bidnerf_core.cli.common import UsageError, read_views, require, require_different, say
-from bidnerf_core.datasets import READERS, Dataset, open_dataset
+from bidnerf_core.datasets import READERS, Dataset, DepthRegistration, given_sensor, open_dataset
 from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.errors import InputError, InputWarning
@@ -62,12 +63,13 @@ class PhotoOptions:
     focal: float | None = None  # pixels of the image file
     hfov: float | None = None  # degrees
     depth_unit: float | None = None  # metres a step
+    registration: DepthRegistration | None = None
 
     @property
-    def given(self) -> list[str]:
-        """The options that were given, as they are written."""
-        values = {"--depth": self.depth or None, "--camera": self.camera, "--focal": self.focal,
-                  "--hfov": self.hfov, "--depth-unit": self.depth_unit}  # fmt: skip
+    def for_photos(self) -> list[str]:
+        """The options given that datasets do not have, as they are written."""
+        values = {"--depth": self.depth or None, "--focal": self.focal, "--hfov": self.hfov,
+                  "--depth-unit": self.depth_unit}  # fmt: skip
         return [option for option, value in values.items() if value is not None]
 
 
@@ -120,6 +122,8 @@ class Photos:
         self._files, self._options, self._background, self._points = files, options, background, points
         self._names = unique_names([(*file.parts[:-1], file.stem) for file in files])
         self._depth = _depth_files(files, options.depth)
+        sensor = given_sensor("--register-depth", options.registration)
+        self._camera = GivenCamera(options.camera, options.focal, options.hfov, sensor)
         self._remarks: set[str] = set()
 
     @property
@@ -130,10 +134,7 @@ class Photos:
         file, options = self._files[place], self._options
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", InputWarning)
-            frame = Frame.open(
-                file, depth=self._depth.get(file), camera=options.camera, focal=options.focal,
-                hfov=options.hfov, depth_unit=options.depth_unit, background=self._background,
-            )  # fmt: skip
+            frame = self._camera.read(file, self._depth.get(file), options.depth_unit, self._background)
         name = self._names[place]
         for warning in caught:
             self._remark(name, str(warning.message).partition(": ")[2] or str(warning.message))
@@ -210,12 +211,13 @@ def _dataset(
 ) -> QuerySource:  # fmt: skip
     if len(paths) > 1:
         raise UsageError(f"{len(paths)} queries with a dataset among them, expected the dataset alone")
-    if photos.given:
+    if photos.for_photos:
         raise UsageError(
-            f"{photos.given[0]} is for photos, but {paths[0]} is a dataset, which has its own; to take its images as"
+            f"{photos.for_photos[0]} is for photos, but {paths[0]} is a dataset, which has its own; to take its images as"
             " photos, name the files"
         )
-    source = DatasetFrames(open_dataset(paths[0], background), frames, points)
+    dataset = open_dataset(paths[0], background, camera=photos.camera, register_depth=photos.registration)
+    source = DatasetFrames(dataset, frames, points)
     if points is not None and points.sparse is None and len(source.names) > 1:
         raise UsageError(
             f"{points.path}: points of one camera, but {len(source.names)} frames; name one by --frame"

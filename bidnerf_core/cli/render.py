@@ -13,6 +13,7 @@ import torch
 from kornia.metrics import psnr
 from rich.text import Text
 
+from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
 from bidnerf_core.cli.common import (
     DataFolder,
     Flag,
@@ -48,6 +49,8 @@ def _render(
     out: Annotated[Path, option("DIR", "folder for the images")],
     split: Annotated[str, option("NAME", "split of the dataset")] = "test",
     frame: Annotated[Names, option("NAME...", "render only these frames", "all of the split")] = (),
+    camera: DatasetCamera = None,
+    register_depth: RegisterDepth = None,
     level: Annotated[
         int | None, option("N", "level of detail, 0 the coarsest", "the field itself, the finest")
     ] = None,
@@ -62,7 +65,9 @@ def _render(
         stored = load_map(map)
         field = stored.field if level is None else _level(stored, level, map)
         names = [name for group in frame for name in group]
-        views = read_views(open_dataset(data, stored.bounds.background), split, names or None)
+        registration = depth_registration(register_depth)
+        dataset = open_dataset(data, stored.bounds.background, camera=camera, register_depth=registration)
+        views = read_views(dataset, split, names or None)
         _check_file_names([view.frame.name for view in views])
         _render_views(field, stored.bounds, views, out)
 

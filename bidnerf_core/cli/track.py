@@ -11,7 +11,13 @@ from typing import Annotated
 
 import tyro
 
-from bidnerf_core.cli.camera_options import CameraFile, FieldOfView, FocalLength
+from bidnerf_core.cli.camera_options import (
+    CameraFile,
+    FieldOfView,
+    FocalLength,
+    RegisterDepth,
+    depth_registration,
+)
 from bidnerf_core.cli.common import (
     Flag,
     MapFolder,
@@ -28,7 +34,7 @@ from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.cli.tracked_path import TrackedPath, check_out
 from bidnerf_core.cli.tracking_video import TrackingVideo, check_video
-from bidnerf_core.datasets import open_sequence
+from bidnerf_core.datasets import FrameSequence, given_sensor, open_sequence
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.plot_style import require_matplotlib
@@ -67,6 +73,7 @@ def run(arguments: list[str]) -> None:
         camera: CameraFile = None,
         focal: FocalLength = None,
         hfov: FieldOfView = None,
+        register_depth: RegisterDepth = None,
         depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
         every: Annotated[int, option("N", "take every Nth frame only")] = 1,
         start: Annotated[
@@ -96,7 +103,9 @@ def run(arguments: list[str]) -> None:
             require_matplotlib()
         if video is not None:
             check_video(video)
-        given = GivenCamera(camera, focal, hfov)
+        given, registration = GivenCamera(camera, focal, hfov), depth_registration(register_depth)
+        if follow:
+            given = replace(given, sensor=given_sensor(sequence, registration))
         begin = None if start is None else read_pose(start)
         stored = load_map(map)
         path = TrackedPath(stored.info.backend)
@@ -109,7 +118,11 @@ def run(arguments: list[str]) -> None:
                 if follow:
                     _follow(str(sequence), step, given, stored.bounds.background)
                 else:
-                    _track(sequence, step, given, every, stored.bounds.background)
+                    frames = open_sequence(
+                        sequence, camera=camera, focal=focal, hfov=hfov, background=stored.bounds.background,
+                        register_depth=registration,
+                    )  # fmt: skip
+                    _track(frames, step, every)
         finally:  # Ctrl-C included: what there is, is written whole
             seconds = clocks.perf_counter() - began
             if out is not None and path.frames:
@@ -144,12 +157,7 @@ class _Step:
         return found
 
 
-def _track(
-    source: Path, step: _Step, camera: GivenCamera, every: int, background: tuple[float, float, float]
-) -> None:
-    frames = open_sequence(
-        source, camera=camera.camera, focal=camera.focal, hfov=camera.hfov, background=background
-    )
+def _track(frames: FrameSequence, step: _Step, every: int) -> None:
     total = -(-len(frames) // every)
     with counted("tracking", "frames", total) as report:
         for number, timed in enumerate(frames):

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from bidnerf_core.backend import Backend
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.cli.bake import bake_map
+from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
 from bidnerf_core.cli.common import (
     DEFAULT_BACKEND,
     DataFolder,
@@ -26,7 +27,7 @@ from bidnerf_core.cli.common import (
 )
 from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
 from bidnerf_core.cli.training_views import Refinement, located, prepared
-from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.datasets import Background, Dataset, DepthRegistration, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
@@ -49,6 +50,11 @@ class Source:
     background: str | None
     depth_points: Path | None  # folder of a COLMAP model
     choice: SparseChoice
+    camera: Path | None = None
+    registration: DepthRegistration | None = None
+
+    def dataset(self, background: Background | None) -> Dataset:
+        return open_dataset(self.data, background, camera=self.camera, register_depth=self.registration)
 
     def views(self, dataset: Dataset) -> tuple[list[View], int]:
         """Return the views of the split, and how many pixels of them have their depth from points."""
@@ -82,6 +88,8 @@ def run(arguments: list[str]) -> None:
         out: Annotated[Path, option("MAP", "folder for the map")],
         backend: Annotated[str, option("NAME", "one of 'bidnerf backends'")] = DEFAULT_BACKEND,
         split: Annotated[str, option("NAME", "split of the dataset to train on")] = "train",
+        camera: DatasetCamera = None,
+        register_depth: RegisterDepth = None,
         background: Annotated[
             str | None,
             option("COLOUR", "colour behind images with alpha: white or black", "as the dataset has it"),
@@ -123,7 +131,8 @@ def run(arguments: list[str]) -> None:
         if background is not None:
             with wrong_usage():
                 background_colour(background)
-        source = Source(data, split, background, depth_points, model_points)
+        registration = depth_registration(register_depth)
+        source = Source(data, split, background, depth_points, model_points, camera, registration)
         try:
             if resume:
                 info = load_interrupted(out, not no_bake)
@@ -203,7 +212,7 @@ def _start(
     backend: Backend, name: str, source: Source, out: Path, config: Any, checkpoint_seconds: float, baked: bool,
     refinement: Refinement,
 ) -> None:  # fmt: skip
-    dataset = open_dataset(source.data, source.background)
+    dataset = source.dataset(source.background)
     views, sparse_depth = source.views(dataset)
     if not any(view.frame.has_depth for view in views):
         say(f"{source.data}: no measured depth in split {source.split!r}; training on colour only")
@@ -217,7 +226,7 @@ def _resume(
     info: MapInfo, source: Source, out: Path, checkpoint_seconds: float, baked: bool
 ) -> None:  # fmt: skip
     data, split, background = source.data, source.split, source.background
-    dataset = open_dataset(data, info.bounds.background if background is None else background)
+    dataset = source.dataset(info.bounds.background if background is None else background)
     if dataset.background != info.bounds.background:
         raise UsageError(f"{out}: was begun over background {info.bounds.background}, got {background!r}")
     views, sparse_depth = source.views(dataset)

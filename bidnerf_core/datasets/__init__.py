@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.colmap_project import ColmapReader
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
+from bidnerf_core.datasets.depth_registration import DepthSensor
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.image_folders import open_images
 from bidnerf_core.datasets.scanner_app import ScannerAppReader
@@ -32,6 +34,9 @@ __all__ = [
     "Background",
     "CameraReader",
     "Dataset",
+    "DepthRegistration",
+    "DepthSensor",
+    "DepthSensorReader",
     "FileSequence",
     "FrameSequence",
     "Reader",
@@ -39,6 +44,7 @@ __all__ = [
     "SequenceEntry",
     "SequenceReader",
     "TimedFrame",
+    "given_sensor",
     "open_dataset",
     "open_sequence",
     "write_transforms",
@@ -78,6 +84,21 @@ class CameraReader(Protocol):
     def with_camera(self, camera: Intrinsics | Path) -> Reader: ...
 
 
+@runtime_checkable
+class DepthSensorReader(Protocol):
+    """A reader whose format may have depth that is not registered to its colour images."""
+
+    @property
+    def sensor(self) -> DepthSensor | None:
+        """The sensor from which depth is registered, unless another is given."""
+        ...
+
+    def with_depth_sensor(self, sensor: DepthSensor | None) -> Reader: ...
+
+
+DepthRegistration: TypeAlias = bool | DepthSensor | str | Path
+"""How depth is registered to colour images: by a sensor or a file of one, by that of the format (True), or not (False)."""
+
 READERS: list[Reader] = [
     TransformsReader(),
     ScannerAppReader(),
@@ -93,13 +114,15 @@ def open_dataset(
     background: Background | None = None,
     readers: Sequence[Reader] | None = None,
     camera: Intrinsics | str | Path | None = None,
+    register_depth: DepthRegistration | None = None,
 ) -> Dataset:
     """Open the dataset in the folder ``path``. Descriptions are read and checked now, images when views are requested.
 
     ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. The default is
     white where the images have one, as is the convention of NeRF-Synthetic, and black otherwise. ``camera`` (intrinsics or
-    a file of them) is for formats without a camera of their own, such as TUM RGB-D. Raises ``InputError`` where there is no
-    such folder, where no reader recognises it, and where a description is not usable.
+    a file of them) is for formats without a camera of their own, such as TUM RGB-D. ``register_depth`` says whether depth is
+    moved to the colour camera, and from which sensor; by default as is usual for the format. Raises ``InputError`` where there
+    is no such folder, where no reader recognises it, and where a description is not usable.
     """
     folder = Path(path)
     if not folder.exists():
@@ -111,7 +134,8 @@ def open_dataset(
     if reader is None:
         expected = " or ".join(reader.expected for reader in readers)
         raise InputError(f"{folder}: no dataset found, expected {expected}")
-    return _with_camera(reader, folder, GivenCamera(camera)).open(folder, background)
+    reader = _with_sensor(_with_camera(reader, folder, GivenCamera(camera)), folder, register_depth)
+    return reader.open(folder, background)
 
 
 def open_sequence(
@@ -122,13 +146,14 @@ def open_sequence(
     hfov: float | None = None,
     background: Background | None = None,
     readers: Sequence[Reader] | None = None,
+    register_depth: DepthRegistration | None = None,
 ) -> FrameSequence:
     """Open the frames of ``path`` in the order of time: a dataset, a folder of images, or a video. None is read yet.
 
     Images and videos have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in
     ``Frame.open``; images without them that of their EXIF. Datasets have their own, but for those of which ``open_dataset``
-    takes one. Raises ``InputError`` where nothing is found, where a description is not usable, and for a camera that is
-    missing or one too many.
+    takes one. ``register_depth`` is as in ``open_dataset``; depth beside images is registered where a sensor is given. Raises
+    ``InputError`` where nothing is found, where a description is not usable, and for a camera that is missing or one too many.
     """
     place, given = Path(path), GivenCamera(camera, focal, hfov)
     if not place.exists():
@@ -138,14 +163,42 @@ def open_sequence(
             raise InputError(
                 f"{place}: is a file, expected a video ({', '.join(VIDEO_SUFFIXES)}) or a folder"
             )
+        if register_depth is not None:
+            raise InputError(f"{place}: is a video, which has no depth to register")
         return open_video(place, given)
     reader = _reader_of(place, READERS if readers is None else readers)
     if reader is None:
-        return open_images(place, given, background)
-    reader = _with_camera(reader, place, given)
+        return open_images(place, replace(given, sensor=given_sensor(place, register_depth)), background)
+    reader = _with_sensor(_with_camera(reader, place, given), place, register_depth)
     if isinstance(reader, SequenceReader):
         return reader.open_sequence(place, background)
     return sequence_of(reader.open(place, background))
+
+
+def given_sensor(place: Path | str, register: DepthRegistration | None) -> DepthSensor | None:
+    """Return the sensor from which depth is registered, None where it is taken as it is.
+
+    Raises ``InputError``, which begins with ``place``, for that of a format which has none, and as ``DepthSensor.read``.
+    """
+    if register is True:
+        raise InputError(
+            f"{place}: has no depth sensor that is known, expected a file of one (register_depth=)"
+        )
+    if register is None or register is False:
+        return None
+    return register if isinstance(register, DepthSensor) else DepthSensor.read(Path(register))
+
+
+def _with_sensor(reader: Reader, folder: Path, register: DepthRegistration | None) -> Reader:
+    if register is None or (register is False and not isinstance(reader, DepthSensorReader)):
+        return reader
+    if not isinstance(reader, DepthSensorReader):
+        raise InputError(
+            f"{folder}: is a dataset whose depth belongs to its images, expected no registration"
+        )
+    if register is True and reader.sensor is not None:
+        return reader
+    return reader.with_depth_sensor(given_sensor(folder, register))
 
 
 def _reader_of(folder: Path, readers: Sequence[Reader]) -> Reader | None:

@@ -2,12 +2,68 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera_sources import Raster, read_camera
+from bidnerf_core.datasets.poses import rigid_of_rows
+from bidnerf_core.errors import InputError
+from bidnerf_core.images import resampled
+from bidnerf_core.orientation import UPRIGHT
+from bidnerf_core.records import read_record
 from bidnerf_core.se3 import SE3
+
+EXTRINSICS = "T_colour_depth"
+"""The key of the 4x4 matrix (metres, OpenCV axes) beside the intrinsics in a file of a depth sensor."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSensor:
+    """A depth camera beside a colour camera whose images its depth is to be registered to."""
+
+    camera: Intrinsics
+    T_colour_depth: SE3  # metres, OpenCV axes
+
+    @staticmethod
+    def read(path: Path) -> DepthSensor:
+        """Read a JSON file with the intrinsics as in ``transforms.json``, with ``w`` and ``h``, and ``T_colour_depth`` (4x4).
+
+        Raises ``InputError`` where one of them is missing or not usable.
+        """
+        record = read_record(path)
+        if record.size("w") is None or record.size("h") is None:
+            raise record.error("no w and h, expected the size of the depth images")
+        rows = record.items(EXTRINSICS)
+        if rows is None:
+            raise record.error(
+                f"no {EXTRINSICS}, expected the 4x4 pose of the depth camera in the colour camera"
+            )
+        return DepthSensor(read_camera(path, (0, 0)), rigid_of_rows(record, EXTRINSICS, rows))
+
+    def registered(
+        self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str
+    ) -> Float[Tensor, "h w"]:
+        """Return planar z (metres) in the colour camera; ``file`` opens the message of errors.
+
+        Depth of lower resolution than the colour image is registered at its own resolution and then resampled, since its
+        points would otherwise be too far apart to cover each other. Raises ``InputError`` for depth of another aspect ratio
+        than the sensor's.
+        """
+        height, width = depth.shape
+        camera = Raster(width, height, UPRIGHT).upright(self.camera)
+        if camera is None:
+            given = f"{self.camera.width}x{self.camera.height}"
+            raise InputError(
+                f"{file}: depth is {width}x{height}, expected the aspect ratio of its camera's {given}"
+            )
+        coarse = colour.scaled(min(1.0, camera.fx / colour.fx, camera.fy / colour.fy))
+        found = register_depth(depth, camera, coarse, self.T_colour_depth)
+        return found if coarse == colour else resampled(found, colour.width, colour.height)
 
 
 def register_depth(
@@ -23,8 +79,18 @@ def register_depth(
     points = T_colour_depth.apply(rays * depth[measured].double()[:, None])
     column, row = colour_camera.project(points).nan_to_num(-1.0, -1.0, -1.0).floor().unbind(-1)
     width, height = colour_camera.width, colour_camera.height
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & _ahead(points, colour_camera)
     place = (row * width + column)[inside].long()
     empty = torch.full((height * width,), torch.inf)
     nearest = empty.scatter_reduce(0, place, points[inside, 2].float(), "amin")
     return torch.where(nearest.isfinite(), nearest, 0).reshape(height, width)
+
+
+def _ahead(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Bool[Tensor, "n"]:
+    """Return which points lie in the pyramid of the image; a polynomial lens maps others into the image as well."""
+    centres = camera.pixel_centres(torch.float64)
+    border = torch.cat([centres[[0, -1]].reshape(-1, 2), centres[:, [0, -1]].reshape(-1, 2)])
+    edge = camera.unproject(border)[:, :2]
+    pixel = torch.tensor([1 / camera.fx, 1 / camera.fy], dtype=torch.float64)
+    x = points[:, :2] / points[:, 2:].clamp(min=1e-9)
+    return ((x >= edge.amin(0) - pixel) & (x <= edge.amax(0) + pixel)).all(-1)

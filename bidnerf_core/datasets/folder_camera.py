@@ -16,17 +16,24 @@ CAMERA_FILES = ("camera.json", "cameras.txt")
 class FolderCamera:
     """The camera ``given`` (intrinsics or a file), or that of a file in ``folder``, or the ``published`` one of the format.
 
-    Raises ``InputError`` where there is none of them; the message begins with ``unknown``, which says why.
+    Raises ``InputError`` where there is none of them; the message begins with ``unknown``, which says why,
+    and ends with the ``ways`` to give one.
     """
 
     def __init__(
-        self, folder: Path, given: Intrinsics | Path | None, published: Intrinsics | None, unknown: str = ""
+        self,
+        folder: Path,
+        given: Intrinsics | Path | None,
+        published: Intrinsics | None,
+        unknown: str = "",
+        ways: str = "a file",
     ) -> None:
         beside = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
         found = given or beside or published
         if found is None:
             raise InputError(
-                f"{folder}: {unknown}; expected its camera: {' or '.join(CAMERA_FILES)} in the folder, or camera= in Python"
+                f"{folder}: {unknown}; expected its camera: {' or '.join(CAMERA_FILES)} in the folder, or --camera with "
+                f"{ways} (camera= in Python)"
             )
         self._source = found
 

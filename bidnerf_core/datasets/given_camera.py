@@ -1,24 +1,33 @@
-"""The camera of images that have no description beside them, as a user gives it."""
+"""The cameras of images that have no description beside them, as a user gives them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.camera_sources import WAYS, CameraSource, Raster, find_camera
-from bidnerf_core.errors import InputError
+from bidnerf_core.datasets.depth_registration import DepthSensor
+from bidnerf_core.depth_images import read_depth_image
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.exif import Exif
+from bidnerf_core.frames import Frame
+from bidnerf_core.images import Background
 from bidnerf_core.orientation import UPRIGHT
 
 
 @dataclass(frozen=True)
 class GivenCamera:
-    """At most one of intrinsics or a file that holds them, a focal length (pixels), and a horizontal field of view (degrees)."""
+    """At most one of intrinsics or a file that holds them, a focal length (pixels), and a horizontal field of view (degrees).
+
+    Depth is registered to the images from ``sensor``, if there is one.
+    """
 
     camera: Intrinsics | str | Path | None = None
     focal: float | None = None
     hfov: float | None = None
+    sensor: DepthSensor | None = None
 
     @property
     def is_given(self) -> bool:
@@ -34,3 +43,20 @@ class GivenCamera:
         return find_camera(
             str(path), Raster(width, height, UPRIGHT), Exif(), self.camera, self.focal, self.hfov
         )
+
+    def read(
+        self, image: Path, depth: Path | None, depth_unit: float | None, background: Background
+    ) -> Frame:
+        """Read an image and its depth, upright; without a camera, that of EXIF is taken. Raises ``InputError`` as ``Frame.open``."""
+        apart = self.sensor is not None and depth is not None
+        frame = Frame.open(
+            image, depth=None if apart else depth, depth_unit=depth_unit, camera=self.camera, focal=self.focal,
+            hfov=self.hfov, background=background,
+        )  # fmt: skip
+        if self.sensor is None or depth is None:
+            return frame
+        measured = read_depth_image(depth, depth_unit)
+        remark = measured.remark(depth_unit is None)
+        if remark is not None:
+            warnings.warn(f"{depth}: {remark}", InputWarning, stacklevel=2)
+        return replace(frame, depth=self.sensor.registered(measured.metres, frame.intrinsics, depth))

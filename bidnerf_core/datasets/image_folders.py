@@ -32,11 +32,7 @@ def open_images(folder: Path, camera: GivenCamera, background: Background | None
         beside = photo.with_name(f"{photo.stem}{DEPTH_STEM}.png")
         depth, unit = (beside, MILLIMETRE) if beside.is_file() else (None, None)
         behind: Background = "black" if background is None else background
-        frame = Frame.open(
-            photo, depth=depth, depth_unit=unit, background=behind,
-            camera=camera.camera, focal=camera.focal, hfov=camera.hfov,
-        )  # fmt: skip
-        return frame, None
+        return camera.read(photo, depth, unit, behind), None
 
     return FileSequence.ordered(
         folder,

@@ -31,6 +31,18 @@ def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
     """Return ``T_world_camera`` as ``pose`` does; ``key`` is where ``record`` has ``rows``, for messages."""
     matrix = _matrix(record, key, rows)
     matrix[:, 1:3] *= -1  # y up becomes y down, z backward becomes z forward
+    return _rigid(record, key, matrix)
+
+
+def rigid_of_rows(record: Record, key: str, rows: list[Any]) -> SE3:
+    """Return the rigid transform (float64) that ``rows`` (3x4 or 4x4) are up to rounding, whatever its axes.
+
+    ``key`` is where ``record`` has them. Raises ``InputError`` for any other matrix.
+    """
+    return _rigid(record, key, _matrix(record, key, rows))
+
+
+def _rigid(record: Record, key: str, matrix: Float[Tensor, "3 4"]) -> SE3:
     try:
         return rigid_pose(matrix)
     except InputError as error:

@@ -9,8 +9,8 @@ as "test" and the others are "train". The format records no times: a sequence is
 The Kinect's two cameras were not calibrated, and its depth is not registered to its colour images. The poses are those of
 the depth camera (focal length 585 px); the colour camera has 525 px and is 2.6 cm beside it. By default both are treated as
 the literature on relocalization does (ACE, CVPR 2023, and the pseudo ground truth of Brachmann et al., ICCV 2021): poses
-are moved to the colour camera and depth is registered to it, by a calibration of another Kinect. With
-``register_depth=False`` images, depth and poses are taken as they are, with the 585 px of the dataset's page for both, as in
+are moved to the colour camera and depth is registered to it, by a calibration of another Kinect, or by that which is given.
+Without registration, images, depth and poses are taken as they are, with the 585 px of the dataset's page for both, as in
 KinectFusion and its successors; colours at the border are then some 30 px beside their depth.
 
 Cameras of images of other sizes are scaled. A camera that is given, or in ``camera.json`` or ``cameras.txt`` of the folder, is
@@ -27,7 +27,7 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.depth_registration import register_depth
+from bidnerf_core.datasets.depth_registration import DepthSensor
 from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.pose_files import read_pose_matrix
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -57,6 +57,7 @@ T_COLOUR_DEPTH = SE3(
     ),
 ).normalized()
 """https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html, as used by ACE's ``setup_7scenes.py``."""
+KINECT = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
 
 COLOUR = re.compile(r"(frame-\d+)\.color\.(?:png|jpe?g)", re.IGNORECASE)
 SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
@@ -90,9 +91,9 @@ class SceneFrame:
 
 @dataclass(frozen=True)
 class SevenScenesReader:
-    """The reader of folders of 7-Scenes; ``register_depth`` moves poses and depth to the colour camera."""
+    """The reader of folders of 7-Scenes; poses and depth are moved from ``sensor`` to the colour camera, if there is one."""
 
-    register_depth: bool = True
+    sensor: DepthSensor | None = KINECT
     camera: Intrinsics | Path | None = None
     expected = "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)"
 
@@ -101,6 +102,9 @@ class SevenScenesReader:
 
     def with_camera(self, camera: Intrinsics | Path) -> SevenScenesReader:
         return replace(self, camera=camera)
+
+    def with_depth_sensor(self, sensor: DepthSensor | None) -> SevenScenesReader:
+        return replace(self, sensor=sensor)
 
     def open(self, path: Path, background: Background | None) -> Dataset:
         """List the frames. Raises ``InputError`` where one has no pose, and for split files that are not usable."""
@@ -123,19 +127,23 @@ class SevenScenesReader:
     def _dataset(
         self, path: Path, splits: dict[str, list[SceneFrame]], background: Background | None
     ) -> SevenScenesDataset:
-        published = COLOUR_CAMERA if self.register_depth else DEPTH_CAMERA
+        published = DEPTH_CAMERA if self.sensor is None else COLOUR_CAMERA
         camera = FolderCamera(path, self.camera, published)
-        return SevenScenesDataset(Splits(path, splits), camera, self.register_depth, background)
+        return SevenScenesDataset(Splits(path, splits), camera, self.sensor, background)
 
 
 class SevenScenesDataset(OpaqueDataset[SceneFrame]):
     """Views of a folder of 7-Scenes; see ``Dataset``."""
 
     def __init__(
-        self, frames: Splits[SceneFrame], camera: FolderCamera, register: bool, background: Background | None
+        self,
+        frames: Splits[SceneFrame],
+        camera: FolderCamera,
+        sensor: DepthSensor | None,
+        background: Background | None,
     ) -> None:
         super().__init__(frames, background)
-        self._camera, self._register = camera, register
+        self._camera, self._sensor = camera, sensor
         self._read_depth = DepthReader(documented=("65535",))
 
     def _view(self, frame: SceneFrame, name: str) -> View:
@@ -146,7 +154,9 @@ class SevenScenesDataset(OpaqueDataset[SceneFrame]):
 
     def _pose(self, frame: SceneFrame) -> SE3:
         T_world_depth = read_pose_matrix(frame.pose)
-        return T_world_depth @ T_COLOUR_DEPTH.inverse() if self._register else T_world_depth
+        return (
+            T_world_depth if self._sensor is None else T_world_depth @ self._sensor.T_colour_depth.inverse()
+        )
 
     def _frame(self, frame: SceneFrame, name: str) -> Frame:
         header = read_header(frame.image)
@@ -155,14 +165,13 @@ class SevenScenesDataset(OpaqueDataset[SceneFrame]):
         depth = None
         if frame.depth.is_file():
             depth = self._read_depth(frame.depth, DEPTH_UNIT).metres
-            if depth.shape != colour.shape[:2]:
+            if self._sensor is not None:
+                depth = self._sensor.registered(depth, camera, frame.depth)
+            elif depth.shape != colour.shape[:2]:
                 raise InputError(
                     f"{frame.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
                     "as the colour image"
                 )
-            if self._register:
-                sensor = DEPTH_CAMERA.resized(header.width, header.height)
-                depth = register_depth(depth, sensor, camera, T_COLOUR_DEPTH)
         return Frame(name, over(colour, alpha, self._background), camera, depth, alpha)
 
 

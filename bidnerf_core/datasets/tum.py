@@ -8,9 +8,10 @@ or in a gap of it of more than 0.1 s, has no pose: it is in the sequence and not
 eighth (the first, the ninth ...) is held out as "test" and the others are "train".
 
 Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image. The published
-images contain the correction of the depth scale already.
+images contain the correction of the depth scale already. Depth of other recordings in this layout is registered by the sensor
+that is given.
 
-The camera is, in this order, the one that is given; that in ``camera.json`` or ``cameras.txt`` of the folder (as ``--camera``
+The camera is, in this order, the one that is given, as a file or as ``freiburg1``, 2 or 3; that in ``camera.json`` or ``cameras.txt`` of the folder (as ``--camera``
 of ``bidnerf localize`` takes them); and the published one of freiburg1, 2 or 3, which the folder's name says. Published
 principal points count pixels from the centre of the upper left one and are half a pixel larger here. Colour images of
 freiburg1 and freiburg2 are distorted; the camera models it (k1 k2 p1 p2 k3), so that no image is resampled.
@@ -27,6 +28,7 @@ import numpy as np
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.depth_registration import DepthSensor
 from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
@@ -48,6 +50,7 @@ CAMERAS = {
     "3": Intrinsics(535.4, 539.2, 320.6, 248.1, 640, 480),
 }
 """The benchmark's "ROS default" is none of them: these are its calibrations of the three colour cameras."""
+SENSORS = "freiburg1, freiburg2 and freiburg3"
 SENSOR = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
 
 
@@ -80,16 +83,24 @@ class TumFrame:
 
 @dataclass(frozen=True)
 class TumReader:
-    """The reader of folders of the TUM RGB-D benchmark; ``camera`` (intrinsics or a file) goes before all others."""
+    """The reader of folders of the TUM RGB-D benchmark.
+
+    ``camera`` (intrinsics or a file) goes before all others; depth is registered from ``sensor``, if there is one.
+    """
 
     camera: Intrinsics | Path | None = None
+    sensor: DepthSensor | None = None
     expected = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
 
     def recognises(self, path: Path) -> bool:
         return (path / COLOUR_LIST).is_file()
 
     def with_camera(self, camera: Intrinsics | Path) -> TumReader:
-        return replace(self, camera=camera)
+        """Return a reader with this camera; a path may also be a name of one of the benchmark's sensors."""
+        return replace(self, camera=_named_camera(camera) or camera)
+
+    def with_depth_sensor(self, sensor: DepthSensor | None) -> TumReader:
+        return replace(self, sensor=sensor)
 
     def open(self, path: Path, background: Background | None) -> Dataset:
         """Read the lists. Raises ``InputError`` where one is missing or broken, and where no frame has a pose."""
@@ -101,7 +112,7 @@ class TumReader:
                 f"{path / TRUTH}: covers no image of {COLOUR_LIST}, expected samples before and after their times, "
                 f"at most {LARGEST_GAP:g} s apart"
             )
-        return TumDataset(Splits(path, hold_out(posed)), self._camera(path), background)
+        return self._dataset(path, hold_out(posed), background)
 
     def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
         """Read the lists; frames without a pose are in the sequence as well, and all where there is no ground truth."""
@@ -109,19 +120,30 @@ class TumReader:
         posed = [frame for frame in frames if frame.truth is not None]
         unposed = [frame for frame in frames if frame.truth is None]
         splits = hold_out(posed) if posed else {}
-        return TumDataset(Splits(path, splits), self._camera(path), background).sequence(unposed)
+        return self._dataset(path, splits, background).sequence(unposed)
 
-    def _camera(self, path: Path) -> FolderCamera:
-        unknown = "its name says none of freiburg1, freiburg2 and freiburg3"
-        return FolderCamera(path, self.camera, published_camera(path), unknown)
+    def _dataset(
+        self, path: Path, splits: dict[str, list[TumFrame]], background: Background | None
+    ) -> TumDataset:
+        unknown = f"its name says none of {SENSORS}"
+        camera = FolderCamera(
+            path, self.camera, published_camera(path), unknown, f"one of {SENSORS}, or a file"
+        )
+        return TumDataset(Splits(path, splits), camera, self.sensor, background)
 
 
 class TumDataset(OpaqueDataset[TumFrame]):
     """Views of a folder of the TUM RGB-D benchmark; see ``Dataset``."""
 
-    def __init__(self, frames: Splits[TumFrame], camera: FolderCamera, background: Background | None) -> None:
+    def __init__(
+        self,
+        frames: Splits[TumFrame],
+        camera: FolderCamera,
+        sensor: DepthSensor | None,
+        background: Background | None,
+    ) -> None:
         super().__init__(frames, background)
-        self._camera = camera
+        self._camera, self._sensor = camera, sensor
         self._read_depth = DepthReader(documented=("65535",))
 
     def _view(self, frame: TumFrame, name: str) -> View:
@@ -139,7 +161,9 @@ class TumDataset(OpaqueDataset[TumFrame]):
         depth = None
         if frame.depth is not None:
             depth = self._read_depth(frame.depth.image, METRES_PER_STEP).metres
-            if depth.shape != colour.shape[:2]:
+            if self._sensor is not None:
+                depth = self._sensor.registered(depth, camera, frame.depth.image)
+            elif depth.shape != colour.shape[:2]:
                 raise InputError(
                     f"{frame.depth.image}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
                     "as its colour image, to which it is registered"
@@ -150,6 +174,12 @@ class TumDataset(OpaqueDataset[TumFrame]):
 def published_camera(folder: Path) -> Intrinsics | None:
     """Return the benchmark's calibration of the sensor that the folder's name says, or None."""
     found = SENSOR.search(folder.resolve().name)
+    return CAMERAS[found[1]] if found else None
+
+
+def _named_camera(given: Intrinsics | Path) -> Intrinsics | None:
+    """Return the calibration of a sensor that is given by its name, such as ``freiburg1``, or None."""
+    found = None if isinstance(given, Intrinsics) or given.exists() else SENSOR.fullmatch(str(given))
     return CAMERAS[found[1]] if found else None
 
 

@@ -11,7 +11,7 @@ from torch import Generator
 
 from bidnerf_core.localization.acceptance import rendered_verdict
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.covariance import INDEPENDENT
+from bidnerf_core.localization.covariance import INDEPENDENT, position_deviation
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     RefinementSettings,
@@ -110,7 +110,7 @@ def without_the_imprecise(found: Localization, typical: float) -> Localization:
     """
     if not found.converged or found.covariance is None or typical <= 0:
         return found
-    deviation = float(torch.linalg.eigvalsh(found.covariance[:3, :3])[-1].clamp(min=0).sqrt())
+    deviation = position_deviation(found.covariance)
     if deviation <= TYPICAL_ERRORS * typical:
         return found
     why = f"the position is uncertain by {deviation:.3g}, the map's own images by {typical:.3g}"

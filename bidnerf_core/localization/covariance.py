@@ -78,3 +78,8 @@ def without_direction(information: Float[Tensor, "6 6"], slope: Float[Tensor, "6
     """
     pulled = information @ slope
     return information - pulled[:, None] * pulled / (1 + slope @ pulled)
+
+
+def position_deviation(covariance: Float[Tensor, "6 6"]) -> float:
+    """Return the standard deviation (metres) of the position along its least certain direction."""
+    return float(torch.linalg.eigvalsh(covariance[:3, :3])[-1].clamp(min=0).sqrt())

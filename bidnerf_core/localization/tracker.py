@@ -22,21 +22,28 @@ from bidnerf_core.localization.tracking.answers import (
 from bidnerf_core.localization.tracking.clock import Clock
 from bidnerf_core.localization.tracking.detection import LandmarkDetector
 from bidnerf_core.localization.tracking.flow import Grey
+from bidnerf_core.localization.tracking.judging import determined, shape_verdict
 from bidnerf_core.localization.tracking.measuring import (
     ByLandmarks,
     Measurement,
     by_colour,
     by_shape,
     by_surface,
-    determined,
     followed,
     is_vague,
-    precise_enough,
 )
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
 from bidnerf_core.localization.tracking.odometry import Odometry
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints
-from bidnerf_core.localization.tracking.relocalization import has_points, relocalized, uses_landmarks
+from bidnerf_core.localization.tracking.relocalization import (
+    LONG_WAIT,
+    has_points,
+    is_searchable,
+    relocalized,
+    scene_extent,
+    typical_error,
+    uses_landmarks,
+)
 from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
 from bidnerf_core.mapping import SurfaceMap
@@ -141,7 +148,8 @@ class Tracker:
         self, frame: Frame, image: Grey | None, state: TrackerState, motion: Motion, seconds: float
     ) -> tuple[Localization, TrackerState]:
         """Find the pose from that of the last frame. If it is not accepted, search anew from the next frame on."""
-        predicted, surface = motion.predicted(seconds), self.localizer.map.surface
+        surface = self.localizer.map.surface
+        predicted = motion.predicted(seconds, state.clock.stamped)
         if image is None and surface is not None and has_points(frame):
             return self._by_shape(surface, frame, state, predicted)
         points = followed(state, image, frame, predicted.T_world_camera)
@@ -150,14 +158,12 @@ class Tracker:
         if measured is not None and measured.verdict.accepted:
             return self._accepted(frame, image, measured, predicted)
         if state.lost or is_vague(predicted, frame.intrinsics):
+            T, waited = predicted.T_world_camera, state.waited + abs(seconds)
+            lost = max(state.searchable, min(state.lost, 1))
             found = relocalized(
-                self.localizer,
-                frame,
-                predicted.T_world_camera,
-                state.searchable,
-                self.config.patience,
-                state.frames,
-            )
+                self.localizer, frame, T, lost, self.config.patience, state.frames, waited
+            )  # fmt: skip
+            state = replace(state, waited=0.0 if image is not None and waited >= LONG_WAIT else waited)
             if found is not None and found.converged:
                 return self._found(frame, image, state, found)
         state = self._adrift(frame, image, state, points, predicted)
@@ -180,7 +186,8 @@ class Tracker:
             state = replace(state, motion=predicted, lost=state.lost + 1)
             return tracked_localization(predicted, verdict, predicted, found.loss), state
         motion = predicted.refined(found.pose)
-        verdict = precise_enough(found.verdict, motion.covariance, self._reach(frame))
+        typical, stamped = typical_error(self.localizer), state.clock.stamped
+        verdict = shape_verdict(found.verdict, motion.covariance, self._reach(frame), typical, stamped)
         state = replace(state, motion=motion, lost=0 if verdict.accepted else state.lost + 1)
         return tracked_localization(motion, verdict, predicted, found.loss), state
 
@@ -222,7 +229,7 @@ class Tracker:
         motion = predicted.updated(measured.pose) if measured.motion is None else measured.motion
         reach = self._reach(frame, measured.state.points, measured.pose.T_world_camera)
         motion = replace(motion, reach=reach)
-        state = replace(measured.state, motion=motion, lost=0, searchable=0)
+        state = replace(measured.state, motion=motion, lost=0, searchable=0, waited=0.0)
         if self._by_landmarks is None:
             corners = self._odometry.replenished(frame, image, state.points, motion.T_world_camera)
             state = replace(state, points=corners)
@@ -237,14 +244,10 @@ class Tracker:
             covariance = self._at_start(frame, found.T_world_camera).covariance
         pose = PoseEstimate(found.T_world_camera, 0.5 * covariance, 0.5 * covariance)
         motion = Motion.at(pose, self._reach(frame))
+        factor = state.focal_factor * found.focal_factor  # other than 1 for approximate focal lengths
         state = replace(
-            state,
-            points=FollowedPoints.none(),
-            window=(),
-            motion=motion,
-            focal_factor=state.focal_factor
-            * found.focal_factor,  # other than 1 for approximate focal lengths
-        )
+            state, points=FollowedPoints.none(), window=(), motion=motion, focal_factor=factor
+        )  # fmt: skip
         frame = with_focal_factor(frame, found.focal_factor)
         measured = self._measured(frame, image, state, state.points, motion)
         if measured is not None and measured.verdict.accepted:
@@ -255,7 +258,7 @@ class Tracker:
             state = replace(state, points=corners)
         reason = f"relocalized after {state.lost} frames: {found.reason}" if state.lost else found.reason
         answer = replace(found, method=METHOD, reason=reason, covariance=motion.covariance)
-        return answer, replace(state, motion=motion, lost=0, searchable=0)
+        return answer, replace(state, motion=motion, lost=0, searchable=0, waited=0.0)
 
     def _adrift(
         self, frame: Frame, image: Grey | None, state: TrackerState, points: FollowedPoints, predicted: Motion
@@ -269,17 +272,13 @@ class Tracker:
             points=corners,
             window=(),
             lost=state.lost + 1,
-            searchable=state.searchable + (image is not None),
+            searchable=state.searchable + (image is not None and is_searchable(frame)),
         )
 
     @property
     def _extent(self) -> float:
         """The size of the scene (metres)."""
-        scene = self.localizer.map
-        if scene.surface is not None:
-            return scene.surface.extent
-        corners = torch.tensor([scene.bounds.lower, scene.bounds.upper])
-        return float(torch.linalg.vector_norm(corners[1] - corners[0]))
+        return scene_extent(self.localizer.map)
 
     def _reach(
         self, frame: Frame, points: FollowedPoints | None = None, T_world_camera: SE3 | None = None

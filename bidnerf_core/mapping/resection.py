@@ -13,11 +13,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.rotations import rotation_of
 from bidnerf_core.se3 import SE3
 
 Array = np.ndarray
@@ -67,14 +67,14 @@ def resect(
     """
     residuals, free = _Residuals(data, start), prior.deviations.numpy().nonzero()[0]
 
-    def equations(state: _State, noise: float) -> _System:
-        return residuals(state, noise, free).weighted(1 / correlation).with_prior(state, prior)
+    def equations(here: _Linearization, noise: float) -> _System:
+        return residuals.system(here, noise).weighted(1 / correlation).with_prior(here.state, prior)
 
-    state = _State.of(start, calibration)
-    system, damping = equations(state, noise), 1e-6
+    here = residuals.linearized(_State.of(start, calibration), free)
+    system, damping = equations(here, noise), 1e-6
     for _ in range(RESECTION_STEPS):
         step = -_solved(system.hessian, damping, system.gradient)
-        moved = state.retracted(step, free)
+        moved = residuals.linearized(here.state.retracted(step, free), free)
         tried = equations(moved, noise)
         size = float(step @ system.hessian @ step)
         if not tried.cost <= system.cost:
@@ -82,17 +82,18 @@ def resect(
             if size < SMALL_STEP or damping > 1e8:
                 break
             continue
-        state, system, damping = moved, tried, damping / 10
+        here, system, damping = moved, tried, damping / 10
         better = max(LEAST_NOISE, noise * tried.spread)
         settled = abs(better / noise - 1) < NOISE_TOLERANCE
         if not settled:
             noise = better
-            system = equations(state, noise)
+            system = equations(here, noise)
         elif size < SMALL_STEP:
             break
     covariance = system.covariance()
     deviations = np.zeros(4)
     deviations[free] = np.sqrt(np.diag(covariance)[6:].clip(min=0))
+    state = here.state
     return ReprojectionFit(
         state.pose(),
         Calibration(*state.calibration.tolist()),
@@ -121,7 +122,7 @@ class _State:
         calibration[free] += step[6:]
         # To first order, moving along the camera's axes equals the exponential map's translation.
         position = self.position + self.rotation @ step[:3]
-        return _State(self.rotation @ Rotation.from_rotvec(step[3:6]).as_matrix(), position, calibration)
+        return _State(self.rotation @ rotation_of(step[3:6]), position, calibration)
 
     def pose(self) -> SE3:
         return SE3(torch.from_numpy(self.rotation), torch.from_numpy(self.position)).normalized()
@@ -171,31 +172,48 @@ class _System:
         return (found + found.T) / 2
 
 
+@dataclass(frozen=True, eq=False)
+class _Linearization:
+    """Reprojection errors in pixels about a state; they do not depend on the noise, which may change without them."""
+
+    state: _State
+    front: Array  # (m,) whether the point is before the camera
+    off: Array  # (m, 2) projection minus observation
+    jacobian: Array  # (m, 2, p)
+
+
 class _Residuals:
-    """Reprojection errors in standard deviations, linearized about a state."""
+    """Reprojection errors of observed points, and the normal equations of their robust cost."""
 
     def __init__(self, data: ObservedPoints, start: SE3) -> None:
         self._points = data.points.numpy()
         self._rotation, self._translation = data.rotation.numpy(), data.translation.numpy()
+        self._turned = bool((self._rotation != np.eye(3)).any())
         self._focal = data.focal.numpy()[:, None]
         self._observed = data.image.numpy() * self._focal
         self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
 
-    def __call__(self, state: _State, noise: float, free: Array) -> _System:
+    def linearized(self, state: _State, free: Array) -> _Linearization:
         rig = (self._points - state.position) @ state.rotation
-        local = np.einsum("mij,mj->mi", self._rotation, rig) + self._translation
+        turned = np.einsum("mij,mj->mi", self._rotation, rig) if self._turned else rig
+        local = turned + self._translation
         front = local[:, 2] > 1e-9
         z = np.where(front, local[:, 2], 1)[:, None]
         flat = local[:, :2] / z
-        deviation = np.sqrt(noise**2 + self._variance)[:, None]
         log_focal, shift, radial = state.calibration[0], state.calibration[1:3], state.calibration[3]
         bend = radial * (flat**2).sum(1, keepdims=True)
         scale = self._focal * math.exp(log_focal)
         projected = flat * (1 + bend) * scale + self._focal * shift
-        residual = np.where(front[:, None], (projected - self._observed) / deviation, BEHIND)
+        jacobian = self._jacobian(rig, flat, z, scale, radial, bend, free)
+        return _Linearization(state, front, projected - self._observed, jacobian)
+
+    def system(self, here: _Linearization, noise: float) -> _System:
+        """Return the normal equations for keypoints of this noise (pixels)."""
+        deviation = np.sqrt(noise**2 + self._variance)[:, None]
+        residual = np.where(here.front[:, None], here.off / deviation, BEHIND)
         squared = (residual**2).sum(1)
-        weight = front / (1 + squared / SCALE**2)
-        jacobian = self._jacobian(rig, flat, z, scale, radial, bend, free) / deviation[..., None]
+        weight = here.front / (1 + squared / SCALE**2)
+        jacobian = here.jacobian / deviation[..., None]
         single = ((weight[:, None] * residual)[:, None] @ jacobian)[:, 0]
         weighted = (jacobian * np.sqrt(weight)[:, None, None]).reshape(-1, jacobian.shape[-1])
         hessian, scatter = weighted.T @ weighted, single.T @ single
@@ -207,7 +225,7 @@ class _Residuals:
 
     def slope(self, state: _State, noise: float) -> Array:
         """Return how the pose that fits best follows a change of the calibration, (6, 4)."""
-        hessian = self(state, noise, np.arange(4)).hessian
+        hessian = self.system(self.linearized(state, np.arange(4)), noise).hessian
         return -_solved(hessian[:6, :6], 1e-9, hessian[:6, 6:])
 
     def _jacobian(
@@ -216,9 +234,13 @@ class _Residuals:
         """Return the derivative (m, 2, p) of the projection in pixels by a right update and by the free calibration."""
         x, y = flat[:, 0], flat[:, 1]
         zero, one = np.zeros_like(x), np.ones_like(x)
-        bent = np.eye(2) * (1 + bend)[..., None] + 2 * radial * flat[:, :, None] * flat[:, None]
-        by_local = np.stack([one, zero, -x, zero, one, -y], axis=1).reshape(-1, 2, 3) / z[..., None]
-        by_rig = (scale[..., None] * bent) @ by_local @ self._rotation
+        by_rig = np.stack([one, zero, -x, zero, one, -y], axis=1).reshape(-1, 2, 3) * (scale / z)[..., None]
+        if radial:
+            by_rig = (
+                np.eye(2) * (1 + bend)[..., None] + 2 * radial * flat[:, :, None] * flat[:, None]
+            ) @ by_rig
+        if self._turned:
+            by_rig = by_rig @ self._rotation
         # A point of the rig's frame moves by -rho + p x phi under T exp(rho, phi), and r (p x phi) = (r x p) phi.
         by_pose = np.concatenate([-by_rig, _cross(by_rig, rig[:, None])], axis=-1)
         if not len(free):

@@ -125,7 +125,15 @@ class SurfaceCost:
     scales: PointScales
 
     def __call__(self, T: SE3) -> NormalEquations:
-        scales, found = self.scales, self.correspondences(T)
+        return self._equations(self.correspondences(T))
+
+    def with_variance(self, T: SE3) -> tuple[NormalEquations, Float[Tensor, "h"]]:
+        """Return the normal equations and ``residual_variance``; neighbours are sought once for both."""
+        found = self.correspondences(T)
+        return self._equations(found), self._variance(found)
+
+    def _equations(self, found: Correspondences) -> NormalEquations:
+        scales = self.scales
         near = geman_mcclure_inlier(found.squared, scales.distance)
         weight = near**2 / scales.distance**2
         if not scales.colour_weight:
@@ -152,7 +160,10 @@ class SurfaceCost:
 
     def residual_variance(self, T: SE3) -> Float[Tensor, "h"]:
         """Return the weighted mean of the squared residuals, in units of their scales."""
-        found, scales = self.correspondences(T), self.scales
+        return self._variance(self.correspondences(T))
+
+    def _variance(self, found: Correspondences) -> Float[Tensor, "h"]:
+        scales = self.scales
         difference, _ = self.colour_differences(found)
         squared = torch.stack(
             [found.squared / scales.distance**2, (difference**2).sum(-1) / scales.colour**2]

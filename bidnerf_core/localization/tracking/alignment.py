@@ -21,6 +21,7 @@ from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.tracking.motion import PoseEstimate
 from bidnerf_core.localization.tracking.single_pose import retracted
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.pixels import observe
 from bidnerf_core.se3 import SE3
 
 SURFACE_BIAS = 0.5
@@ -29,6 +30,8 @@ DEPTH_MEASUREMENTS = 3.0
 """Number of independent measurements that a frame's points count as beside landmarks: fewer than ``INDEPENDENT``, which is
 optimistic for hand-held sensors.
 """
+DRAWN = 4
+"""Number of pixels that are drawn for each measured point that is wanted."""
 ALIGNMENT_STEPS = 8
 """Largest number of steps of an alignment without landmarks, at each of its scales."""
 ALIGNED_STEP = 1e-4
@@ -44,8 +47,21 @@ class CloudInCamera:
 
 
 def measured_cloud(frame: Frame, count: int, scale: float, generator: Generator) -> PointCloud:
-    """Return up to ``count`` of a frame's measured points in the camera's frame; depth is multiplied by ``scale``."""
-    cloud = PointCloud.measured((View(frame, SE3.identity()),), None, count, generator)
+    """Return up to ``count`` of a frame's measured points in the camera's frame; depth is multiplied by ``scale``.
+
+    Pixels are drawn without a look at all of them, which would take longer than what is done with the few; a pixel may be
+    drawn twice. Where the depth is sparse, every measured pixel is a candidate.
+    """
+    view, depth = View(frame, SE3.identity()), frame.depth
+    assert depth is not None
+    drawn = torch.randint(depth.numel(), (DRAWN * count,), generator=generator)
+    drawn = drawn[(depth.flatten()[drawn] > 0).nonzero()[:count, 0]]
+    if len(drawn) == count:
+        width = depth.shape[1]
+        seen = observe(view, torch.stack([drawn % width, drawn // width], dim=-1), device="cpu")
+        cloud = PointCloud(seen.points, seen.rgb, seen.origins, seen.coloured)
+    else:
+        cloud = PointCloud.measured((view,), None, count, generator)
     return cloud if scale == 1 else replace(cloud, points=scale * cloud.points)
 
 
@@ -71,13 +87,13 @@ def fused_with_surface(
     """
     about = cloud.pivot
     cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
-    variance = max(float(cost.residual_variance(pose.T_world_camera[None])[0]), LEAST_VARIANCE)
-    weight = DEPTH_MEASUREMENTS * views / variance
+    here, variance = cost.with_variance(pose.T_world_camera[None])
+    weight = DEPTH_MEASUREMENTS * views / max(float(variance[0]), LEAST_VARIANCE)
     at_camera = about.update_at_camera(pose.T_world_camera)
     prior = at_camera.T @ torch.linalg.inv(pose.covariance) @ at_camera
     T, moved = pose.T_world_camera, torch.zeros(6, dtype=torch.float64)
-    for _ in range(steps):
-        here = cost(T[None])
+    for number in range(steps):
+        here = cost(T[None]) if number else here
         hessian, gradient = weight * here.hessian[0], weight * here.gradient[0]
         # The steps are so short that they add up; the prior pulls back by all of them.
         step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)

@@ -14,6 +14,7 @@ class Clock:
 
     now: float | None  # seconds, from any origin
     interval: float  # seconds
+    stamped: bool = True  # whether the last frame had a time stamp
 
     def step(self, time: float | None) -> tuple[Clock, float]:
         """Return the clock at the next frame, and the seconds since the last one: negative if it came out of order.
@@ -21,7 +22,8 @@ class Clock:
         Raises ``InputError`` for a time that is not finite.
         """
         if time is None:
-            return Clock(None if self.now is None else self.now + self.interval, self.interval), self.interval
+            now = None if self.now is None else self.now + self.interval
+            return Clock(now, self.interval, stamped=False), self.interval
         if not math.isfinite(time):
             raise InputError(f"time of the frame is {time}, expected seconds or None")
         if self.now is None:

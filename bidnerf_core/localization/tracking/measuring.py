@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Generator
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
@@ -38,6 +37,7 @@ from bidnerf_core.localization.tracking.detection import (
     well_spread,
 )
 from bidnerf_core.localization.tracking.flow import Grey, alike, flow
+from bidnerf_core.localization.tracking.judging import not_by_chance, precise_enough
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose
 from bidnerf_core.localization.tracking.settings import TrackerConfig
@@ -61,8 +61,6 @@ VAGUE = 0.35
 TOO_VAGUE = Verdict(
     Outcome.UNDETERMINED, "no colours were recorded, and the prediction is too uncertain for the shape"
 )
-DETERMINED = 0.02, math.radians(3)
-"""Largest standard deviation of an accepted pose by depth or colour: shares of the scene's extent, and radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,21 +111,19 @@ class ByLandmarks:
         found = fit_pose(
             points.observed(frame), predicted.T_world_camera, state.noise, threshold, self.correlation
         )
-        judged = None
+        judged = measured = None
+        state = replace(state, age=state.age + 1)
         if found is not None:
             evidence = flow_evidence(found, frame.intrinsics)
-            judged = self._judged(frame, points, found, evidence, state.miscalibration)
-        state = replace(state, age=state.age + 1)
-        if judged is None or self._wants_more(state, predicted, judged):
+            pose, verdict = self._judged(frame, points, found, evidence, state.miscalibration)
+            judged = pose, not_by_chance(verdict, found.fit.noise, threshold)
+            measured = self._fused(frame, state, points[found.inliers], *judged, predicted)
+        if judged is None or measured is None or self._wants_more(state, judged[0], measured):
             fresh = self._recognized(frame, state, predicted, judged)
             if fresh is not None and (judged is None or fresh[1].accepted or not judged[1].accepted):
-                judged, points, found, state = fresh[:2], fresh[2], fresh[3], fresh[4]
-        if judged is None or found is None:
-            return None
-        measured = self._fused(frame, state, points[found.inliers], *judged)
-        motion = predicted.updated(measured.pose)
-        verdict = precise_enough(measured.verdict, motion.covariance, judged[0].distance)
-        return replace(measured, verdict=verdict, motion=motion)
+                pose, verdict, points, found, state = fresh
+                return self._fused(frame, state, points[found.inliers], pose, verdict, predicted)
+        return measured
 
     def _judged(
         self,
@@ -142,16 +138,9 @@ class ByLandmarks:
         )
         return pose, landmark_verdict(pose, SINGLE)
 
-    def _wants_more(
-        self, state: TrackerState, predicted: Motion, judged: tuple[LandmarkPose, Verdict]
-    ) -> bool:
-        left = judged[0].inliers
-        few = left < max(ENOUGH_LANDMARKS, self.config.refresh_share * state.sought)
-        pose, verdict = judged
-        if pose.position_deviation > LandmarkThresholds().precision * pose.distance:
-            fused = predicted.updated(self._estimate(pose))  # the prediction may make up for it
-            few |= not precise_enough(verdict, fused.covariance, pose.distance).accepted
-        return few or state.age >= self.config.refresh_frames or not verdict.accepted
+    def _wants_more(self, state: TrackerState, found: LandmarkPose, measured: Measurement) -> bool:
+        few = found.inliers < max(ENOUGH_LANDMARKS, self.config.refresh_share * state.sought)
+        return few or state.age >= self.config.refresh_frames or not measured.verdict.accepted
 
     def _recognized(
         self,
@@ -193,6 +182,21 @@ class ByLandmarks:
         return pose, verdict, seen.points, replace(seen.found, inliers=kept), state
 
     def _fused(
+        self,
+        frame: Frame,
+        state: TrackerState,
+        kept: FollowedPoints,
+        found: LandmarkPose,
+        verdict: Verdict,
+        predicted: Motion,
+    ) -> Measurement:
+        """Fuse a pose by landmarks with depth and the prediction, and judge whether it is precise enough then."""
+        measured = self._with_depth(frame, state, kept, found, verdict)
+        motion = predicted.updated(measured.pose)
+        verdict = precise_enough(measured.verdict, motion.covariance, found.distance)
+        return replace(measured, verdict=verdict, motion=motion)
+
+    def _with_depth(
         self, frame: Frame, state: TrackerState, kept: FollowedPoints, found: LandmarkPose, verdict: Verdict
     ) -> Measurement:
         state = replace(state, points=kept, noise=found.noise)
@@ -276,21 +280,3 @@ def by_colour(
         answer.refined.T.normalized(), (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance
     )
     return Measurement(pose, answer.verdict, answer.refined.loss, state)
-
-
-def precise_enough(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
-    """Return the verdict, or that the position is too uncertain for the ``distance`` (metres) of what is in view."""
-    deviation = float(torch.linalg.eigvalsh(covariance[:3, :3])[-1].clamp(min=0).sqrt())
-    if not verdict.accepted or deviation <= LandmarkThresholds().precision * distance:
-        return verdict
-    why = f"but the position is uncertain by {deviation / distance:.1%} of the distance"
-    return Verdict(Outcome.IMPRECISE, f"{verdict.reason}, {why}")
-
-
-def determined(verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float) -> Verdict:
-    """Return the verdict, or that the pose is not determined where its covariance is large."""
-    translation, rotation = (float(part.max().sqrt()) for part in covariance.diagonal().split(3))
-    if not verdict.accepted or (translation <= DETERMINED[0] * extent and rotation <= DETERMINED[1]):
-        return verdict
-    why = f"one standard deviation is {translation:.3g} m and {math.degrees(rotation):.2g} deg"
-    return Verdict(Outcome.UNDETERMINED, why)

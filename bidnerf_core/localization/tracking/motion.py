@@ -34,6 +34,8 @@ to the expected one that counts.
 """
 KNOWN = 0.5
 """Variance of a velocity, as a share of that of an unknown one, up to which predictions show how briskly a camera moves."""
+UNSTAMPED = 0.5
+"""Standard deviation of an interval between frames that is not recorded, as a share of it: frames may be left out."""
 LEAST_SECONDS = 1e-3
 """Least time between two frames for which noise of the motion is added; frames may be repeated or lack distinct times."""
 
@@ -77,10 +79,11 @@ class Motion:
         """Covariance of the pose, right update."""
         return self.noise[:6, :6] + self.bias
 
-    def predicted(self, seconds: float) -> Motion:
+    def predicted(self, seconds: float, stamped: bool = True) -> Motion:
         """Return the state ``seconds`` later, or earlier where they are negative.
 
-        After a gap, the pose stays where it was and its uncertainty grows with the speed that a camera may have.
+        After a gap, the pose stays where it was and its uncertainty grows with the speed that a camera may have. Without a
+        time stamp the interval is an assumption, and the way covered in it is uncertain by as much.
         """
         motion = self.at_rest() if abs(seconds) > LONGEST_GAP else self
         step = motion.velocity * seconds
@@ -90,6 +93,9 @@ class Motion:
         transition[:6, :6] = back
         transition[:6, 6:] = seconds * torch.eye(6, dtype=torch.float64)
         noise = transition @ motion.noise @ transition.T + self._acceleration_noise(seconds)
+        if not stamped:
+            way, turn = (float(torch.linalg.vector_norm(part)) for part in step.split(3))
+            noise[:6, :6] += _scaled(UNSTAMPED * way, UNSTAMPED * turn)
         return replace(motion, T_world_camera=T, noise=_symmetric(noise), bias=back @ self.bias @ back.T)
 
     def at_rest(self) -> Motion:

@@ -4,34 +4,45 @@ from __future__ import annotations
 
 import time
 
+import torch
+
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import FLAT
 from bidnerf_core.localization.auto import LEAST_POINTS, MANY_LANDMARKS, AutoConfig
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.localizer import Localizer
-from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.se3 import SE3
 
 FIRST_FULL_SEARCH = 4
 """The number of lost frames after which the whole surface is searched; then again whenever that number has doubled."""
+LONG_WAIT = 0.25
+"""Seconds without a search after which every frame is searched: such frames come slowly enough."""
 
 
 def relocalized(
-    localizer: Localizer, frame: Frame, predicted: SE3 | None, lost: int, patience: int, seed: int
+    localizer: Localizer,
+    frame: Frame,
+    predicted: SE3 | None,
+    lost: int,
+    patience: int,
+    seed: int,
+    waited: float = 0.0,
 ) -> Localization | None:
     """Return what a search for the pose gives, or None in frames that are left out to save time.
 
-    Where the map has landmarks, they are sought in the first ``patience`` frames after a loss and then in every second. The
-    search of the whole surface, which takes longer, comes at growing intervals; it is the only one in maps without
-    landmarks. ``lost`` is the number of frames since the last accepted pose, 0 at the beginning of a sequence.
+    Where the map has landmarks, they are sought in the first ``patience`` frames after a loss and then in every second, or
+    in every frame where ``waited``, the time (seconds) without a search, is long. The search of the whole surface, which takes
+    longer, comes at growing intervals; it is the only one in maps without landmarks. ``lost`` is the number of frames since
+    the last accepted pose that could be searched, 0 at the beginning of a sequence.
     """
-    if is_blank(frame) and not has_points(frame):
+    if not is_searchable(frame):
         return None
     if uses_landmarks(localizer):
         assert localizer.matcher is not None
-        if lost > patience and lost % 2:
+        if lost > patience and lost % 2 and waited < LONG_WAIT:
             return None
         began = time.perf_counter()
         problem = rig(localizer.map, [View(frame, SE3.identity())], None, None, localizer.matcher)
@@ -54,6 +65,24 @@ def uses_landmarks(localizer: Localizer) -> bool:
     """Return whether the map has landmarks and the method of the localizer makes use of them."""
     config = localizer.config
     return localizer.matcher is not None and isinstance(config, AutoConfig) and config.landmarks
+
+
+def typical_error(localizer: Localizer) -> float:
+    """Return the median error (metres) of positions of the map's own images, 0 where it is not known."""
+    return 0.0 if localizer.matcher is None else localizer.matcher.landmarks.trial.translation
+
+
+def scene_extent(scene: SceneMap) -> float:
+    """Return the size of the scene (metres)."""
+    if scene.surface is not None:
+        return scene.surface.extent
+    corners = torch.tensor([scene.bounds.lower, scene.bounds.upper])
+    return float(torch.linalg.vector_norm(corners[1] - corners[0]))
+
+
+def is_searchable(frame: Frame) -> bool:
+    """Return whether the frame shows anything that can be recognised."""
+    return has_points(frame) or not is_blank(frame)
 
 
 def has_points(frame: Frame) -> bool:

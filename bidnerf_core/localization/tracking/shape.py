@@ -85,9 +85,9 @@ def _descended(
     at_pivot = torch.linalg.inv(about.update_at_camera(T))
     prior = torch.linalg.inv(predicted.covariance)
     for _ in range(SHAPE_STEPS):
-        here = cost(T[None])
+        here, variance = cost.with_variance(T[None])
         # The residuals at a prediction that is off say nothing of the noise, so it is estimated anew in each step.
-        weight = DEPTH_MEASUREMENTS / max(float(cost.residual_variance(T[None])[0]), LEAST_VARIANCE)
+        weight = DEPTH_MEASUREMENTS / max(float(variance[0]), LEAST_VARIANCE)
         kept = _determined(here.hessian[0], cost.cloud)
         hessian = weight * at_pivot.T @ kept.T @ here.hessian[0] @ kept @ at_pivot
         gradient = weight * at_pivot.T @ kept.T @ here.gradient[0]

@@ -23,7 +23,7 @@ from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.se3 import SE3
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 2
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 3
 CLOUD = ("points", "rgb", "origins", "coloured")
 
 
@@ -36,6 +36,7 @@ class TrackerState:
     frames: int = 0  # that the tracker has been called with
     lost: int = 0  # consecutive frames without an accepted pose, up to the last one
     searchable: int = 0  # of these, the frames that could be searched
+    waited: float = 0.0  # seconds that a lost tracker has been without a search
     points: FollowedPoints = field(default_factory=FollowedPoints.none)
     image: Grey | None = None  # the last one, in which the points were seen
     sought: int = 0  # number of points when they were last sought
@@ -61,6 +62,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
         "noise": state.noise, "window": len(state.window),
         "reach": None if state.motion is None else state.motion.reach,
         "agility": None if state.motion is None else state.motion.agility, "searchable": state.searchable,
+        "waited": state.waited,
         "calibrated": state.calibrated, "focal_factor": state.focal_factor,
     }  # fmt: skip
     tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
@@ -127,7 +129,7 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
     miscalibration = Miscalibration(*(tensors[f"miscalibration.{f.name}"] for f in fields(Miscalibration)))
     return TrackerState(
         Clock(numbers["now"], numbers["interval"]), motion, numbers["frames"], numbers["lost"],
-        numbers["searchable"], points,
+        numbers["searchable"], numbers["waited"], points,
         tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
         float("inf") if usual is None else usual, miscalibration, numbers["calibrated"],
         numbers["focal_factor"], numbers["noise"], window,
