@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.localization.training_poses import TrainingPoses, training_poses
 from bidnerf_core.map_cameras import (
     PoseRefinement,
@@ -19,6 +21,7 @@ from bidnerf_core.map_cameras import (
     pose_sentences,
     stored_cameras,
 )
+from bidnerf_core.mapping.features import Sift
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
 from bidnerf_core.mapping.pose_refinement import refined_poses
 from landmark_scene import Points, looking_in, ring
@@ -171,3 +174,24 @@ def test_cameras_that_did_not_move_have_one_pose() -> None:
     cameras = moved_from(views, stored_cameras(views), [0.0] * 4)
     assert cameras == stored_cameras(views)
     assert [camera.moved for camera in cameras] == [None] * 4
+
+
+# Recorded scenes
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "refined"), [("room_living", False), ("tum_fr1_xyz", True)])
+def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
+    data_dir: Path, scene: str, refined: bool
+) -> None:
+    views = open_dataset(data_dir / scene).views("train")[:24]
+    features = Sift(count=500)
+    found = training_poses(tracked_views(views, features), views, features=features)
+    assert found.refined == refined
+    assert found.inconsistency is not None
+    if refined:
+        assert found.noise_after < 0.7 * found.noise_before
+        assert 0.3 < float(found.pixels.median()) < 2
+    else:
+        assert found.inconsistency < 0.1

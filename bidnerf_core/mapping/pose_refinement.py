@@ -17,7 +17,7 @@ from bidnerf_core.mapping.resection import LEAST_NOISE
 from bidnerf_core.mapping.triangulation import noise
 from bidnerf_core.se3 import SE3
 
-ROUNDS = 4
+ROUNDS = 3
 """Largest number of adjustments. After each, the keypoints are matched anew, which finds those that wrong poses hid."""
 SETTLED_PIXELS = 0.25
 """Largest motion of an image by an adjustment after which no other one is needed."""
