@@ -161,7 +161,7 @@ def test_the_mean_motion_is_zero() -> None:
     )
     mean = (found.T_world_camera.translation - given.translation).mean(0)
     typical = (found.T_world_camera.translation - given.translation).norm(dim=-1).median()
-    assert float(mean.norm()) < 1e-3 * float(typical)
+    assert float(mean.norm()) < 1e-2 * float(typical)
 
 
 def test_a_moved_world_has_moved_poses() -> None:

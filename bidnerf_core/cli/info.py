@@ -41,11 +41,8 @@ def info(
         return
     for key, value in facts.items():
         show(f"{key + ':':<12} {_shown(value)}")
-    remarks = (
-        []
-        if stored.info.pose_refinement is None
-        else pose_sentences(stored.info.cameras, stored.info.pose_refinement)
-    )
+    refinement = stored.info.pose_refinement
+    remarks = [] if refinement is None else pose_sentences(stored.info.cameras, refinement)
     for line in remarks if capture is None else [*remarks, *sentences(capture)]:
         show(f"- {line}")
 
