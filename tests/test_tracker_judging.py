@@ -14,6 +14,7 @@ from bidnerf_core.localization.tracking.judging import (
     not_by_chance,
     precise_enough,
     shape_verdict,
+    unconfirmed,
 )
 from flights import flight_frame, without_depth
 
@@ -81,3 +82,9 @@ def test_a_shape_without_a_time_is_not_accepted() -> None:
     assert "time stamp" in shape_verdict(ACCEPTED, small, 1.0, 0.01, stamped=False).reason
     assert shape_verdict(ACCEPTED, covariance(0.05), 1.0, 1.0, stamped=True).outcome is Outcome.IMPRECISE
     assert shape_verdict(ACCEPTED, covariance(0.02), 1.0, 0.004, stamped=True).outcome is Outcome.IMPRECISE
+
+
+def test_few_followed_landmarks_need_confirmation() -> None:
+    assert unconfirmed(ACCEPTED).outcome is Outcome.TOO_FEW_MATCHES
+    other = Verdict(Outcome.UNDETERMINED, "")
+    assert unconfirmed(other) is other

@@ -27,6 +27,16 @@ def not_by_chance(verdict: Verdict, noise: float, threshold: float) -> Verdict:
     return Verdict(Outcome.AMBIGUOUS, f"{verdict.reason}, hardly better than by chance")
 
 
+def unconfirmed(verdict: Verdict) -> Verdict:
+    """Return the verdict on few followed landmarks where none are recognised about the pose, which may have drifted away."""
+    if not verdict.accepted:
+        return verdict
+    return Verdict(
+        Outcome.TOO_FEW_MATCHES,
+        f"{verdict.reason}, but the image does not confirm these few that were followed",
+    )
+
+
 def precise_enough(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
     """Return the verdict, or that the position is too uncertain for the ``distance`` (metres) of what is in view."""
     deviation = position_deviation(covariance)

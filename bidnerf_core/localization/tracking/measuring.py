@@ -37,7 +37,7 @@ from bidnerf_core.localization.tracking.detection import (
     well_spread,
 )
 from bidnerf_core.localization.tracking.flow import Grey, alike, flow
-from bidnerf_core.localization.tracking.judging import not_by_chance, precise_enough
+from bidnerf_core.localization.tracking.judging import not_by_chance, precise_enough, unconfirmed
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose
 from bidnerf_core.localization.tracking.settings import TrackerConfig
@@ -51,7 +51,7 @@ WIDEST = 0.4
 SIGMAS = 3.0
 """The radius in standard deviations of the prediction."""
 ENOUGH_LANDMARKS = 40
-"""The number of followed landmarks that agree from which on no new ones are sought."""
+"""The number of followed landmarks that agree from which on no new ones are sought, and the pose needs no confirmation."""
 INTRINSICS_CHECKED_EVERY = 30
 """The number of frames after which recognised landmarks check the given intrinsics again."""
 SINGLE = LandmarkThresholds(precision=math.inf)
@@ -123,7 +123,10 @@ class ByLandmarks:
             if fresh is not None and (judged is None or fresh[1].accepted or not judged[1].accepted):
                 pose, verdict, points, found, state = fresh
                 return self._fused(frame, state, points[found.inliers], pose, verdict, predicted)
-        return measured
+        if judged is None or measured is None:
+            return None
+        enough = judged[0].inliers >= ENOUGH_LANDMARKS
+        return measured if enough else replace(measured, verdict=unconfirmed(measured.verdict))
 
     def _judged(
         self,
