@@ -7,19 +7,22 @@ of images, the absolute error of depth where depth was measured, and how many sa
 exposure of a photo that it was not trained on: PSNR is measured as rendered, and after the gain and the offset of each colour
 channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
 measured at the poses that the map's landmarks give the test frames, and on training frames at the poses that the map has of
-them. Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the choice of samples that makes it fast, is
-judged beside that on every fifth frame.
+them. Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the choice of samples that
+makes it fast, is judged beside that on every fifth frame. ``--without-depth`` keeps the measured depth of a ``transforms_train.json``
+from the training, and judges by that of the test split.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import resource
 import statistics
 import subprocess
 import sys
 import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -56,11 +59,26 @@ def train(data: Path, out: Path, options: list[str]) -> dict[str, float]:
     }
 
 
+def train_without_depth(data: Path, out: Path, options: list[str]) -> dict[str, float]:
+    """Train on a copy of the dataset whose training frames name no depth, see ``train``."""
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / data.name
+        copy.mkdir()
+        for entry in data.iterdir():
+            (copy / entry.name).symlink_to(entry.resolve())
+        listed = json.loads((data / "transforms_train.json").read_text())
+        for frame in listed["frames"]:
+            frame.pop("depth_file_path", None)
+        (copy / "transforms_train.json").unlink()
+        (copy / "transforms_train.json").write_text(json.dumps(listed))
+        return train(copy, out, options)
+
+
 def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, float | None]:
-    """Mean PSNR (as rendered, and after ``fitted_colours``) and SSIM; median and 90th percentile of absolute depth error
-    (metres) over measured pixels.
+    """Return the mean PSNR (as rendered, and after ``fitted_colours``) and SSIM, and the median and 90th percentile of the
+    absolute depth error (metres) over measured pixels, with the median of its ratio to the measured depth.
     """
-    quality, fitted, likeness, errors, missing, measured = [], [], [], [], 0, 0
+    quality, fitted, likeness, errors, ratios, missing, measured = [], [], [], [], [], 0, 0
     for view in views:
         image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds)
         quality.append(float(psnr(image.rgb, view.frame.rgb, 1.0)))
@@ -70,6 +88,7 @@ def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[
         if view.frame.depth is not None:
             known = view.frame.depth > 0
             errors.append((image.depth - view.frame.depth).abs()[known])
+            ratios.append(errors[-1] / view.frame.depth[known])
             missing += int((known & (image.depth == 0)).sum())
             measured += int(known.sum())
     depth = torch.cat(errors) if errors else torch.zeros(0)
@@ -81,6 +100,7 @@ def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[
         "ssim_mean": statistics.fmean(likeness),
         "samples_per_ray": samples_per_ray(field, bounds, views),
         "depth_error_median": float(depth.median()) if len(depth) else None,
+        "relative_depth_error_median": float(torch.cat(ratios).median()) if errors else None,
         "depth_error_p90": float(depth.quantile(0.9)) if 0 < len(depth) < 2**24 else None,
         "share_of_measured_pixels_without_rendered_depth": missing / measured if measured else None,
     }
@@ -151,14 +171,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--name", required=True, help="of the record")
     parser.add_argument("--keep", action="store_true", help="judge the map that is there already")
+    parser.add_argument(
+        "--without-depth", action="store_true", help="train on the colours of transforms_train.json alone"
+    )
     words = sys.argv[1:]
     end = words.index("--") if "--" in words else len(words)
     given = parser.parse_args(words[:end])
-    training = {} if given.keep else train(given.data, given.out, words[end + 1 :])
+    trained = train_without_depth if given.without_depth else train
+    training = {} if given.keep else trained(given.data, given.out, words[end + 1 :])
     stored = load_map(given.out)
     views = open_dataset(given.data, stored.bounds.background).views("test")
     results = {
         "backend": stored.info.backend,
+        "trained_without_depth": given.without_depth,
         "config": stored.info.config,
         "training": training,
         "training_seconds_in_map": stored.info.seconds,
