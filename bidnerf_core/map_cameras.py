@@ -105,7 +105,8 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
     moved = [camera.moved for camera in cameras if camera.moved is not None]
     wrong = [m for m in moved if m.name in found.replaced]
     error = f"errors of the given poses add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
-    lines = [f"{error}; the poses are kept" if not found.refined else f"{error}; {_typical_motion(moved)}"]
+    refined = found.refined and moved
+    lines = [f"{error}; {_typical_motion(moved)}" if refined else f"{error}; the poses are kept"]
     if wrong:
         listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in wrong)
         lines.append(f"moved to where the landmarks of the other images place them: {listed}")

@@ -61,10 +61,8 @@ class MapInfo:
     data: str = ""  # name of the dataset's folder
     seconds: float = 0.0  # of training
     cameras: tuple[StoredCamera, ...] = ()
-    pose_refinement: PoseRefinement | None = None  # of the cameras; None where their given poses were kept
-    distances: bool = (
-        True  # whether the training images showed how far things are; photos from one place do not
-    )
+    pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
+    distances: bool = True  # False if the images, from one place, do not show how far things are
     sparse_depth: int = 0  # pixels of the training images that had their depth from structure from motion
     weights: str = ""  # file names
     training: str | None = None  # what resuming needs; dropped when training is complete

@@ -45,6 +45,16 @@ def test_a_recording_without_a_camera_says_how_to_give_one(
     assert "or --camera with one of freiburg1, freiburg2 and freiburg3, or a file" in found.err
 
 
+def test_an_unknown_name_of_a_camera_is_answered_with_the_known_ones(
+    bidnerf: Run, shared: Path, tmp_path: Path
+) -> None:
+    words = ["train", shared / "data", "--out", tmp_path / "map", "--camera", "freiburg9"]
+    found = bidnerf(*words, *tiny.options())
+    assert found.status == 1
+    assert "freiburg9: no such file" in found.err
+    assert "one of freiburg1, freiburg2 and freiburg3, or a file" in found.err
+
+
 def test_localize_takes_the_camera_and_the_registration(bidnerf: Run, shared: Path) -> None:
     begin = ["localize", shared / "map", shared / "data", "--json", "--method", "bid", "--max-steps", 2]
     begin += ["--rays", 64, "--perturb", 0.02, 1, "--depth-weight", 1, "--camera", shared / "camera.json"]

@@ -75,7 +75,9 @@ def test_never_and_images_without_keypoints_keep_the_given_poses(
 ) -> None:
     for when in ("never", "auto", "always"):
         words = ["train", data, "--out", tmp_path / when, "--refine-poses", when, *tiny.options(2)]
-        assert bidnerf(*words).status == 0
+        found = bidnerf(*words)
+        assert found.status == 0
+        assert ("the poses are kept: to refine them takes 8 images" in found.err) == (when == "always")
         info = load_info(tmp_path / when)
         assert info.cameras == stored_cameras(views_of(data))
         assert info.pose_refinement is None

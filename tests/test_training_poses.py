@@ -107,6 +107,8 @@ def test_a_wrong_pose_is_put_right_and_the_others_are_kept(turn: float) -> None:
     found, _, true = refined(0.4, updates)
     assert found.replaced == [WRONG]
     assert not found.refined
+    again = found.tracked.matched_anew(LandmarkConfig())  # as a resumed training matches them
+    assert torch.equal(found.tracked.observations.point, again.observations.point)
     poses = found.tracked.T_world_camera
     translation, rotation = (true[WRONG].inverse() @ poses[WRONG]).log().split(3)
     assert float(translation.norm()) < 0.02
@@ -174,6 +176,8 @@ def test_cameras_that_did_not_move_have_one_pose() -> None:
     cameras = moved_from(views, stored_cameras(views), [0.0] * 4)
     assert cameras == stored_cameras(views)
     assert [camera.moved for camera in cameras] == [None] * 4
+    (line,) = pose_sentences(cameras, PoseRefinement(0.3, 0.3, True))
+    assert line.endswith("the poses are kept")
 
 
 # Recorded scenes

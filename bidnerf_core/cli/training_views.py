@@ -20,6 +20,7 @@ from bidnerf_core.map_cameras import (
 )
 from bidnerf_core.mapping.capture_coverage import shows_distances
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
+from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
 
 Refinement = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` does where they are inconsistent."""
@@ -55,6 +56,11 @@ def prepared(views: Sequence[View], refinement: Refinement = "auto") -> Training
     names = tuple(views[number].frame.name for number in found.replaced)
     noise = (found.noise_before, found.noise_after)
     summary = PoseRefinement(*noise, found.refined, names) if found.inconsistency is not None else None
+    if summary is None and refinement == "always":
+        say(
+            f"the poses are kept: to refine them takes {ENOUGH_IMAGES} images or more that show {LEAST_VISIBLE_POINTS}"
+            " triangulated points each"
+        )
     for line in [] if summary is None else pose_sentences(cameras, summary):
         say(line)
     seeing, distances = _with_landmarks(moved, found.tracked), shows_distances(views, tracked)

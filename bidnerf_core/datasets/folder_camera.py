@@ -16,8 +16,8 @@ CAMERA_FILES = ("camera.json", "cameras.txt")
 class FolderCamera:
     """The camera ``given`` (intrinsics or a file), or that of a file in ``folder``, or the ``published`` one of the format.
 
-    Raises ``InputError`` where there is none of them; the message begins with ``unknown``, which says why,
-    and ends with the ``ways`` to give one.
+    Raises ``InputError`` where there is none of them, with ``unknown``, which says why, and the ``ways`` to give one; and
+    for a given file that does not exist.
     """
 
     def __init__(
@@ -28,6 +28,8 @@ class FolderCamera:
         unknown: str = "",
         ways: str = "a file",
     ) -> None:
+        if isinstance(given, Path) and not given.exists():
+            raise InputError(f"{given}: no such file, expected as the camera of {folder}: {ways}")
         beside = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
         found = given or beside or published
         if found is None:

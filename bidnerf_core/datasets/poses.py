@@ -66,7 +66,7 @@ def _matrix(record: Record, key: str, rows: list[Any] | None) -> Tensor:
     if rows is None:
         raise record.error(f"no {key}, expected a 4x4 camera-to-world matrix")
     if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise record.error(f"{key} is not 3x4 or 4x4, expected a 4x4 camera-to-world matrix")
+        raise record.error(f"{key} is not 3x4 or 4x4, expected a 4x4 matrix")
     numbers = [[record.checked_number(x, f"a number of {key}") for x in row] for row in rows]
     if len(numbers) == 4 and max(abs(x - y) for x, y in zip(numbers[3], (0, 0, 0, 1), strict=True)) > 1e-6:
         raise record.error(f"the last row of {key} is {numbers[3]}, expected [0, 0, 0, 1]")

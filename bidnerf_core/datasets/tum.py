@@ -11,9 +11,9 @@ Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, reg
 images contain the correction of the depth scale already. Depth of other recordings in this layout is registered by the sensor
 that is given.
 
-The camera is, in this order, the one that is given, as a file or as ``freiburg1``, 2 or 3; that in ``camera.json`` or ``cameras.txt`` of the folder (as ``--camera``
-of ``bidnerf localize`` takes them); and the published one of freiburg1, 2 or 3, which the folder's name says. Published
-principal points count pixels from the centre of the upper left one and are half a pixel larger here. Colour images of
+The camera is, in this order, the one that is given, as a file or as ``freiburg1``, 2 or 3; that in ``camera.json`` or
+``cameras.txt`` of the folder (as ``--camera`` of ``bidnerf localize`` takes them); and the published one of freiburg1, 2 or 3,
+which the folder's name says. Published principal points count pixels from the centre of the upper left one and are half a pixel larger here. Colour images of
 freiburg1 and freiburg2 are distorted; the camera models it (k1 k2 p1 p2 k3), so that no image is resampled.
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -27,14 +27,10 @@ class TrainingPoses:
     """The poses to train with, and how far they are from the given ones."""
 
     tracked: TrackedViews  # with these poses
-    pixels: Float[
-        Tensor, "v"
-    ]  # how far the points that an image shows move in it, median; 0 where the pose was kept
-    replaced: list[int]  # images whose given pose was wrong, and which landmarks of the others placed
+    pixels: Float[Tensor, "v"]  # median motion of the points in an image; 0 where its pose was kept
+    replaced: list[int]  # images whose given pose was wrong, placed by landmarks of the others
     refined: bool  # whether all poses were refined
-    inconsistency: (
-        float | None
-    )  # pixels that errors of the given poses add to the keypoints; None if that is not known
+    inconsistency: float | None  # pixels, as in ``RefinedPoses``; None if not known
     noise_before: float = 0.0  # pixels: standard deviation of the keypoints about their points
     noise_after: float = 0.0
 
@@ -62,6 +58,8 @@ def training_poses(
         tracked = tracked.at(given.retract(updates)).matched_anew(config, progress)
     fit = refined_poses(tracked, config, progress, least)
     answer = _chosen(tracked, fit, list(wrong), least)
+    if wrong and fit is not None and not answer.refined:
+        answer = replace(answer, tracked=answer.tracked.matched_anew(config, progress))
     for number, found in wrong.items():
         answer.pixels[number] = found.pixels
     return answer

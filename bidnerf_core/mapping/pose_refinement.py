@@ -51,7 +51,7 @@ def refined_poses(
     """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
 
     The errors of the given poses are taken as independent of each other, and as large as resection of the images
-    suggests. This prior alone holds the whole arrangement in its place, so that the mean motion of the images is zero. If the
+    suggests. This prior alone holds the whole arrangement in its place, so that the mean motion of the images is about zero. If the
     first adjustment finds an inconsistency of less than ``least`` pixels, its poses are returned at once.
     """
     given = tracked.T_world_camera
