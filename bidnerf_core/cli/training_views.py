@@ -56,10 +56,10 @@ def prepared(views: Sequence[View], refinement: Refinement = "auto") -> Training
     names = tuple(views[number].frame.name for number in found.replaced)
     noise = (found.noise_before, found.noise_after)
     summary = PoseRefinement(*noise, found.refined, names) if found.inconsistency is not None else None
-    if summary is None and refinement == "always":
+    if summary is None and (refinement == "always" or len(views) >= ENOUGH_IMAGES):
         say(
             f"the poses are kept: to refine them takes {ENOUGH_IMAGES} images or more that show {LEAST_VISIBLE_POINTS}"
-            " triangulated points each"
+            " triangulated points each; if these images overlap, check the order and the axes of their poses"
         )
     for line in [] if summary is None else pose_sentences(cameras, summary):
         say(line)

@@ -194,7 +194,7 @@ def _with_sensor(reader: Reader, folder: Path, register: DepthRegistration | Non
         return reader
     if not isinstance(reader, DepthSensorReader):
         raise InputError(
-            f"{folder}: is a dataset whose depth belongs to its images, expected no registration"
+            f"{folder}: is a dataset whose depth belongs to its images, expected no registration; leave out register_depth"
         )
     if register is True and reader.sensor is not None:
         return reader
