@@ -93,10 +93,10 @@ class Resampled:
         return self.field.query(positions, directions)
 
 
-Rows = TypeVar("Rows", Rays, RaySamples)
+OfRays = TypeVar("OfRays", Rays, RaySamples)
 
 
-def _rows(of: Rows, index: Int[Tensor, "n"]) -> Rows:
+def _rows(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
     """Return the rays, or the samples of the rays, with these numbers."""
     leading = (of.near if isinstance(of, Rays) else of.starts[..., 0]).dim()
     parts = (getattr(of, field.name) for field in fields(of))
