@@ -26,7 +26,7 @@ from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
 
-CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
+SMALL_CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
 SMALL_FIELD = [
     "--levels",
     "3",
@@ -69,7 +69,9 @@ Door: TypeAlias = Words | PythonDoor
 def sound_folder(folder: Path) -> None:
     """Write a dataset, a map of it with surface and landmarks, photos with depth, and every other kind of input."""
     scene = demo_object()
-    train, test = (seen_from(scene, CAMERA, orbit(3.5, count, seed=seed)) for seed, count in ((0, 6), (1, 2)))
+    train, test = (
+        seen_from(scene, SMALL_CAMERA, orbit(3.5, count, seed=seed)) for seed, count in ((0, 6), (1, 2))
+    )
     write_transforms(folder / "data", {"train": train, "test": test}, scene.bounds.background)
     _run("train", folder / "data", "--out", folder / "map", *SMALL_FIELD, "--steps", "6", "--no-bake")
     _run("bake", folder / "map", "--data", folder / "data", *BAKED)
@@ -115,7 +117,7 @@ def _dataset(folder: Path) -> object:
 
 def _localizer(folder: Path) -> object:
     stored = load_map(folder / "map")
-    view = seen_from(demo_object(), CAMERA, orbit(3.5, 1, seed=1))[0]
+    view = seen_from(demo_object(), SMALL_CAMERA, orbit(3.5, 1, seed=1))[0]
     config = settings_of("auto", {"points": 100, "hypotheses": 8, "rounds": 1, "refine_rays": 64})
     return Localizer(stored, "auto", config)(view.frame)
 
@@ -388,9 +390,9 @@ def odd_call(chance: Random) -> tuple[str, PythonDoor]:
             *drawn, chance.choice(((), (1, 2), (float("nan"),) * 4, (1e9,) * 5, None, "k1"))
         ),
         "from_hfov": lambda folder: Intrinsics.from_hfov(drawn[0], drawn[1], drawn[2]),
-        "from_numpy": lambda folder: Frame.from_numpy(pixels, CAMERA),
+        "from_numpy": lambda folder: Frame.from_numpy(pixels, SMALL_CAMERA),
         "from_numpy depth": lambda folder: Frame.from_numpy(
-            np.zeros((24, 24, 3), "u1"), CAMERA, depth=pixels, depth_unit=drawn[0]
+            np.zeros((24, 24, 3), "u1"), SMALL_CAMERA, depth=pixels, depth_unit=drawn[0]
         ),
         "Localizer": lambda folder: Localizer(drawn[0], drawn[1], drawn[2]),
         "start": lambda folder: Localizer(

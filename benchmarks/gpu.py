@@ -50,12 +50,12 @@ from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.waiting import without_waiting
 
-RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
+TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
 FRAMES = 40
 """Largest number of frames that are localized without a start."""
 
 
-def made_steps(folder: str, data: str, level: int, device: torch.device, rays: int = RAYS) -> AdamSteps:
+def made_steps(folder: str, data: str, level: int, device: torch.device, rays: int = TIMED_RAYS) -> AdamSteps:
     """Return the steps of ``bid`` from 0.1 units beside the first test frame's pose."""
     stored, dataset = opened(folder, data)
     there = None if device.type == "cpu" else device
@@ -174,7 +174,7 @@ def main() -> None:
         return
     device, gpu = torch.device("cuda"), torch.cuda.get_device_name()
     given.out.mkdir(parents=True, exist_ok=True)
-    results: dict[str, Any] = {"gpu": gpu, "rays": RAYS}
+    results: dict[str, Any] = {"gpu": gpu, "rays": TIMED_RAYS}
     with RowStore(given.out / "gpu.rows.jsonl") as store:
         for folder in given.map:
             name = Path(folder).name

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gpu import RAYS, made_steps
+from gpu import TIMED_RAYS, made_steps
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -57,7 +57,7 @@ class Counter(TorchDispatchMode):
         return found
 
 
-def counted(folder: str, data: str, level: int, rays: int = RAYS) -> dict[str, Any]:
+def counted(folder: str, data: str, level: int, rays: int = TIMED_RAYS) -> dict[str, Any]:
     """Return the counts of a step, and the estimate in milliseconds, with launches and without."""
     with Elsewhere():
         steps = made_steps(folder, data, level, DEVICE, rays)
@@ -82,7 +82,7 @@ def main() -> None:
     parser.add_argument("data")
     parser.add_argument("--map", nargs="+", required=True)
     parser.add_argument("--level", type=int, nargs="+", help="default: all")
-    parser.add_argument("--rays", type=int, default=RAYS)
+    parser.add_argument("--rays", type=int, default=TIMED_RAYS)
     parser.add_argument("--name", required=True, help="of the record")
     parser.add_argument("--out", type=Path, default=RESULTS)
     given = parser.parse_args()

@@ -20,7 +20,9 @@ FARTHEST = 1e9
 """Metres. No sensor measures more, and float32 has no use for it."""
 NOTHING = 1e10
 """Floating-point values from here on stand for "nothing", whatever the unit: Blender's 1e10, the largest float."""
-INTEGER_UNIT, FLOAT_UNIT = 0.001, 1.0
+MILLIMETRE = 0.001
+"""Metres."""
+INTEGER_UNIT, FLOAT_UNIT = MILLIMETRE, 1.0
 """Metres a step where the user gives none."""
 SPIKE, SPIKE_PIXELS = 0.05, 20
 """Share and count of an image's pixels from which on its largest value may be the sensor's limit, not a measurement ..."""

@@ -13,7 +13,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
 
-Rows = tuple[tuple[float, float, float, float], ...]
+MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
 
 
@@ -23,8 +23,8 @@ class StoredCamera:
 
     name: str
     intrinsics: Intrinsics
-    T_world_camera: Rows
-    given_T_world_camera: Rows | None = None  # the dataset's, where training refined it
+    T_world_camera: MatrixRows
+    given_T_world_camera: MatrixRows | None = None  # the dataset's, where training refined it
     moved_pixels: float | None = None  # how far the points that the image shows move in it from there, median
 
     @property
@@ -62,18 +62,24 @@ class MovedCamera:
 
 
 @dataclass(frozen=True)
-class PoseRefinement:
-    """How well the given poses of a map's images fit the keypoints that the images share, and how well refined ones do."""
+class PoseConsistency:
+    """How well the given poses of images fit the keypoints that the images share, and how well adjusted ones do."""
 
-    noise_before: float  # pixels: standard deviation of the keypoints about their points
+    noise_before: float  # pixels: standard deviation of the keypoints about their points at the given poses
     noise_after: float
-    refined: bool  # whether training took the refined poses
-    replaced: tuple[str, ...] = ()  # images whose given pose was wrong; landmarks of the others placed them
 
     @property
     def inconsistency(self) -> float:
         """The deviation of keypoints (pixels) that errors of the given poses add to the keypoints' own noise."""
         return max(0.0, self.noise_before**2 - self.noise_after**2) ** 0.5
+
+
+@dataclass(frozen=True)
+class PoseRefinement(PoseConsistency):
+    """What training found of the given poses of a map's images, and which ones it took."""
+
+    refined: bool  # whether training took the adjusted poses
+    replaced: tuple[str, ...] = ()  # images whose given pose was wrong; landmarks of the others placed them
 
 
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
@@ -131,9 +137,9 @@ def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> l
     return [replace(view, T_ref_camera=T) for view, T in zip(views, poses, strict=True)]
 
 
-def _rows(T: SE3) -> Rows:
+def _rows(T: SE3) -> MatrixRows:
     return tuple(tuple(row) for row in T.matrix().tolist())
 
 
-def _pose(rows: Rows) -> SE3:
+def _pose(rows: MatrixRows) -> SE3:
     return SE3.from_matrix(torch.tensor(rows, dtype=torch.float64))

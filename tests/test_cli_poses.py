@@ -15,7 +15,7 @@ from bidnerf_core import View
 from bidnerf_core.cli import training_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.localization.training_poses import TrainingPoses
-from bidnerf_core.map_cameras import as_given, stored_cameras
+from bidnerf_core.map_cameras import PoseConsistency, as_given, stored_cameras
 from bidnerf_core.map_parts import load_capture
 from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.storage import cameras_of, load_info
@@ -35,7 +35,7 @@ def refining(monkeypatch: pytest.MonkeyPatch) -> None:
         pixels = torch.full((len(views),), 0.9, dtype=torch.float64)
         pixels[2] = 1.4
         there = tracked.at(tracked.T_world_camera.retract(UPDATE))
-        return TrainingPoses(there, pixels, [1], True, 0.6, 0.7, 0.36)
+        return TrainingPoses(there, pixels, [1], True, PoseConsistency(0.7, 0.36))
 
     monkeypatch.setattr(training_views, "training_poses", moved)
 
@@ -95,6 +95,8 @@ def test_a_resumed_training_takes_the_refined_poses_again(
         stop_at(patch, 5)
         assert bidnerf(*train, "--out", tmp_path / "half").status == 130
     monkeypatch.setattr(training_views, "training_poses", None)  # it is not called again
+    other = bidnerf("train", data, "--resume", "--refine-poses", "never", "--out", tmp_path / "half")
+    assert (other.status, "was begun with refined poses" in other.err) == (2, True)
     assert bidnerf("train", data, "--resume", "--no-bake", "--out", tmp_path / "half").status == 0
     assert_same_map(tmp_path / "half", tmp_path / "whole")
     assert load_info(tmp_path / "half").cameras == load_info(tmp_path / "whole").cameras

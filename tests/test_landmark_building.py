@@ -14,7 +14,7 @@ from bidnerf_core.mapping.landmark_building import LandmarkConfig, build_landmar
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.pose_scatter import robust_covariance
 from bidnerf_core.mapping.tracks import Matches, joined_tracks
-from bidnerf_core.mapping.triangulation import Sightings, intersected, parallax, refined
+from bidnerf_core.mapping.triangulation import Sightings, intersected, parallax, refined_points
 from bidnerf_core.mapping.view_pairs import likely_pairs
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
@@ -153,7 +153,7 @@ def test_covariance_of_a_triangulated_point_is_that_of_many_trials() -> None:
         [looking_in(0.15 * i) for i in range(4)],
     )
     seen = sightings(point, cameras, 0.5, 3000)
-    found, unit = refined(seen, intersected(seen, 3000), 50.0)
+    found, unit = refined_points(seen, intersected(seen, 3000), 50.0)
     sampled = (found - point).mT @ (found - point) / len(found)
     expected = 0.25 * unit.mean(0)
     whitened = torch.linalg.solve(torch.linalg.cholesky(expected), sampled)
@@ -170,7 +170,7 @@ def test_one_wrong_observation_of_six_does_not_pull_a_point_away() -> None:
     seen.image[2] += 0.1  # 30 pixels
     found = intersected(seen, 1)
     for scale in (5.0, 1.0, 0.2):
-        found, _ = refined(seen, found, scale)
+        found, _ = refined_points(seen, found, scale)
     assert float((found[0] - point).norm()) < 1e-3
 
 

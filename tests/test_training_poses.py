@@ -23,7 +23,7 @@ from bidnerf_core.map_cameras import (
 )
 from bidnerf_core.mapping.features import Sift
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
-from bidnerf_core.mapping.pose_refinement import refined_poses
+from bidnerf_core.mapping.pose_refinement import adjusted_poses
 from landmark_scene import Points, looking_in, ring
 
 VIEWS, WRONG = 16, 7
@@ -69,7 +69,8 @@ def test_exact_poses_do_not_move_at_all() -> None:
         [(found.tracked.T_world_camera[i].inverse() @ v.T_ref_camera).log() for i, v in enumerate(views)]
     )
     assert float(moved.abs().max()) < 1e-5  # the keypoints are float32
-    assert found.inconsistency == pytest.approx(0, abs=1e-3)
+    assert found.consistency is not None
+    assert found.consistency.inconsistency == pytest.approx(0, abs=1e-3)
 
 
 def test_poses_that_fit_are_kept() -> None:
@@ -78,17 +79,17 @@ def test_poses_that_fit_are_kept() -> None:
     assert found.replaced == []
     for i, view in enumerate(views):
         assert torch.equal(found.tracked.T_world_camera[i].matrix(), view.T_ref_camera.matrix())
-    assert found.inconsistency is not None
-    assert found.inconsistency < 0.15
+    assert found.consistency is not None
+    assert found.consistency.inconsistency < 0.15
 
 
 def test_known_errors_are_taken_back() -> None:
     found, views, true = inaccurate()
     given = SE3.stack([view.T_ref_camera for view in views])
     assert found.refined
-    assert found.inconsistency is not None
-    assert found.inconsistency > 0.5
-    assert found.noise_after == pytest.approx(0.4, rel=0.2)
+    assert found.consistency is not None
+    assert found.consistency.inconsistency > 0.5
+    assert found.consistency.noise_after == pytest.approx(0.4, rel=0.2)
     assert float(off(found.tracked.T_world_camera, true).median()) < 0.4 * float(off(given, true).median())
     assert 0.5 < float(found.pixels.median()) < 4
     motion = found.tracked.T_world_camera.translation - given.translation
@@ -132,9 +133,9 @@ def test_too_few_images_are_left_alone() -> None:
     points = Points()
     views = ring(points, 3)
     tracked = tracked_views(views, points)
-    assert refined_poses(tracked, LandmarkConfig()) is None
+    assert adjusted_poses(tracked, LandmarkConfig()) is None
     found = training_poses(tracked, views, features=points)
-    assert (found.refined, found.inconsistency, found.replaced) == (False, None, [])
+    assert (found.refined, found.consistency, found.replaced) == (False, None, [])
 
 
 def test_nothing_in_common_leaves_the_poses_alone() -> None:
@@ -145,7 +146,7 @@ def test_nothing_in_common_leaves_the_poses_alone() -> None:
     ]
     points.seen.append(points.seen[0][torch.zeros(0, dtype=torch.long)])
     found = training_poses(tracked_views(blank, points), blank, features=points)
-    assert (found.refined, found.inconsistency, found.replaced) == (False, None, [])
+    assert (found.refined, found.consistency, found.replaced) == (False, None, [])
 
 
 def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:
@@ -166,7 +167,9 @@ def test_stored_cameras_hold_both_poses_and_how_far_they_are_apart() -> None:
     assert camera is not None
     assert camera.translation == pytest.approx(float(update[:3].norm()))
     assert camera.rotation_deg == pytest.approx(float(update[3:].norm().rad2deg()))
-    (line,) = pose_sentences(cameras, PoseRefinement(found.noise_before, found.noise_after, True))
+    assert found.consistency is not None
+    found_noise = found.consistency.noise_before, found.consistency.noise_after
+    (line,) = pose_sentences(cameras, PoseRefinement(*found_noise, True))
     worst = max(range(VIEWS), key=lambda i: float(found.pixels[i]))
     assert f"{views[worst].frame.name} most" in line
 
@@ -193,9 +196,9 @@ def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
     features = Sift(count=500)
     found = training_poses(tracked_views(views, features), views, features=features)
     assert found.refined == refined
-    assert found.inconsistency is not None
+    assert found.consistency is not None
     if refined:
-        assert found.noise_after < 0.7 * found.noise_before
+        assert found.consistency.noise_after < 0.7 * found.consistency.noise_before
         assert 0.3 < float(found.pixels.median()) < 2
     else:
-        assert found.inconsistency < 0.1
+        assert found.consistency.inconsistency < 0.1

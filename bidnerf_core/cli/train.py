@@ -26,7 +26,7 @@ from bidnerf_core.cli.common import (
     wrong_usage,
 )
 from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
-from bidnerf_core.cli.training_views import Refinement, located, prepared
+from bidnerf_core.cli.training_views import RefinementChoice, located, prepared
 from bidnerf_core.datasets import Background, Dataset, DepthRegistration, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
@@ -107,7 +107,7 @@ def run(arguments: list[str]) -> None:
             option("MODEL", "COLMAP sparse model whose points give depth to images that have none", ""),
         ] = None,
         refine_poses: Annotated[
-            Refinement,
+            RefinementChoice,
             option(
                 "WHEN",
                 "refine the given poses by the keypoints that images share: always, never, or auto: if inconsistent",
@@ -137,6 +137,7 @@ def run(arguments: list[str]) -> None:
             if resume:
                 info = load_interrupted(out, not no_bake)
                 _check_unchanged(out, info, named, kind(), config)
+                _check_refinement(out, info, refine_poses)
                 with output_folder(out, overwrite=True):
                     _resume(info, source, out, checkpoint_every, not no_bake)
             else:
@@ -153,7 +154,7 @@ def run(arguments: list[str]) -> None:
 def train_map(
     backend: Backend, name: str, views: Sequence[View], config: Any, out: Path, data: str,
     background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS, baked: bool = True,
-    sparse_depth: int = 0, refinement: Refinement = "auto",
+    sparse_depth: int = 0, refinement: RefinementChoice = "auto",
 ) -> None:  # fmt: skip
     """Train a new map into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
     taken = prepared(views, refinement)
@@ -208,9 +209,21 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
             )
 
 
+def _check_refinement(out: Path, info: MapInfo, refinement: RefinementChoice) -> None:
+    """Raise ``UsageError`` for a choice of poses that differs from what the interrupted training did."""
+    if info.pose_refinement is None:  # "never", or too few keypoints for any
+        return
+    refined = info.pose_refinement.refined
+    if refinement == ("never" if refined else "always"):
+        has = "refined" if refined else "given"
+        raise UsageError(
+            f"{out}: was begun with {has} poses, got --refine-poses {refinement}; --resume keeps the poses"
+        )
+
+
 def _start(
     backend: Backend, name: str, source: Source, out: Path, config: Any, checkpoint_seconds: float, baked: bool,
-    refinement: Refinement,
+    refinement: RefinementChoice,
 ) -> None:  # fmt: skip
     dataset = source.dataset(source.background)
     views, sparse_depth = source.views(dataset)

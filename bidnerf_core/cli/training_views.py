@@ -19,10 +19,10 @@ from bidnerf_core.map_cameras import (
     stored_cameras,
 )
 from bidnerf_core.mapping.capture_coverage import shows_distances
-from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
+from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedViews, tracked_views
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
 
-Refinement = Literal["auto", "always", "never"]
+RefinementChoice = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` does where they are inconsistent."""
 
 
@@ -37,7 +37,7 @@ class TrainingViews:
     distances: bool = True  # whether the views show how far things are
 
 
-def prepared(views: Sequence[View], refinement: Refinement = "auto") -> TrainingViews:
+def prepared(views: Sequence[View], refinement: RefinementChoice = "auto") -> TrainingViews:
     """Refine the poses of the views where that is wanted, and find the landmarks that they show."""
     if refinement == "never":
         tracked, seeing = located(views)
@@ -54,8 +54,10 @@ def prepared(views: Sequence[View], refinement: Refinement = "auto") -> Training
         moved = list(views)
     cameras = moved_from(views, stored_cameras(moved), found.pixels.tolist())
     names = tuple(views[number].frame.name for number in found.replaced)
-    noise = (found.noise_before, found.noise_after)
-    summary = PoseRefinement(*noise, found.refined, names) if found.inconsistency is not None else None
+    summary = None
+    if found.consistency is not None:
+        before, after = found.consistency.noise_before, found.consistency.noise_after
+        summary = PoseRefinement(before, after, found.refined, names)
     if summary is None and (refinement == "always" or len(views) >= ENOUGH_IMAGES):
         say(
             f"the poses are kept: to refine them takes {ENOUGH_IMAGES} images or more that show {LEAST_VISIBLE_POINTS}"
@@ -92,7 +94,7 @@ def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
     """Return the views with the landmarks that each shows, unless no view needs them for its distances."""
     if not any(map(_lacks_distances, views)):
         return list(views)
-    seen = tracked.seen(LandmarkConfig())
+    seen = tracked.seen(DEFAULT_LANDMARKS)
     count = sum(len(part.distance) for part in seen)
     say(f"{count} sightings of landmarks in {len(views)} views")
     return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]

@@ -35,7 +35,7 @@ Number = TypeVar("Number", int, float)
 NAMES = ("images", "points3D")
 COUNT, IMAGE, POINT = struct.Struct("<Q"), struct.Struct("<I7dI"), struct.Struct("<q3d3BdQ")
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
-CAMERA = struct.Struct("<IiQQ")
+CAMERA_RECORD = struct.Struct("<IiQQ")
 LARGEST_MODEL = 2**30  # bytes of a file of a model
 TRACK_BYTES = 8  # an image and one of its key points, 4 bytes each
 
@@ -109,7 +109,7 @@ def has_posed_images(folder: Path, suffix: str | None = None) -> bool:
 
 
 def _binary_camera(file: _Bytes) -> tuple[int, Intrinsics]:
-    number, model, width, height = file.take(CAMERA)
+    number, model, width, height = file.take(CAMERA_RECORD)
     where = f"{file.path}: camera {number}"
     name = COLMAP_MODEL_IDS.get(model)
     if name is None:

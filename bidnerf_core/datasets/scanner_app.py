@@ -34,7 +34,7 @@ from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.poses import pose_of_rows
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
-from bidnerf_core.depth_images import DepthImage, read_depth_image
+from bidnerf_core.depth_images import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.files import read_file
 from bidnerf_core.frames import Frame, View
@@ -46,8 +46,6 @@ from bidnerf_core.se3 import SE3
 
 LARGEST_SIDE = 640
 """Pixels of the longer side of a photo once it is read."""
-DEPTH_UNIT = 0.001
-"""Metres."""
 RANGE = 5.0
 """Metres that the LiDAR measures, by Apple's statement; what is beyond was inferred from the photo."""
 HIGH_CONFIDENCE = 2
@@ -224,7 +222,7 @@ def read_measured(depth: Path, confidence: Path) -> DepthImage:
 
     Raises ``InputError`` where a file is not readable or not what it should be.
     """
-    measured = read_depth_image(depth, DEPTH_UNIT)
+    measured = read_depth_image(depth, MILLIMETRE)
     sure = decode(confidence)
     height, width = measured.metres.shape
     if sure.shape != (height, width):

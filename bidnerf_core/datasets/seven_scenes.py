@@ -32,7 +32,7 @@ from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.pose_files import read_pose_matrix
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
-from bidnerf_core.depth_images import DepthReader
+from bidnerf_core.depth_images import MILLIMETRE, DepthReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.files import read_file
 from bidnerf_core.frames import Frame, View
@@ -40,7 +40,6 @@ from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.photos import natural_order
 from bidnerf_core.se3 import SE3
 
-DEPTH_UNIT = 0.001
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
 COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)
 T_COLOUR_DEPTH = SE3(
@@ -164,7 +163,7 @@ class SevenScenesDataset(OpaqueDataset[SceneFrame]):
         colour, alpha = read_image(frame.image)
         depth = None
         if frame.depth.is_file():
-            depth = self._read_depth(frame.depth, DEPTH_UNIT).metres
+            depth = self._read_depth(frame.depth, MILLIMETRE).metres
             if self._sensor is not None:
                 depth = self._sensor.registered(depth, camera, frame.depth)
             elif depth.shape != colour.shape[:2]:

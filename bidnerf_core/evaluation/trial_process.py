@@ -23,7 +23,7 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.settings import to_flat
 
-RAYS = 2048
+COUNTED_RAYS = 2048
 """The number of rays on which samples are counted."""
 
 
@@ -81,10 +81,10 @@ def samples_per_ray(trial: Trial) -> float:
     number = to_flat(parse_settings(trial.method, trial.config)).get("level")
     level = stored.field if number is None else levels(stored.field)[number]
     own = (View(view.frame, SE3.identity()),)
-    pixels = draw(own, RAYS, uniform, torch.Generator().manual_seed(trial.seed))
+    pixels = draw(own, COUNTED_RAYS, uniform, torch.Generator().manual_seed(trial.seed))
     with torch.no_grad():
         samples = level.sampler(pixels.rays(view.T_ref_camera, stored.bounds))
-    return float(samples.valid.sum()) / RAYS
+    return float(samples.valid.sum()) / COUNTED_RAYS
 
 
 def _serve(questions: Iterable[str], answers: Any) -> None:

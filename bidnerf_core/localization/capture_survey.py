@@ -23,13 +23,13 @@ from bidnerf_core.mapping.capture_photos import (
 )
 from bidnerf_core.mapping.capture_report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.mapping.features import SIFT, Features
-from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
+from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, LandmarkConfig, TrackedViews
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.landmarks import HeldOutTrial
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, pose_updates, robust_covariance
 from bidnerf_core.mapping.triangulation import noise
 
-DEFAULTS, NOT_TRIED = LandmarkConfig(), HeldOutTrial()
+NOT_TRIED = HeldOutTrial()
 LEAST_EXPOSURE = 1.0
 """Stops by which a photo must at least differ to be badly exposed; training corrects less."""
 CLIPPED = 0.25
@@ -40,7 +40,7 @@ def surveyed(
     tracked: TrackedViews,
     views: Sequence[View],
     features: Features = SIFT,
-    config: LandmarkConfig = DEFAULTS,
+    config: LandmarkConfig = DEFAULT_LANDMARKS,
     trial: HeldOutTrial = NOT_TRIED,
 ) -> CaptureReport:
     """Return the record of the capture whose keypoints are matched in ``tracked``, in the order of ``views``.

@@ -21,11 +21,15 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.features import SIFT, Features
-from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
+from bidnerf_core.mapping.landmark_building import (
+    DEFAULT_LANDMARKS,
+    LandmarkConfig,
+    TrackedViews,
+    tracked_views,
+)
 from bidnerf_core.mapping.landmarks import HeldOutTrial, LandmarkMap
 from bidnerf_core.se3 import SE3
 
-DEFAULTS = LandmarkConfig()
 HELD_OUT, MOST_HELD_OUT = 8, 24
 """One image in so many is held out, and at most so many images."""
 ENOUGH = 6
@@ -45,7 +49,7 @@ class _Answer:
 def build_tried_landmarks(
     views: Sequence[View],
     features: Features = SIFT,
-    config: LandmarkConfig = DEFAULTS,
+    config: LandmarkConfig = DEFAULT_LANDMARKS,
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
@@ -57,7 +61,7 @@ def tried_landmarks(
     tracked: TrackedViews,
     views: Sequence[View],
     features: Features = SIFT,
-    config: LandmarkConfig = DEFAULTS,
+    config: LandmarkConfig = DEFAULT_LANDMARKS,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
     """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on images that are held out.

@@ -36,11 +36,11 @@ from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
 from bidnerf_core.localization.tracking.odometry import Odometry
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints
 from bidnerf_core.localization.tracking.relocalization import (
-    LONG_WAIT,
     has_points,
     is_searchable,
     relocalized,
     scene_extent,
+    search_due,
     typical_error,
     uses_landmarks,
 )
@@ -132,9 +132,9 @@ class Tracker:
                 return answer, state
         if image is None:  # a shape alone fits in many places of a building
             return unknown(self._start, self._extent), replace(state, lost=state.lost + 1)
-        found = relocalized(
-            self.localizer, frame, self._start, state.searchable, self.config.patience, seed=state.frames
-        )
+        found = None
+        if search_due(self.localizer, frame, state.searchable, self.config.patience):
+            found = relocalized(self.localizer, frame, self._start, state.searchable, state.frames)
         if found is None or not found.converged:
             answer = unknown(self._start, self._extent) if found is None else replace(found, method=METHOD)
             return answer, replace(state, lost=state.lost + 1, searchable=state.searchable + 1)
@@ -160,10 +160,11 @@ class Tracker:
         if state.lost or is_vague(predicted, frame.intrinsics):
             T, waited = predicted.T_world_camera, state.waited + abs(seconds)
             lost = max(state.searchable, min(state.lost, 1))
-            found = relocalized(
-                self.localizer, frame, T, lost, self.config.patience, state.frames, waited
-            )  # fmt: skip
-            state = replace(state, waited=0.0 if image is not None and waited >= LONG_WAIT else waited)
+            found = None
+            if search_due(self.localizer, frame, lost, self.config.patience, waited):
+                found = relocalized(self.localizer, frame, T, lost, state.frames)
+                waited = waited if image is None else 0.0  # a shape alone does not show landmarks
+            state = replace(state, waited=waited)
             if found is not None and found.converged:
                 return self._found(frame, image, state, found)
         state = self._adrift(frame, image, state, points, predicted)

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from bidnerf_core.frames import View
 from bidnerf_core.localization.relocated_photos import Relocation, relocated, suspects
+from bidnerf_core.map_cameras import PoseConsistency
 from bidnerf_core.mapping.capture_links import groups, linked
 from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
-from bidnerf_core.mapping.pose_refinement import RefinedPoses, refined_poses
+from bidnerf_core.mapping.pose_refinement import AdjustedPoses, adjusted_poses
 
 INCONSISTENT = 0.25
 """Deviation (pixels) that errors of the given poses must at least add to that of the keypoints for the poses to be refined.
@@ -30,9 +31,7 @@ class TrainingPoses:
     pixels: Float[Tensor, "v"]  # median motion of the points in an image; 0 where its pose was kept
     replaced: list[int]  # images whose given pose was wrong, placed by landmarks of the others
     refined: bool  # whether all poses were refined
-    inconsistency: float | None  # pixels, as in ``RefinedPoses``; None if not known
-    noise_before: float = 0.0  # pixels: standard deviation of the keypoints about their points
-    noise_after: float = 0.0
+    consistency: PoseConsistency | None  # of the given poses; None if not known
 
 
 def training_poses(
@@ -56,7 +55,7 @@ def training_poses(
         for number, found in wrong.items():
             updates[number] = found.update
         tracked = tracked.at(given.retract(updates)).matched_anew(config, progress)
-    fit = refined_poses(tracked, config, progress, least)
+    fit = adjusted_poses(tracked, config, progress, least)
     answer = _chosen(tracked, fit, list(wrong), least)
     if wrong and fit is not None and not answer.refined:
         answer = replace(answer, tracked=answer.tracked.matched_anew(config, progress))
@@ -65,23 +64,22 @@ def training_poses(
     return answer
 
 
-def _chosen(tracked: TrackedViews, fit: RefinedPoses | None, wrong: list[int], least: float) -> TrainingPoses:
+def _chosen(
+    tracked: TrackedViews, fit: AdjustedPoses | None, wrong: list[int], least: float
+) -> TrainingPoses:
     """Return the refined poses if they are wanted, else the present ones, of which those that were wrong are refined."""
     still = torch.zeros(len(tracked.observations.images), dtype=torch.float64)
     if fit is None:
         return TrainingPoses(tracked, still, wrong, False, None)
-    noise = fit.noise_before, fit.noise_after
-    if fit.inconsistency >= least:
-        return TrainingPoses(fit.tracked, fit.pixels, wrong, True, fit.inconsistency, *noise)
+    if fit.consistency.inconsistency >= least:
+        return TrainingPoses(fit.tracked, fit.pixels, wrong, True, fit.consistency)
     poses, better = tracked.T_world_camera, fit.tracked.T_world_camera
     for number in wrong:
         poses.rotation[number], poses.translation[number] = (
             better.rotation[number],
             better.translation[number],
         )
-    return TrainingPoses(
-        tracked.at(poses) if wrong else tracked, still, wrong, False, fit.inconsistency, *noise
-    )
+    return TrainingPoses(tracked.at(poses) if wrong else tracked, still, wrong, False, fit.consistency)
 
 
 def _wrongly_posed(

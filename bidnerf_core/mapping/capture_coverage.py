@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.frames import View
 from bidnerf_core.mapping.capture_report import Arrangement, CoverageRecord, Gap
-from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
+from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedViews
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
 
@@ -31,7 +31,6 @@ STEEP = 75.0
 """Degrees above or below the horizon from which on a camera has no direction along it."""
 FEW_POINTS = 50
 """Number of triangulated points below which a capture shows hardly any distances."""
-DEFAULTS = LandmarkConfig()
 FEW = 4
 """Number of photos below which nothing is said of gaps."""
 
@@ -138,9 +137,9 @@ def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool
     if float((centres - centres[:1]).abs().max()) <= 0:
         return False
     angle = None if tracked is None else parallax_deg(tracked.matched)
-    if tracked is None or angle is None or angle >= DEFAULTS.parallax:
+    if tracked is None or angle is None or angle >= DEFAULT_LANDMARKS.parallax:
         return True
-    return len(tracked.triangulated(DEFAULTS)[1]) >= FEW_POINTS
+    return len(tracked.triangulated(DEFAULT_LANDMARKS)[1]) >= FEW_POINTS
 
 
 def parallax_deg(matched: TrackedKeypoints) -> float | None:

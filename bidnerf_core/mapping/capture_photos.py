@@ -31,7 +31,7 @@ GAMMA = 2.2
 """Exponent from the values of an image to linear light, approximately that of sRGB."""
 ENOUGH_SHARED = 10
 """Least number of landmarks by which the exposure of a photo is compared; with fewer, whole images are compared."""
-EXPOSURE_ROUNDS = 20
+BRIGHTNESS_ROUNDS = 20
 """Rounds of alternation between the brightness of landmarks and the exposure of photos."""
 NEIGHBOURS = 8
 """Number of photos from nearby places with which a photo is compared."""
@@ -142,7 +142,7 @@ def exposures(
     light = _light_of_keypoints(views, seen)
     enough = torch.bincount(image, minlength=len(views)) >= ENOUGH_SHARED
     found = torch.zeros(len(views), dtype=torch.float64)
-    for _ in range(EXPOSURE_ROUNDS):
+    for _ in range(BRIGHTNESS_ROUNDS):
         of_points = _medians(light - found[image], point, seen.count)
         of_images = _medians(light - of_points[point], image, len(views))
         found = torch.where(enough, of_images, 0.0)

@@ -45,7 +45,9 @@ def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, 
     return torch.where(smooth, median, 0)
 
 
-def depth_noise(sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]) -> float:
+def keypoint_depth_noise(
+    sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]
+) -> float:
     """Return a robust relative standard deviation of measured depth, by comparison with triangulated points."""
     known = depth > 0
     if int(known.sum()) < ENOUGH_DEPTHS:

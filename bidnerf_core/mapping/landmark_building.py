@@ -15,7 +15,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import SeenLandmarks, View
 from bidnerf_core.mapping.features import SIFT, Features
-from bidnerf_core.mapping.keypoint_depth import depth_noise, measured_depth, placed
+from bidnerf_core.mapping.keypoint_depth import keypoint_depth_noise, measured_depth, placed
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks, seen_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
 from bidnerf_core.mapping.pose_scatter import pose_scatter
@@ -27,7 +27,7 @@ from bidnerf_core.mapping.triangulation import (
     noise,
     observations_per_point,
     parallax,
-    refined,
+    refined_points,
 )
 from bidnerf_core.mapping.view_pairs import likely_pairs_of_poses
 from bidnerf_core.se3 import SE3
@@ -53,10 +53,13 @@ class LandmarkConfig(Settings):
     most: Annotated[int, Range(1, 10**8)] = 200_000  # largest number of landmarks, 168 bytes each with SIFT
 
 
+DEFAULT_LANDMARKS = LandmarkConfig()
+
+
 def build_landmarks(
     views: Sequence[View],
     features: Features = SIFT,
-    config: LandmarkConfig = LandmarkConfig(),
+    config: LandmarkConfig = DEFAULT_LANDMARKS,
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
@@ -140,7 +143,7 @@ class TrackedViews:
 def tracked_views(
     views: Sequence[View],
     features: Features = SIFT,
-    config: LandmarkConfig = LandmarkConfig(),
+    config: LandmarkConfig = DEFAULT_LANDMARKS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TrackedViews:
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks."""
@@ -188,7 +191,7 @@ def _located(
         fused_landmarks(kept, positions, pixel_noise**2 * covariance, pixel_noise),
         pose_covariance=pose_scatter(kept, positions, pixel_noise),
     )
-    relative = depth_noise(sightings, positions, depth[kept.number])
+    relative = keypoint_depth_noise(sightings, positions, depth[kept.number])
     left = ~torch.isin(observations.number, kept.number)
     rest = observations[left & (_tracked(observations) | config.singles)]
     rest, positions, covariance = placed(rest, depth[rest.number], relative, pixel_noise)
@@ -212,7 +215,7 @@ def _triangulated(
     points = intersected(observations.sightings, count)
     covariance = torch.zeros((count, 3, 3), dtype=torch.float64)
     for tolerance in TOLERANCES:
-        points, covariance = refined(observations.sightings, points, tolerance / 2)
+        points, covariance = refined_points(observations.sightings, points, tolerance / 2)
         observations = observations[_inliers(observations.sightings, points, tolerance)]
     wide = parallax(observations.sightings, points) >= least
     observations, numbers = observations[wide[observations.point]].compacted()

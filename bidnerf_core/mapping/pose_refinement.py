@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.map_cameras import PoseConsistency
 from bidnerf_core.mapping.bundle_adjustment import MeasuredSightings, PosePrior, adjusted
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
@@ -21,33 +22,27 @@ ROUNDS = 3
 """Largest number of adjustments. After each, the keypoints are matched anew, which finds those that wrong poses hid."""
 SETTLED_PIXELS = 0.25
 """Largest motion of an image by an adjustment after which no other one is needed."""
-CORRELATION = 10.0
+CORRELATED_KEYPOINTS = 10.0
 """Number of keypoints that count as one: lenses and rolling shutters give the keypoints of an image errors in common."""
 LEAST_DEVIATION = 1e-9
 """Standard deviation of the poses (metres, radians) that is assumed at least."""
 
 
 @dataclass(frozen=True, eq=False)
-class RefinedPoses:
-    """The poses that fit the keypoints best, and how well the given ones fit them."""
+class AdjustedPoses:
+    """The poses that fit the keypoints best, and how well the given ones do."""
 
     tracked: TrackedViews  # with these poses, and matched by them
     pixels: Float[Tensor, "v"]  # how far the points that an image shows move in it, median; 0 without points
-    noise_before: float  # pixels: standard deviation of the keypoints about their points at the given poses
-    noise_after: float
-
-    @property
-    def inconsistency(self) -> float:
-        """The deviation of keypoints (pixels) that errors of the given poses add to the keypoints' own noise."""
-        return max(0.0, self.noise_before**2 - self.noise_after**2) ** 0.5
+    consistency: PoseConsistency  # of the given poses
 
 
-def refined_poses(
+def adjusted_poses(
     tracked: TrackedViews,
     config: LandmarkConfig,
     progress: Callable[[int, int], None] = lambda done, total: None,
     least: float = 0.0,
-) -> RefinedPoses | None:
+) -> AdjustedPoses | None:
     """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
 
     The errors of the given poses are taken as independent of each other, and as large as resection of the images
@@ -63,14 +58,16 @@ def refined_poses(
     for number in range(ROUNDS):
         pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
         unmeasured = torch.zeros(len(seen.point), dtype=torch.float64)
-        sightings = MeasuredSightings(seen.sightings, seen.image, unmeasured, pixel_noise, 1.0, CORRELATION)
+        sightings = MeasuredSightings(
+            seen.sightings, seen.image, unmeasured, pixel_noise, 1.0, CORRELATED_KEYPOINTS
+        )
         fit = adjusted(sightings, points, PosePrior(given, *deviations), tracked.T_world_camera)
         step = _motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
         moved = (given.inverse() @ fit.T_world_camera).log()
         deviations = max(deviations[0], _spread(moved[:, :3])), max(deviations[1], _spread(moved[:, 3:]))
         pixels = _motion(seen, fit.points, given, fit.T_world_camera)
         tracked = tracked.at(fit.T_world_camera)
-        if number == 0 and _found(tracked, pixels, before, config).inconsistency < least:
+        if number == 0 and _found(tracked, pixels, before, config).consistency.inconsistency < least:
             break
         tracked = tracked.matched_anew(config, progress)
         if float(step.max()) <= SETTLED_PIXELS:
@@ -81,9 +78,10 @@ def refined_poses(
 
 def _found(
     tracked: TrackedViews, pixels: Float[Tensor, "v"], before: float, config: LandmarkConfig
-) -> RefinedPoses:
+) -> AdjustedPoses:
     seen, points = tracked.triangulated(config)
-    return RefinedPoses(tracked, pixels, before, max(LEAST_NOISE, noise(seen.sightings, points)))
+    after = max(LEAST_NOISE, noise(seen.sightings, points))
+    return AdjustedPoses(tracked, pixels, PoseConsistency(before, after))
 
 
 def _deviations(

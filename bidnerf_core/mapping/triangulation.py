@@ -57,7 +57,7 @@ def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
     return torch.linalg.solve(_damped(matrix), right)
 
 
-def refined(
+def refined_points(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
     """Minimize the reprojection errors under a Cauchy loss of ``scale`` pixels.

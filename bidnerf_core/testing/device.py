@@ -36,7 +36,7 @@ from bidnerf_core.testing.scene import BOUNDS, rgbd_views
 from bidnerf_core.testing.values import close
 from bidnerf_core.waiting import without_waiting
 
-RAYS = 48
+CHECKED_RAYS = 48
 OFF = (0.05, -0.03, 0.04, 0.01, -0.02, 0.01)
 """Tangent vector from the true pose to the one that steps begin at: metres, radians."""
 
@@ -94,7 +94,9 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
     device, start = problem.device, problem.start_for("bid")
     objective = objective_of(ColourSettings(), DepthSettings())
     settings, generator = DescentSettings(level=level), torch.Generator(device).manual_seed(0)
-    loss = SampledLoss(problem.on_device(), objective, RayCounts(RAYS), settings, ReachSettings(), generator)
+    loss = SampledLoss(
+        problem.on_device(), objective, RayCounts(CHECKED_RAYS), settings, ReachSettings(), generator
+    )
     steps = AdamSteps(loss, pivot("scene", problem), AdamSettings(), start.to(device))
     with without_waiting():
         steps(0)
@@ -109,7 +111,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
 def _second_order(problem: Problem, level: int, mode: Elsewhere) -> None:
     about = pivot("scene", problem).to(DEVICE)
     settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
-    stage, generator = RefinementStage(2, RAYS, level=level), torch.Generator().manual_seed(0)
+    stage, generator = RefinementStage(2, CHECKED_RAYS, level=level), torch.Generator().manual_seed(0)
     cost = settings.drawn(problem.on_device(), stage, about, generator)
     start = problem.start_for("bid-lm")[None].to(DEVICE)
     with without_waiting():

@@ -54,7 +54,7 @@ class GuidedPose:
     miscalibration: Miscalibration
 
 
-def refined(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -> GuidedPose:
+def refined_pose(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -> GuidedPose:
     """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change."""
     most = usual_distance(query, inliers)
     start = Calibration(log_focal=math.log(first.focal_factor))
@@ -137,7 +137,7 @@ def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
     return (ratio / scale - 1).abs() <= DEPTH_OFF
 
 
-def agreement(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
+def visible_and_matching(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
     """Return how many landmarks should be visible from a pose, how many match near there, and how many would by chance."""
     radius = RADII[0] * query.threshold
     projections = projected_landmarks(query.images, query.landmarks, T_world_rig, GIVEN, radius)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_images
-from bidnerf_core.localization.search.guided_refinement import agreement, confirmed, refined
+from bidnerf_core.localization.search.guided_refinement import confirmed, refined_pose, visible_and_matching
 from bidnerf_core.localization.search.landmark_evidence import described, log10_agreement
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
@@ -56,7 +56,7 @@ def propose(
     matches, first = _first_pose(query, matcher, seed, clock)
     if first is None:
         return None
-    answer = refined(query, matches[first.inliers], first)
+    answer = refined_pose(query, matches[first.inliers], first)
     clock.lap("refinement")
     found = described(query, matches, answer, clock.seconds)
     clock.lap("assessment")
@@ -85,7 +85,7 @@ def confirm(
     clock = Stopwatch()
     query = LandmarkQuery(query_images(views, features), matcher.landmarks, _calibration_prior(views))
     clock.lap("descriptors")
-    visible, matches, chance = agreement(query, T_world_camera)
+    visible, matches, chance = visible_and_matching(query, T_world_camera)
     answer = confirmed(query, T_world_camera)
     clock.lap("refinement")
     pose = None if answer is None else described(query, answer.correspondences, answer, clock.seconds)

@@ -24,8 +24,6 @@ MOST_DRAWS_WITH_FOCAL = 1500
 """Fewer draws are allowed because each takes some hundred microseconds."""
 FOCAL_RANGE = (0.2, 5.0)
 """Range of the focal length, in multiples of the given one."""
-ONE_PLACE = 1e-6
-"""Cameras closer together than this share of the points' distance have no generalized solution of their own."""
 
 
 @dataclass(frozen=True, eq=False)

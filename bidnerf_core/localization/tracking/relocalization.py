@@ -22,28 +22,30 @@ LONG_WAIT = 0.25
 """Seconds without a search after which every frame is searched: such frames come slowly enough."""
 
 
-def relocalized(
-    localizer: Localizer,
-    frame: Frame,
-    predicted: SE3 | None,
-    lost: int,
-    patience: int,
-    seed: int,
-    waited: float = 0.0,
-) -> Localization | None:
-    """Return what a search for the pose gives, or None in frames that are left out to save time.
+def search_due(localizer: Localizer, frame: Frame, lost: int, patience: int, waited: float = 0.0) -> bool:
+    """Return whether the pose of a frame is searched, or the frame left out to save time.
 
-    Where the map has landmarks, they are sought in the first ``patience`` frames after a loss and then in every second, or
-    in every frame where ``waited``, the time (seconds) without a search, is long. The search of the whole surface, which takes
-    longer, comes at growing intervals; it is the only one in maps without landmarks. ``lost`` is the number of frames since
-    the last accepted pose that could be searched, 0 at the beginning of a sequence.
+    In maps with landmarks, the first ``patience`` frames after a loss are searched and then every second, or every frame
+    where ``waited``, the time (seconds) without a search, is long. ``lost`` is as for ``relocalized``.
     """
     if not is_searchable(frame):
-        return None
+        return False
+    if uses_landmarks(localizer):
+        return lost <= patience or lost % 2 == 0 or waited >= LONG_WAIT
+    return lost == 0 or _due(lost, 1)
+
+
+def relocalized(
+    localizer: Localizer, frame: Frame, predicted: SE3 | None, lost: int, seed: int
+) -> Localization | None:
+    """Return what a search for the pose gives, None if nothing; for frames where ``search_due``.
+
+    Where the map has landmarks, they are sought first. The search of the whole surface, which takes longer, comes at growing
+    intervals; it is the only one in maps without landmarks. ``lost`` is the number of frames since the last accepted pose
+    that could be searched, 0 at the beginning of a sequence.
+    """
     if uses_landmarks(localizer):
         assert localizer.matcher is not None
-        if lost > patience and lost % 2 and waited < LONG_WAIT:
-            return None
         began = time.perf_counter()
         problem = rig(localizer.map, [View(frame, SE3.identity())], None, None, localizer.matcher)
         answer = answer_by_landmarks(problem, localizer.matcher, 0, seed)
@@ -51,8 +53,6 @@ def relocalized(
         if found is not None and found.converged:
             return found
         return localizer(frame, predicted, seed=seed) if _searched(localizer, frame, lost) else found
-    if lost and not _due(lost, 1):
-        return None
     try:
         return localizer(frame, predicted, seed=seed)
     except InputError:

@@ -36,7 +36,7 @@ class TrackerState:
     frames: int = 0  # that the tracker has been called with
     lost: int = 0  # consecutive frames without an accepted pose, up to the last one
     searchable: int = 0  # of these, the frames that could be searched
-    waited: float = 0.0  # seconds since the loss, or since the last search that a long wait caused
+    waited: float = 0.0  # seconds since the loss, or since the last search of an image
     points: FollowedPoints = field(default_factory=FollowedPoints.none)
     image: Grey | None = None  # the last one, in which the points were seen
     sought: int = 0  # number of points when they were last sought
