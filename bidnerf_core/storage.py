@@ -253,6 +253,8 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     module = cast(nn.Module, field)
     module.load_state_dict(tensors)
     module.requires_grad_(False).eval().to(device)
+    if landmarks is not None:
+        landmarks = replace(landmarks, cameras=tuple(camera.intrinsics for camera in info.cameras))
     return Map(info, field, surface, landmarks)
 
 

@@ -17,6 +17,7 @@ from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.mapping.calibration import Calibration
 from bidnerf_core.mapping.casting import trace
 from bidnerf_core.se3 import SE3
 
@@ -135,9 +136,12 @@ class LandmarkThresholds:
     above_chance: float = 3.0  # times as many as at a wrong pose, at least
     spread: float = 0.06  # share of the image's cells that hold one, at least
     miscalibration: float = 0.1  # probability that the given intrinsics are wrong, at most
-    precision: float = (
-        0.03  # standard deviation of the position, as a share of the landmarks' distance, at most
+    # probability that the intrinsics not taken, given or the map's, are right, at most, ...
+    alternative: float = 0.2
+    alternative_motion: float = (
+        0.005  # ... if they move the camera by more than this share of the landmarks' distance
     )
+    precision: float = 0.03  # standard deviation of the position, as a share of that distance, at most
 
 
 def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = LandmarkThresholds()) -> Verdict:
@@ -154,13 +158,25 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     wrong = found.miscalibration
     if not found.estimates_calibration and wrong.worst[1] > thresholds.miscalibration:
         return Verdict(Outcome.MISCALIBRATED, f"{share}, but they suggest {wrong.sentence}")
+    if not found.estimates_calibration and doubtful_intrinsics(found, thresholds):
+        other = Calibration(*wrong.alternative.tolist()).sentence
+        given = "the given ones" if found.takes_map_camera else "those of the map's cameras"
+        return Verdict(Outcome.MISCALIBRATED, f"{share}, but do not tell whether {given} are right: {other}")
     deviation = found.position_deviation
     if not deviation <= thresholds.precision * found.distance:
         return Verdict(
             Outcome.IMPRECISE,
             f"{share}, but the position is uncertain by {deviation / found.distance:.1%} of the distance",
         )
-    return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px")
+    by_map = f", with the map's intrinsics: {found.calibration.sentence}" if found.takes_map_camera else ""
+    return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{by_map}")
+
+
+def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> bool:
+    """Return whether the intrinsics that were not taken, the given or the map's, may be right and would move the pose far."""
+    shift = float(torch.linalg.vector_norm(found.alternative_shift[:3]))
+    possible = float(found.miscalibration.alternative_probability) > thresholds.alternative
+    return possible and shift > thresholds.alternative_motion * found.distance
 
 
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:

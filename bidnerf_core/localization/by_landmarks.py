@@ -107,11 +107,14 @@ def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
 
 
 def _from(problem: Problem, found: LandmarkPose) -> Problem:
-    """Return the problem from the pose found, with measured depth on the map's scale."""
+    """Return the problem from the pose found, with its intrinsics and with measured depth on the map's scale."""
     scale, views = shrunk_depth_scale(found), []
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
-        views.append(replace(view, frame=replace(view.frame, depth=depth)))
+        camera = view.frame.intrinsics
+        if found.takes_map_camera:
+            camera = found.calibration.applied(camera)
+        views.append(replace(view, frame=replace(view.frame, depth=depth, intrinsics=camera)))
     return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -49,6 +49,23 @@ class Calibration:
             flat = seen / (1 + self.radial * flat.square().sum(-1, keepdim=True))
         return flat
 
+    @property
+    def sentence(self) -> str:
+        """The most considerable part of the correction, in words."""
+        parts = torch.tensor(astuple(self), dtype=torch.float64)
+        number = int((parts.abs() / MISTAKEN.deviations).argmax())
+        return self.sentences[number]
+
+    @property
+    def sentences(self) -> tuple[str, str, str, str]:
+        """Each part of the correction in words, in the order of the fields."""
+        return (
+            f"a focal length {self.focal_factor - 1:+.1%} from the given one",
+            f"a principal point {self.shift_u:+.1%} of the focal length further right",
+            f"a principal point {self.shift_v:+.1%} of the focal length further down",
+            f"a radial distortion {self.radial:+.3f} from the given one",
+        )
+
 
 GIVEN = Calibration()
 """Intrinsics as they are given."""
@@ -72,5 +89,11 @@ FIXED = CalibrationPrior()
 """Intrinsics that are not estimated."""
 CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002)
 """Intrinsics from a good calibration."""
+USUAL, USUALLY = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01), 0.35
+"""Standard deviations of intrinsics as many devices state them, and the share of cameras whose intrinsics are so: they belong to
+another unit of the model, or to another focus and temperature.
+"""
+MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
+"""Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
 NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
 """Intrinsics from EXIF or a field of view, without distortion."""

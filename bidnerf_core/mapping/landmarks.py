@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
+
 
 @dataclass(frozen=True)
 class HeldOutTrial:
@@ -43,6 +45,7 @@ class LandmarkMap:
         default_factory=lambda: torch.full((4,), 0.02, dtype=torch.float64)
     )
     trial: HeldOutTrial = HeldOutTrial()
+    cameras: tuple[Intrinsics, ...] = ()  # of the images, where known
 
     def __len__(self) -> int:
         return len(self.positions)

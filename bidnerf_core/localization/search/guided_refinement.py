@@ -17,9 +17,9 @@ from bidnerf_core.localization.search.guided import (
     projected_landmarks,
 )
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.search.miscalibration import Miscalibration, taken_intrinsics
 from bidnerf_core.localization.search.ransac import Hypothesis
-from bidnerf_core.mapping.calibration import GIVEN, NOMINAL, Calibration, CalibrationPrior
+from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.features import NORM
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, resect
@@ -87,7 +87,13 @@ def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches,
     correlation = query.landmarks.correlation
     fit, found = _guided(query, query.prior, fit, found, most, RADII)
     free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
-    wrong = Miscalibration.of(free, query.landmarks)
+    taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate=query.prior.log_focal > 0)
+    wrong = Miscalibration.of(free, query.landmarks, taken)
+    if taken.calibration != GIVEN:
+        fit = resect(
+            query.observed(found), free.T_world_rig, free.noise, FIXED, taken.calibration, correlation
+        )
+        fit, found = _guided(query, FIXED, fit, found, most, RADII[1:])
     if wrong.worst[1] > CERTAIN and not query.prior.log_focal:
         fit, found = _guided(query, NOMINAL, free, found, most, RADII[1:])
     radius = RADII[-1] * query.threshold

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
-from bidnerf_core.mapping.calibration import Calibration
+from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.se3 import SE3
 
 
@@ -56,6 +56,11 @@ class LandmarkPose:
         return bool((self.calibration_deviations > 0).any())
 
     @property
+    def takes_map_camera(self) -> bool:
+        """Whether the intrinsics are those of the map's images, in place of the given ones."""
+        return self.calibration != GIVEN and not self.estimates_calibration
+
+    @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:
         """The covariance with that of the intrinsics, as they were given or as this image and this map show them."""
         deviations = (
@@ -65,13 +70,20 @@ class LandmarkPose:
         return self.covariance + by_calibration @ by_calibration.mT
 
     @property
+    def alternative_shift(self) -> Float[Tensor, "6"]:
+        """The right update of the pose with those intrinsics, given or the map's, that were not taken."""
+        return self.slope @ self.miscalibration.alternative
+
+    @property
     def unresolved_calibration(self) -> Float[Tensor, "6 6"]:
         """What errors of the intrinsics that are usual, and that this image does not rule out, add to ``full_covariance``."""
         if self.estimates_calibration:
             return torch.zeros_like(self.covariance)
         judged = self.miscalibration
         added = (judged.unresolved.square() - judged.deviations.square()).clamp(min=0)
-        return self.slope * added @ self.slope.mT
+        shift = self.alternative_shift
+        by_alternative = judged.alternative_probability * torch.outer(shift, shift)
+        return self.slope * added @ self.slope.mT + by_alternative
 
     @property
     def position_deviation(self) -> float:

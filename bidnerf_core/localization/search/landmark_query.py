@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
+from bidnerf_core.localization.search.map_camera import MapCamera, map_camera
 from bidnerf_core.mapping.calibration import CalibrationPrior
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
@@ -32,6 +33,12 @@ class LandmarkQuery:
     def threshold(self) -> float:
         """The largest reprojection error of an inlier, pixels."""
         return pixel_threshold(self.images[-1].intrinsics)
+
+    @property
+    def map_camera(self) -> MapCamera | None:
+        """The intrinsics of the map's images, if all images of the query state the same."""
+        given = {image.intrinsics for image in self.images}
+        return map_camera(given.pop(), self.landmarks.cameras) if len(given) == 1 else None
 
     def observed(self, matches: LandmarkMatches) -> ObservedPoints:
         """Return the landmarks and keypoints of ``matches`` as input of a pose solver."""

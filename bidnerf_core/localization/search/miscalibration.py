@@ -9,54 +9,72 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.mapping.calibration import CALIBRATED, Calibration, CalibrationPrior
+from bidnerf_core.localization.search.map_camera import SAME_LOG_ODDS, MapCamera
+from bidnerf_core.mapping.calibration import (
+    CALIBRATED,
+    GIVEN,
+    MISTAKEN,
+    MISTAKES,
+    NOMINAL,
+    USUAL,
+    USUALLY,
+    Calibration,
+)
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import ReprojectionFit
 
-MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
-"""Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
-USUAL, USUALLY = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01), 0.35
-"""Standard deviations of intrinsics as many devices state them, and the share of cameras whose intrinsics are so: they belong to
-another unit of the model, or to another focus and temperature.
-"""
+MIXTURE = ((CALIBRATED, 1 - USUALLY - MISTAKES), (USUAL, USUALLY), (MISTAKEN, MISTAKES))
+"""Prior of the correction of given intrinsics: they are calibrated, off as usual, or wrong."""
+
+
+LIKELY = 0.8
+"""Probability from which on an image whose focal length is approximate is taken to be from the map's camera."""
+
+
+@dataclass(frozen=True)
+class TakenIntrinsics:
+    """The intrinsics with which an image is localized, and others that may be right instead."""
+
+    calibration: Calibration = GIVEN  # correction of the given ones
+    alternative: Calibration = GIVEN  # correction of those taken
+    probability: float = 0.0  # that the alternative is right
 
 
 @dataclass(frozen=True, eq=False)
 class Miscalibration:
-    """How far the intrinsics that fit an image best are from the given ones, and whether these are wrong.
+    """How far the intrinsics that fit an image best are from those taken, and whether these are wrong.
 
-    Images of the map, whose intrinsics are right, seem to need corrections, too; their scatter is part of the noise.
+    The intrinsics taken are the given ones, or those of the map's cameras where the image supports these. Images of the map,
+    whose intrinsics are right, seem to need corrections, too; their scatter is part of the noise.
     """
 
     apparent: Float[Tensor, "4"]  # the correction that fits best, in the order of ``Calibration``
     noise: Float[Tensor, "4"]  # standard deviations of that estimate by the noise of the keypoints
-    probability: Float[Tensor, "4"]  # that the given parameter is wrong
+    probability: Float[Tensor, "4"]  # that the parameter taken is wrong
     unresolved: Float[
         Tensor, "4"
     ]  # standard deviation of the true correction about zero, usual errors of cameras included
+    alternative: Float[Tensor, "4"]  # correction of those taken to those, given or the map's, that were not
+    alternative_probability: Float[Tensor, ""]  # that these are right
 
     @staticmethod
     def unknown() -> Miscalibration:
         """Return that of intrinsics that no image has been compared with."""
         zero = torch.zeros(4, dtype=torch.float64)
-        return Miscalibration(zero, zero, zero, USUAL.deviations)
+        return Miscalibration(zero, zero, zero, USUAL.deviations, zero, zero[0])
 
     @staticmethod
-    def of(free: ReprojectionFit, landmarks: LandmarkMap) -> Miscalibration:
-        """Judge by a fit in which the intrinsics were free."""
-        value = torch.tensor(astuple(free.calibration), dtype=torch.float64)
-        noise = free.calibration_deviations.square() + landmarks.calibration_scatter.square()
+    def of(free: ReprojectionFit, landmarks: LandmarkMap, taken: TakenIntrinsics) -> Miscalibration:
+        """Judge the intrinsics ``taken`` by a fit in which they were free."""
+        value, noise = _estimate(free, landmarks)
+        value = value - _as_tensor(taken.calibration)
         right, wrong = (noise + prior.deviations.square() for prior in (CALIBRATED, MISTAKEN))
         log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
         log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES))
         return Miscalibration(
-            value, free.calibration_deviations, log_odds.sigmoid(), unresolved_deviations(value, noise)
-        )
-
-    @property
-    def calibration(self) -> Calibration:
-        """The correction that fits best."""
-        return Calibration(*self.apparent.tolist())
+            value, free.calibration_deviations, log_odds.sigmoid(), unresolved_deviations(value, noise),
+            _as_tensor(taken.alternative), value.new_tensor(taken.probability),
+        )  # fmt: skip
 
     @property
     def deviations(self) -> Float[Tensor, "4"]:
@@ -72,26 +90,82 @@ class Miscalibration:
     @property
     def sentence(self) -> str:
         """What the most suspect parameter should be."""
-        number, _ = self.worst
-        value = float(self.apparent[number])
-        if number == 0:
-            return f"a focal length {math.expm1(value):+.1%} from the given one"
-        if number == 3:
-            return f"a radial distortion {value:+.3f} from the given one"
-        axis = "right" if number == 1 else "down"
-        return f"a principal point {value:+.1%} of the focal length further {axis}"
+        return Calibration(*self.apparent.tolist()).sentences[self.worst[0]]
+
+
+def taken_intrinsics(
+    free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera | None, approximate: bool
+) -> TakenIntrinsics:
+    """Return the more probable of the given intrinsics and those of the map's ``camera``, by a fit in which they were free.
+
+    ``approximate`` says that the given focal length is; the given intrinsics then leave the calibration to be estimated.
+    """
+    if camera is None:
+        return TakenIntrinsics()
+    if approximate:
+        likely = probability_beside_approximate(free, landmarks, camera) > LIKELY
+        return TakenIntrinsics(camera.calibration if likely else GIVEN)
+    if not bool(camera.differs.any()):
+        return TakenIntrinsics()
+    probability, there = probability_of_map_camera(free, landmarks, camera), camera.correction
+    if probability > 0.5:
+        return TakenIntrinsics(camera.calibration, Calibration(*(-there).tolist()), 1 - probability)
+    return TakenIntrinsics(GIVEN, camera.calibration, probability)
+
+
+def probability_of_map_camera(free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera) -> float:
+    """Return the probability that an image was taken by the map's ``camera`` and not by one with the given intrinsics.
+
+    The image is represented by a fit in which the intrinsics were free.
+    """
+    value, noise = _estimate(free, landmarks)
+    by_given = _log_densities(value, noise).logsumexp(0)
+    evidence = float((_log_density_by(camera, value, noise) - by_given)[camera.differs].sum())
+    return float(torch.tensor(evidence + camera.log_odds, dtype=torch.float64).sigmoid())
+
+
+def probability_beside_approximate(free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera) -> float:
+    """Return the same probability where the given focal length is approximate, so that only the image tells it."""
+    if not camera.is_near(NOMINAL):
+        return 0.0
+    value, noise = _estimate(free, landmarks)
+    total = NOMINAL.deviations.square() + noise
+    by_any = -0.5 * (value.square() / total + total.log())
+    evidence = (_log_density_by(camera, value, noise) - by_any)[
+        0
+    ]  # the other parameters hardly tell cameras apart
+    return float((evidence + SAME_LOG_ODDS).sigmoid())
+
+
+def _log_density_by(
+    camera: MapCamera, value: Float[Tensor, "4"], noise: Float[Tensor, "4"]
+) -> Float[Tensor, "4"]:
+    """Return the logarithm of the density of an estimate if the image is from the map's camera; constants left out."""
+    total = camera.deviations.square() + noise
+    return -0.5 * ((value - camera.correction).square() / total + total.log())
 
 
 def unresolved_deviations(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
-    """Return the standard deviations about zero of the true corrections, seen as ``apparent`` with the variances ``noise``.
-
-    The prior is a mixture: intrinsics are calibrated, off as usual, or wrong.
-    """
-    parts = ((CALIBRATED, 1 - USUALLY - MISTAKES), (USUAL, USUALLY), (MISTAKEN, MISTAKES))
-    prior = torch.stack([part.deviations.square() for part, _ in parts])
-    shares = torch.tensor([[share] for _, share in parts], dtype=prior.dtype)
+    """Return the standard deviations about zero of the true corrections, seen as ``apparent`` with the variances ``noise``."""
+    prior = torch.stack([part.deviations.square() for part, _ in MIXTURE])
     total = prior + noise
-    log_density = -0.5 * (apparent.square() / total + total.log())
-    weights = torch.softmax(log_density + shares.log(), dim=0)
+    weights = torch.softmax(_log_densities(apparent, noise), dim=0)
     mean, variance = apparent * prior / total, prior * noise / total
     return (weights * (mean.square() + variance)).sum(0).sqrt()
+
+
+def _log_densities(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "parts 4"]:
+    """Return the logarithm of each part of the mixture, weighted, at an estimate with the variances ``noise``; constants left out."""
+    total = torch.stack([part.deviations.square() for part, _ in MIXTURE]) + noise
+    shares = torch.tensor([[share] for _, share in MIXTURE], dtype=total.dtype)
+    return -0.5 * (apparent.square() / total + total.log()) + shares.log()
+
+
+def _estimate(free: ReprojectionFit, landmarks: LandmarkMap) -> tuple[Float[Tensor, "4"], Float[Tensor, "4"]]:
+    """Return the correction that fits best, and its variances."""
+    value = _as_tensor(free.calibration)
+    return value, free.calibration_deviations.square() + landmarks.calibration_scatter.square()
+
+
+def _as_tensor(calibration: Calibration) -> Float[Tensor, "4"]:
+    return torch.tensor(astuple(calibration), dtype=torch.float64)

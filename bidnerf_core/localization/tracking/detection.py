@@ -25,7 +25,7 @@ from bidnerf_core.localization.search.landmark_evidence import (
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery, pixel_threshold
 from bidnerf_core.localization.search.matching import EXACT, LandmarkMatcher
-from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.search.miscalibration import Miscalibration, TakenIntrinsics
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL
@@ -145,7 +145,7 @@ class LandmarkDetector:
             found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL, GIVEN,
             self.landmarks.correlation,
         )  # fmt: skip
-        return Miscalibration.of(free, self.landmarks)
+        return Miscalibration.of(free, self.landmarks, TakenIntrinsics())
 
 
 def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float, most: float) -> Evidence:

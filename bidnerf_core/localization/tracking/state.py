@@ -23,7 +23,7 @@ from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.se3 import SE3
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 3
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 4
 CLOUD = ("points", "rgb", "origins", "coloured")
 
 

@@ -1,0 +1,120 @@
+"""The cameras of a map's own images, as an alternative to the intrinsics that a query states.
+
+Who localizes with the camera that made the map may state it a little differently, after another calibration or as the
+manufacturer does. The map was fitted to the intrinsics of its own images, so that these are right for such a query.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics, same_aspect
+from bidnerf_core.mapping.calibration import (
+    CALIBRATED,
+    MISTAKEN,
+    MISTAKES,
+    USUAL,
+    USUALLY,
+    Calibration,
+    CalibrationPrior,
+)
+
+MOST_CAMERAS = 9
+"""Number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
+GRID = 7
+"""Rows and columns of pixels at which cameras are compared."""
+SIGNIFICANT = 2.0
+"""Standard deviations of a good calibration by which cameras must differ to be told apart."""
+SAME_CAMERA = 0.9
+"""Share of queries with nearly the map's intrinsics that are from the map's camera."""
+SAME_LOG_ODDS = math.log(SAME_CAMERA / (1 - SAME_CAMERA))
+OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1)
+"""Standard deviations between the intrinsics of different cameras of one shape of image."""
+FARTHEST = 1.5
+"""Differences of so many times ``OTHER_CAMERA``, or of ``NOMINAL`` where the focal length is approximate, are those of another
+camera for certain.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class MapCamera:
+    """The intrinsics of a map's images, relative to those that a query states."""
+
+    correction: Float[Tensor, "4"]  # of the stated intrinsics, in the order of ``Calibration``
+    deviations: Float[Tensor, "4"]  # of single images of the map, errors of a good calibration included
+
+    @property
+    def differs(self) -> Bool[Tensor, "4"]:
+        """In which parameters the intrinsics differ."""
+        return self.correction.abs() > SIGNIFICANT * self.deviations
+
+    @property
+    def calibration(self) -> Calibration:
+        """The correction of the stated intrinsics."""
+        return Calibration(*self.correction.tolist())
+
+    @property
+    def log_odds(self) -> float:
+        """Logarithm of the odds, before an image is looked at, that the map's intrinsics are right and not the stated ones.
+
+        Either the query is from the map's camera and misstates it, or it is from another camera with similar intrinsics.
+        """
+        if not self.is_near(OTHER_CAMERA):
+            return -math.inf
+        misstated = torch.logaddexp(
+            self._log_density(USUAL) + math.log(USUALLY), self._log_density(MISTAKEN) + math.log(MISTAKES)
+        )
+        other = self._log_density(OTHER_CAMERA)
+        ratio = float((misstated - other)[self.differs].sum())
+        return ratio + SAME_LOG_ODDS
+
+    def is_near(self, prior: CalibrationPrior) -> bool:
+        """Return whether the intrinsics differ by no more than those of different cameras may, where they are stated so well."""
+        return bool((self.correction.abs() <= FARTHEST * prior.deviations).all())
+
+    def _log_density(self, prior: CalibrationPrior) -> Float[Tensor, "4"]:
+        deviations = prior.deviations
+        return -0.5 * (self.correction / deviations).square() - deviations.log()
+
+
+@lru_cache(maxsize=64)
+def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera | None:
+    """Return the camera of a map's images of the same shape as those with the ``given`` intrinsics; None if there are none."""
+    alike = sorted(
+        {c for c in cameras if same_aspect((c.width, c.height), (given.width, given.height))},
+        key=lambda camera: camera.fx / camera.width,
+    )
+    if not alike:
+        return None
+    chosen = [
+        alike[i] for i in torch.linspace(0, len(alike) - 1, min(len(alike), MOST_CAMERAS)).round().int()
+    ]
+    corrections = torch.stack([correction_between(given, camera) for camera in chosen])
+    correction = corrections.median(0).values
+    spread = (corrections - correction).square().mean(0)
+    return MapCamera(correction, (CALIBRATED.deviations.square() + spread).sqrt())
+
+
+def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "4"]:
+    """Return the correction of ``given`` intrinsics, in the order of ``Calibration``, that comes closest to ``true`` ones."""
+    true = true.resized(given.width, given.height)
+    u, v = (torch.linspace(0, size, GRID, dtype=torch.float64) for size in (given.width, given.height))
+    pixels = torch.stack(torch.meshgrid(u, v, indexing="ij"), dim=-1).reshape(-1, 2)
+    stated, real = (camera.unproject(pixels)[:, :2] for camera in (given, true))
+    bend = real * real.square().sum(-1, keepdim=True)
+    zero, one = torch.zeros(len(pixels), dtype=torch.float64), torch.ones(len(pixels), dtype=torch.float64)
+    # stated = factor real + shift + factor radial bend, as in ``Calibration.pixels``
+    rows = [
+        torch.stack(
+            [real[:, axis], one if axis == 0 else zero, one if axis == 1 else zero, bend[:, axis]], -1
+        )
+        for axis in (0, 1)
+    ]
+    factor, shift_u, shift_v, bent = torch.linalg.lstsq(torch.cat(rows), stated.mT.reshape(-1)).solution
+    return torch.stack([factor.log(), shift_u, shift_v, bent / factor])

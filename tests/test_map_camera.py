@@ -1,0 +1,199 @@
+"""The cameras of a map's images as an alternative to the intrinsics that a query states."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, replace
+
+import pytest
+import torch
+
+from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
+from bidnerf_core.localization.result import Outcome
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization.search.map_camera import correction_between, map_camera
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.miscalibration import (
+    probability_beside_approximate,
+    probability_of_map_camera,
+)
+from bidnerf_core.mapping.calibration import GIVEN, NOMINAL, Calibration
+from bidnerf_core.mapping.landmark_building import build_landmarks
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.resection import ReprojectionFit
+from landmark_scene import PINHOLE, Points, looking_in, ring
+
+TRUE = looking_in(0.43, 0.45, 3.6)
+NOISE = 0.3  # pixels
+
+
+@pytest.fixture(scope="module")
+def landmarks() -> LandmarkMap:
+    points = Points()
+    scatter = torch.full((4,), 1e-3, dtype=torch.float64)
+    built = build_landmarks(ring(points), points)
+    return replace(built, cameras=(PINHOLE,), correlation=1.0, calibration_scatter=scatter)
+
+
+def with_focal(factor: float, camera: Intrinsics = PINHOLE) -> Intrinsics:
+    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+
+
+def localized(landmarks: LandmarkMap, stated: Intrinsics, true: Intrinsics = PINHOLE) -> LandmarkPose:
+    """The answer to an image of a ``true`` camera that is stated otherwise."""
+    points = Points(noise=NOISE)
+    view = points.view(TRUE, true)
+    found = propose(
+        LandmarkMatcher(landmarks), [replace(view, frame=replace(view.frame, intrinsics=stated))], points
+    )
+    assert found is not None
+    return found
+
+
+def error(found: LandmarkPose) -> float:
+    return float((found.T_world_camera.inverse() @ TRUE).log().norm())
+
+
+@pytest.mark.parametrize(
+    "correction",
+    [
+        GIVEN,
+        Calibration(log_focal=-0.03),
+        Calibration(0.02, 0.01, -0.02, 0.0),
+        Calibration(0.01, 0.0, 0.0, 0.04),
+    ],
+)
+@pytest.mark.parametrize("given", [PINHOLE, replace(PINHOLE, distortion=(-0.02, 0.0, 0.0, 0.0))])
+def test_the_correction_between_cameras_is_the_one_that_was_applied(
+    given: Intrinsics, correction: Calibration
+) -> None:
+    found = correction_between(given, correction.applied(given))
+    tolerance = 3e-3 if given.distortion else 1e-6  # two distortions make up one only approximately
+    expected = torch.tensor(astuple(correction), dtype=torch.float64)
+    torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
+
+
+def test_a_resized_image_has_the_maps_camera() -> None:
+    found = map_camera(PINHOLE.resized(200, 150), (PINHOLE,))
+    assert found is not None
+    assert not bool(found.differs.any())
+    assert found.correction.abs().max() < 1e-9
+
+
+def test_images_of_another_shape_are_not_compared() -> None:
+    assert map_camera(replace(PINHOLE, height=400), (PINHOLE,)) is None
+    assert map_camera(PINHOLE, ()) is None
+
+
+def test_a_camera_that_refocuses_differs_only_beyond_its_own_spread() -> None:
+    cameras = tuple(with_focal(1 + 0.01 * math.sin(i)) for i in range(40))
+    inside, outside = (map_camera(with_focal(factor), cameras) for factor in (1.01, 1.05))
+    assert inside is not None
+    assert outside is not None
+    assert not bool(inside.differs.any())
+    assert outside.differs.tolist() == [True, False, False, False]
+    assert float(outside.deviations[0]) == pytest.approx(0.0075, rel=0.2)
+
+
+def test_the_farther_the_cameras_are_apart_the_less_likely_they_are_one() -> None:
+    found = [map_camera(with_focal(factor), (PINHOLE,)) for factor in (1.01, 1.03, 1.06, 1.2)]
+    odds = [camera.log_odds for camera in found if camera is not None]
+    assert odds == sorted(odds, reverse=True)
+    assert odds[-1] == -math.inf
+
+
+def fit(apparent: float, deviation: float) -> ReprojectionFit:
+    """A fit with free intrinsics that asks for a longer focal length."""
+    eye, deviations = torch.eye(6, dtype=torch.float64), torch.full((4,), deviation, dtype=torch.float64)
+    return ReprojectionFit(SE3.identity(), Calibration(apparent), 0.3, eye, deviations, torch.zeros(6, 4))
+
+
+def test_the_image_decides_where_it_can(landmarks: LandmarkMap) -> None:
+    camera = map_camera(with_focal(1 / 1.02), (PINHOLE,))
+    assert camera is not None
+    exact = [probability_of_map_camera(fit(a, 0.002), landmarks, camera) for a in (0.0, 0.01, 0.02)]
+    assert exact == sorted(exact)
+    assert exact[0] < 0.001
+    assert exact[-1] > 0.99
+    vague = [probability_of_map_camera(fit(a, 0.5), landmarks, camera) for a in (0.0, 0.02)]
+    prior = 1 / (1 + math.exp(-camera.log_odds))
+    assert vague == pytest.approx([prior, prior], abs=0.02)
+
+
+def test_an_approximate_focal_length_may_be_that_of_the_map_or_any_other(landmarks: LandmarkMap) -> None:
+    camera = map_camera(with_focal(1 / 1.1), (PINHOLE,))
+    assert camera is not None
+    there, elsewhere = (
+        probability_beside_approximate(fit(math.log(a), 0.004), landmarks, camera) for a in (1.1, 1.14)
+    )
+    assert there > 0.99
+    assert elsewhere < 0.01
+    far = map_camera(with_focal(2.0), (PINHOLE,))
+    assert far is not None
+    assert probability_beside_approximate(fit(-0.69, 0.004), landmarks, far) == 0
+
+
+@pytest.mark.parametrize("factor", [0.95, 0.98, 1.02, 1.05])
+def test_a_misstated_camera_of_the_map_is_recognised(landmarks: LandmarkMap, factor: float) -> None:
+    right, corrected = localized(landmarks, PINHOLE), localized(landmarks, with_focal(factor))
+    assert corrected.takes_map_camera
+    assert corrected.focal_factor == pytest.approx(1 / factor, rel=1e-6)
+    assert error(corrected) < 1.5 * error(right) + 0.002
+    verdict = landmark_verdict(corrected)
+    assert verdict.accepted
+    assert "with the map's intrinsics: a focal length" in verdict.reason
+
+
+def test_without_the_maps_cameras_the_stated_one_misleads(landmarks: LandmarkMap) -> None:
+    vague = replace(landmarks, calibration_scatter=10 * landmarks.calibration_scatter)
+    found = localized(replace(vague, cameras=()), with_focal(1.02))
+    assert not found.takes_map_camera
+    assert error(found) > 0.04
+    assert error(localized(vague, with_focal(1.02))) < 0.01
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.04])
+def test_another_camera_that_is_stated_rightly_is_believed(landmarks: LandmarkMap, factor: float) -> None:
+    other = with_focal(factor)
+    found = localized(landmarks, other, other)
+    assert not found.takes_map_camera
+    assert error(found) < 0.02
+    assert landmark_verdict(found).accepted
+
+
+def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks: LandmarkMap) -> None:
+    """The scatter of apparent focal lengths in the map is far larger than the difference."""
+    scatter = landmarks.calibration_scatter.clone()
+    scatter[0] = 0.1
+    found = localized(replace(landmarks, calibration_scatter=scatter), with_focal(1.05))
+    verdict = landmark_verdict(found)
+    assert verdict.outcome is Outcome.MISCALIBRATED
+    assert "do not tell whether" in verdict.reason
+    without = found.covariance.diagonal()[:3].sum()
+    assert (found.full_covariance + found.unresolved_calibration).diagonal()[:3].sum() > 2 * without
+    indifferent = LandmarkThresholds(alternative=1.0)
+    assert landmark_verdict(found, indifferent).outcome is not Outcome.MISCALIBRATED
+
+
+def test_a_misplaced_principal_point_is_corrected_too(landmarks: LandmarkMap) -> None:
+    found = localized(landmarks, replace(PINHOLE, cx=PINHOLE.cx + 6.0))
+    assert found.takes_map_camera
+    assert found.calibration.shift_u == pytest.approx(-6 / PINHOLE.fx, rel=1e-6)
+    assert error(found) < 0.01
+
+
+def test_an_approximate_focal_length_becomes_that_of_the_maps_camera(landmarks: LandmarkMap) -> None:
+    points = Points(noise=NOISE)
+    view = points.view(TRUE)
+    stated = View(Frame("f", view.frame.rgb, with_focal(1.1)), SE3.identity())
+    found = propose(LandmarkMatcher(landmarks), [stated], points, prior=NOMINAL)
+    assert found is not None
+    assert found.takes_map_camera
+    assert found.focal_factor == pytest.approx(1 / 1.1, rel=1e-6)
+    free = propose(LandmarkMatcher(replace(landmarks, cameras=())), [stated], points, prior=NOMINAL)
+    assert free is not None
+    assert float(found.full_covariance.diagonal()[:3].sum()) < float(
+        free.full_covariance.diagonal()[:3].sum()
+    )
