@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
@@ -46,6 +46,9 @@ class Frame:
     has_colour: bool = True
     """Whether colours were recorded. Where only depth was, as between the photos of a LiDAR scan, ``rgb`` is black."""
 
+    hidden: Bool[Tensor, "hh hw"] | None = None
+    """The pixels where something that the map does not have hides the scene; they are not compared with the map."""
+
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[-1] != 3:
             raise InputError(
@@ -53,7 +56,12 @@ class Frame:
                 "Frame.from_numpy takes grey and RGBA"
             )
         expected = (self.intrinsics.height, self.intrinsics.width)
-        for what, image in (("rgb", self.rgb), ("depth", self.depth), ("alpha", self.alpha)):
+        for what, image in (
+            ("rgb", self.rgb),
+            ("depth", self.depth),
+            ("alpha", self.alpha),
+            ("hidden", self.hidden),
+        ):
             if image is not None and tuple(image.shape[:2]) != expected:
                 found = f"{image.shape[1]}x{image.shape[0]}"
                 raise InputError(
@@ -158,10 +166,12 @@ class Frame:
 
     def to(self, device: torch.device | str) -> Frame:
         """Return the frame with its images on ``device``; the frame itself where they lie there."""
-        depth, alpha = (None if image is None else image.to(device) for image in (self.depth, self.alpha))
+        others = (self.depth, self.alpha, self.hidden)
+        depth, alpha, hidden = (None if image is None else image.to(device) for image in others)
         rgb = self.rgb.to(device)
-        unmoved = rgb is self.rgb and depth is self.depth and alpha is self.alpha
-        return self if unmoved else replace(self, rgb=rgb, depth=depth, alpha=alpha)
+        if all(a is b for a, b in zip((rgb, depth, alpha, hidden), (self.rgb, *others), strict=True)):
+            return self
+        return replace(self, rgb=rgb, depth=depth, alpha=alpha, hidden=hidden)
 
     @property
     def has_depth(self) -> bool:

@@ -30,8 +30,12 @@ class PixelDrawer(Protocol):
 
 
 def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
-    """Draw pixels uniformly, with replacement."""
+    """Draw pixels that are not hidden uniformly, with replacement."""
     size, where = frame.intrinsics, generator.device
+    if frame.hidden is not None:
+        seen = (~frame.hidden).nonzero().flip(-1).to(where)
+        if len(seen):
+            return seen[torch.randint(len(seen), (count,), generator=generator, device=where)]
     columns = torch.randint(size.width, (count,), generator=generator, device=where)
     rows = torch.randint(size.height, (count,), generator=generator, device=where)
     return torch.stack([columns, rows], dim=-1)
@@ -152,11 +156,19 @@ class Among:
 
     def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
         if frame not in self._found:
-            self._found[frame] = self._choose(frame).to(generator.device)
+            self._found[frame] = _seen(self._choose(frame), frame).to(generator.device)
         found = self._found[frame]
         if len(found) == 0:
             return uniform(frame, count, generator)
         return found[torch.randint(len(found), (count,), generator=generator, device=found.device)]
+
+
+def _seen(pixels: Int[Tensor, "n 2"], frame: Frame) -> Int[Tensor, "k 2"]:
+    """Return the pixels that are not hidden."""
+    if frame.hidden is None:
+        return pixels
+    columns, rows = pixels.to(frame.hidden.device).unbind(-1)
+    return pixels[~frame.hidden[rows, columns].to(pixels.device)]
 
 
 def drawer(name: DrawerName) -> PixelDrawer:

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import baked
-import bidnerf_core.localization.auto as module
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization import AutoConfig, Localization, Outcome, settings_of
+from bidnerf_core.localization import AutoConfig, Localization, Outcome, by_depth, settings_of
+from bidnerf_core.localization.auto_config import LEAST_POINTS
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.search.by_points import PointSearch
@@ -109,7 +109,7 @@ def test_the_field_refines_what_the_surface_found() -> None:
     near = perturb(view.T_ref_camera, 0.08, 3, 0)
     nothing = torch.zeros(0, dtype=torch.float64)
     found = SearchResult(near[None], search.score(near[None]), math.inf, near[None], nothing)
-    refined, share = module._refined(problem, search, found, AutoConfig(refine_steps=4), generator)
+    refined, share = by_depth._refined(problem, search, found, AutoConfig(refine_steps=4), generator)
     error = pose_error(refined.T[0], view.T_ref_camera)
     assert float(error.translation) < 0.02
     assert float(error.rotation_deg) < 0.5
@@ -166,7 +166,7 @@ def test_without_surface_a_start_is_needed(make, said: str, monkeypatch: pytest.
     assert "needs a start" in str(raised.value)
     assert "\n" not in str(raised.value)
     short = settings_of("bid", {"max_steps": 2, "rays": 32})
-    monkeypatch.setattr(module, "BidConfig", lambda: short)
+    monkeypatch.setattr("bidnerf_core.localization.auto.BidConfig", lambda: short)
     found = found_for(make(view, view.T_ref_camera))
     assert (found.method, found.steps) == ("bid", 2)
     assert said in found.reason
@@ -213,7 +213,7 @@ def test_depth_rays_of_a_wide_lidar_are_matched_without_colour_where_no_image_se
 def test_a_few_depth_rays_are_too_little_to_search_by() -> None:
     """The images decide where there are fewer points than a shape needs."""
     view = baked.unseen()[0]
-    few = in_camera(view)[: module.LEAST_POINTS - 1]
+    few = in_camera(view)[: LEAST_POINTS - 1]
     problem = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour_only(view)], None, few)
     quick = {"hypotheses": 8, "rounds": 1, "coarse_steps": 1, "fine_steps": 1, "fine_rays": 64}
     found = localize(problem, "auto", quick)

@@ -1,6 +1,6 @@
 """Finding poses: ``Localizer``, the methods by name, and their settings."""
 
-from bidnerf_core.localization.auto import AutoConfig
+from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.bid import BidConfig
 from bidnerf_core.localization.bid_lm import BidLmConfig
 from bidnerf_core.localization.inerf import InerfConfig

@@ -9,8 +9,7 @@ from which ``auto`` descends as ``bid`` does.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import replace
 
 import torch
 from torch import Generator
@@ -18,87 +17,77 @@ from torch import Generator
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.acceptance import (
     LandmarkThresholds,
-    SurfaceDiagnostics,
+    SurfaceThresholds,
     landmark_verdict,
-    surface_diagnostics,
 )
+from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.by_colour import (
-    ByColourConfig,
     ColourAnswer,
     localization_of,
     refine_by_colour,
     without_the_imprecise,
 )
+from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface
 from bidnerf_core.localization.by_landmarks import (
+    LandmarkAnswer,
     answer_by_landmarks,
     fused_answer,
     is_sharp,
     localization_by_landmarks,
 )
-from bidnerf_core.localization.confidence import judged
-from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.costs.surface import PointCloud
-from bidnerf_core.localization.covariance import surface_covariance
-from bidnerf_core.localization.fusion import finest_cost
-from bidnerf_core.localization.method_settings import (
-    ColourSettings,
-    DepthSettings,
-    RefinementSettings,
-    RefinementStage,
-    rendered_depth_scale,
-)
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.by_images import ImageSearch
-from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence
+from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
-from bidnerf_core.settings import EXPERT, Range, Settings
 
-LEAST_POINTS = 50
-"""Least number of measured depths from which the shape of the scene can be recognised."""
-WORSE = 0.05
-"""Largest increase of the cost on the surface by refinement; with more, field and surface contradict each other."""
+FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
+"""Reasons for which landmarks reject a pose that nothing else can put right: with wrong intrinsics, the surface is not found at
+the right place either.
+"""
+TRUSTED = 0.8
+"""Confidence from which on a pose by landmarks is not compared with the surface."""
+FEWER = 0.05
+"""Share of the measured points by which landmarks may take a pose off the surface."""
+BEHIND = 0.1
+"""Largest share of the points of an occluder that may lie behind the surface."""
 MANY_LANDMARKS = 500
 """The number of landmarks from which on a scene is textured."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
 SUPPORTED = 0.45
 """Least confidence of landmarks in a pose that the surface accepts on its own grounds."""
-LOSS_POINTS = 200
-"""Number of points on which the losses along the path are computed."""
-
-
-@dataclass(frozen=True)
-class AutoConfig(Settings):
-    """Settings of method ``auto``."""
-
-    # largest number of measured points that are aligned
-    points: Annotated[int, Range(LEAST_POINTS, 10**6)] = 2000
-    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # number of poses with which a round of search begins
-    # largest number of rounds of search, each with fresh hypotheses, until an answer is accepted
-    rounds: Annotated[int, Range(1, 100)] = 3
-    # steps on rendered rays that refine an answer by depth; 0: none
-    refine_steps: Annotated[int, Range(0, 1000)] = 2
-    refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for each of these steps
-    landmarks: bool = True  # match image features with the map's landmarks first, where it has some
-    # number of rendered rays that are fused with landmarks; 0: none
-    fused_rays: Annotated[int, Range(0, 10**6)] = 1024
-    by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     """Find the pose by landmarks, else by depth on the surface, else by colour on it, else by descent from a start.
 
-    Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
+    An image whose pose is not accepted is tried once more without the nearest thing that was measured, which may hide the
+    scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
     """
+    found = _found(problem, config, seed)
+    if found.converged or found.outcome in FINAL or problem.surface is None:
+        return found
+    occluder = nearest_piece(problem)
+    if occluder is None:
+        return found
+    rest = _found(occluder.rest, config, seed)
+    if not rest.converged or occluder.share_behind(problem.surface, rest.T_world_camera) > BEHIND:
+        return found
+    hidden = (
+        f"without the nearest {occluder.share:.0%} of the measured points, which are on something in front"
+    )
+    return replace(rest, reason=f"{rest.reason}, {hidden}", seconds=found.seconds + rest.seconds)
+
+
+def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     began, answer, matcher = time.perf_counter(), None, problem.matcher if config.landmarks else None
     if matcher is not None:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
@@ -106,14 +95,21 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         rejection = _mirror_rejection(problem, matcher, answer.found.log10_nfa, seed)
         answer = answer if rejection is None else replace(answer, verdict=rejection)
     has_points = _measured_points(problem) >= LEAST_POINTS
-    if answer is not None and _is_final(answer.verdict.outcome, has_points):
+    doubtful = answer is not None and has_points and _is_doubtful(problem, answer)
+    if answer is not None and not doubtful and _is_final(answer.verdict.outcome, has_points):
         return localization_by_landmarks(problem, answer, began)
     if answer is not None and problem.start is None:
         problem = replace(problem, start=answer.T)  # one more place to look
     if problem.surface is None:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
     if has_points:
-        found = _by_points(problem, problem.surface, config, seed)
+        found = localized_by_depth(problem, problem.surface, config, seed)
+        if (
+            answer is not None
+            and answer.verdict.accepted
+            and not (found.converged and _leaves_surface(problem, found, answer))
+        ):
+            return localization_by_landmarks(problem, answer, began)
     else:
         found = _by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
@@ -123,12 +119,18 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     )
 
 
+def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
+    """Whether few landmarks gave a pose from which the measured points are off the surface."""
+    if problem.surface is None or not answer.verdict.accepted or (answer.confidence or 0.0) >= TRUSTED:
+        return False
+    return share_on_surface(problem, problem.surface, answer.T) < SurfaceThresholds().on_surface
+
+
 def _is_final(outcome: Outcome, has_points: bool) -> bool:
     """Whether the surface has nothing to add to what landmarks found."""
     if outcome is Outcome.UNCERTAIN:
         return not has_points
-    # With wrong intrinsics, the surface is not found at the right place either.
-    return outcome in (Outcome.CONVERGED, Outcome.MISCALIBRATED, Outcome.MIRRORED)
+    return outcome is Outcome.CONVERGED or outcome in FINAL
 
 
 def _mirror_rejection(
@@ -154,6 +156,8 @@ def _compared_with_landmarks(
     near = confirm(matcher, problem.views, found.T_world_camera)
     if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
+        if found.converged and _leaves_surface(problem, found, answer):
+            return replace(found, seconds=time.perf_counter() - began)
         refined = localization_by_landmarks(problem, answer, began)
         twin = _mirror_rejection(problem, matcher, near.pose.log10_nfa, seed)
         supported = (
@@ -174,82 +178,18 @@ def _compared_with_landmarks(
     return replace(found, seconds=time.perf_counter() - began)
 
 
+def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:
+    """Whether landmarks would move a pose found on the surface to where fewer of the measured points lie on it."""
+    if problem.surface is None or _measured_points(problem) < LEAST_POINTS:
+        return False
+    before, after = (share_on_surface(problem, problem.surface, T) for T in (found.T_world_camera, answer.T))
+    return after < before - FEWER
+
+
 def _measured_points(problem: Problem) -> int:
     images = [view.frame.depth for view in problem.views if view.frame.depth is not None]
     pixels = sum(int(((depth > 0) & depth.isfinite()).sum()) for depth in images)
     return pixels + (0 if problem.depth_rays is None else len(problem.depth_rays))
-
-
-def _by_points(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
-    """Align measured points with the surface, then refine on rendered rays."""
-    began, generator = time.perf_counter(), Generator().manual_seed(seed)
-    search = PointSearch(
-        surface, PointCloud.measured(problem.views, problem.depth_rays, config.points, generator)
-    )
-    with torch.no_grad():
-        found = _searched(problem, search, config, generator)
-    inliers = 1.0
-    if config.refine_steps:
-        found, inliers = _refined(problem, search, found, config, generator)
-    with torch.no_grad():
-        diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers)
-        judgement = judged(diagnostics.verdict(), diagnostics)
-        path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
-        losses = search.judge(LOSS_POINTS).cost(path)
-        covariance = surface_covariance(search.judge(), found.T[0], len(problem.views))
-    return Localization(
-        T_world_camera=found.T[0].normalized(),
-        outcome=judgement.verdict.outcome,
-        reason=judgement.verdict.reason,
-        steps=len(losses) - 1,
-        seconds=time.perf_counter() - began,
-        loss=float(found.scores[0]),
-        method="auto",
-        poses=path,
-        losses=losses[:-1],
-        covariance=covariance,
-        confidence=judgement.confidence,
-        diagnostics=diagnostics,
-    )
-
-
-def _searched(
-    problem: Problem, search: PointSearch, config: AutoConfig, generator: Generator
-) -> SearchResult:
-    """Search in rounds until an answer is acceptable, and return the best one."""
-    answers: list[SearchResult] = []
-    while True:
-        answers.append(search(problem.start, config.hypotheses, generator))
-        best = min(answers, key=lambda found: float(found.scores[0]))
-        if len(answers) == config.rounds or _diagnostics(search, best).rejection() is None:
-            return best
-
-
-def _diagnostics(search: PointSearch, found: SearchResult) -> SurfaceDiagnostics:
-    return surface_diagnostics(search.judge(), found.T[0], found.margin)
-
-
-def _refined(
-    problem: Problem, search: PointSearch, found: SearchResult, config: AutoConfig, generator: Generator
-) -> tuple[SearchResult, float]:
-    """Return a refined pose, and the share of rendered rays that agree with the measurements there.
-
-    The surface is as coarse as its cells, and the field as its training: both count as far as they agree with what was
-    measured.
-    """
-    scale = rendered_depth_scale(problem.bounds)
-    stage = RefinementStage(
-        config.refine_steps, config.refine_rays, depth_scale=scale, surface_sigma=scale / 12
-    )
-    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
-    finest = finest_cost(search.surface, search.cloud)
-    steps = take_few_steps(problem, found.T[0], stage, settings, generator, finest)
-    with torch.no_grad():
-        scores = search.score(steps.poses)
-    if not float(scores[-1]) <= float(scores[0]) + WORSE:
-        return found, 0.0
-    path = SE3.cat([found.path, steps.poses[1:]])
-    return replace(found, T=steps.poses[-1:], scores=scores[-1:], path=path), steps.inliers
 
 
 def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.auto import AutoConfig, auto
+from bidnerf_core.localization.auto import auto
+from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.bid import BID_PRESETS, BidConfig, bid
 from bidnerf_core.localization.bid_lm import BidLmConfig, bid_lm
 from bidnerf_core.localization.inerf import INERF_PRESETS, InerfConfig, inerf

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization.auto import AutoConfig
+from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.tracking.answers import (

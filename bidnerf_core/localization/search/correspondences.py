@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
@@ -27,6 +27,7 @@ class QueryImage:
     depth: Float[Tensor, "n"]  # metres, 0 where none was measured
     intrinsics: Intrinsics
     T_rig_camera: SE3  # float64
+    hidden: Bool[Tensor, "h w"] | None = None  # pixels of what the map does not have, as ``Frame`` has them
 
     @property
     def focal(self) -> float:
@@ -46,10 +47,13 @@ def query_images(views: Sequence[View], features: Features) -> list[QueryImage]:
 
 
 def query_image(frame: Frame, T_rig_camera: SE3, features: Features) -> QueryImage:
-    keypoints = features(frame.rgb)
+    keypoints, hidden = features(frame.rgb), None if frame.hidden is None else frame.hidden.cpu()
+    if hidden is not None:
+        columns, rows = keypoints.pixels.long().unbind(-1)
+        keypoints = keypoints[~hidden[rows, columns]]
     rays = frame.intrinsics.unproject(keypoints.pixels.double())
     depth = measured_depth(frame, keypoints.pixels)
-    return QueryImage(keypoints, rays, depth, frame.intrinsics, T_rig_camera)
+    return QueryImage(keypoints, rays, depth, frame.intrinsics, T_rig_camera, hidden)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.features import paired_squared_distances
@@ -121,7 +122,19 @@ def _visible(
     towards = T_world_camera.translation.float() - landmarks.positions
     length = torch.linalg.vector_norm(towards, dim=-1).clamp(min=1e-12)
     cosine = (towards * landmarks.directions).sum(-1) / length
+    if image.hidden is not None:
+        inside[inside.clone()] &= ~_hidden(image.hidden, local[inside], camera)
     return inside & (cosine >= (landmarks.cones + OBLIQUE).clamp(max=torch.pi).cos())
+
+
+def _hidden(
+    hidden: Bool[Tensor, "h w"], local: Float[Tensor, "m 3"], camera: Intrinsics
+) -> Bool[Tensor, "m"]:
+    """Return which points before a camera appear in its hidden pixels, but for its distortion."""
+    column = (local[:, 0] / local[:, 2] * camera.fx + camera.cx).floor().clamp(-1, camera.width).long()
+    row = (local[:, 1] / local[:, 2] * camera.fy + camera.cy).floor().clamp(-1, camera.height).long()
+    within = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return within & hidden[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
 
 
 def _best(

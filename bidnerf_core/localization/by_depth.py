@@ -1,0 +1,123 @@
+"""Localization by measured depth: align points with the baked surface, then refine on rendered rays."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import torch
+from torch import Generator
+
+from bidnerf_core.localization.acceptance import (
+    SurfaceDiagnostics,
+    surface_diagnostics,
+)
+from bidnerf_core.localization.auto_config import AutoConfig
+from bidnerf_core.localization.confidence import judged
+from bidnerf_core.localization.costs.rendered import RenderedCostSettings
+from bidnerf_core.localization.costs.surface import PointCloud
+from bidnerf_core.localization.covariance import surface_covariance
+from bidnerf_core.localization.fusion import finest_cost
+from bidnerf_core.localization.method_settings import (
+    ColourSettings,
+    DepthSettings,
+    RefinementSettings,
+    RefinementStage,
+    rendered_depth_scale,
+)
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.refinement import take_few_steps
+from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.search.by_points import PointSearch
+from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.se3 import SE3
+
+WORSE = 0.05
+"""Largest increase of the cost on the surface by refinement; with more, field and surface contradict each other."""
+COMPARED_POINTS = 1000
+"""Number of points by which two poses are compared."""
+LOSS_POINTS = 200
+"""Number of points on which the losses along the path are computed."""
+
+
+def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
+    """Align measured points with the surface, then refine on rendered rays."""
+    began, generator = time.perf_counter(), Generator().manual_seed(seed)
+    search = PointSearch(
+        surface, PointCloud.measured(problem.views, problem.depth_rays, config.points, generator)
+    )
+    with torch.no_grad():
+        found = _searched(problem, search, config, generator)
+    inliers = 1.0
+    if config.refine_steps:
+        found, inliers = _refined(problem, search, found, config, generator)
+    with torch.no_grad():
+        diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers)
+        judgement = judged(diagnostics.verdict(), diagnostics)
+        path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
+        losses = search.judge(LOSS_POINTS).cost(path)
+        covariance = surface_covariance(search.judge(), found.T[0], len(problem.views))
+    return Localization(
+        T_world_camera=found.T[0].normalized(),
+        outcome=judgement.verdict.outcome,
+        reason=judgement.verdict.reason,
+        steps=len(losses) - 1,
+        seconds=time.perf_counter() - began,
+        loss=float(found.scores[0]),
+        method="auto",
+        poses=path,
+        losses=losses[:-1],
+        covariance=covariance,
+        confidence=judgement.confidence,
+        diagnostics=diagnostics,
+    )
+
+
+def _searched(
+    problem: Problem, search: PointSearch, config: AutoConfig, generator: Generator
+) -> SearchResult:
+    """Search in rounds until an answer is acceptable, and return the best one."""
+    answers: list[SearchResult] = []
+    while True:
+        answers.append(search(problem.start, config.hypotheses, generator))
+        best = min(answers, key=lambda found: float(found.scores[0]))
+        if len(answers) == config.rounds or _diagnostics(search, best).rejection() is None:
+            return best
+
+
+def _diagnostics(search: PointSearch, found: SearchResult) -> SurfaceDiagnostics:
+    return surface_diagnostics(search.judge(), found.T[0], found.margin)
+
+
+def _refined(
+    problem: Problem, search: PointSearch, found: SearchResult, config: AutoConfig, generator: Generator
+) -> tuple[SearchResult, float]:
+    """Return a refined pose, and the share of rendered rays that agree with the measurements there.
+
+    The surface is as coarse as its cells, and the field as its training: both count as far as they agree with what was
+    measured.
+    """
+    scale = rendered_depth_scale(problem.bounds)
+    stage = RefinementStage(
+        config.refine_steps, config.refine_rays, depth_scale=scale, surface_sigma=scale / 12
+    )
+    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
+    finest = finest_cost(search.surface, search.cloud)
+    steps = take_few_steps(problem, found.T[0], stage, settings, generator, finest)
+    with torch.no_grad():
+        scores = search.score(steps.poses)
+    if not float(scores[-1]) <= float(scores[0]) + WORSE:
+        return found, 0.0
+    path = SE3.cat([found.path, steps.poses[1:]])
+    return replace(found, T=steps.poses[-1:], scores=scores[-1:], path=path), steps.inliers
+
+
+@torch.no_grad()
+def share_on_surface(problem: Problem, surface: SurfaceMap, T_world_camera: SE3) -> float:
+    """Return the share of the measured points that lie on the surface from a pose."""
+    cloud = PointCloud.measured(
+        problem.views, problem.depth_rays, COMPARED_POINTS, Generator().manual_seed(0)
+    )
+    judge = finest_cost(surface, cloud)
+    return float(judge.inliers(judge.correspondences(T_world_camera[None]))[0].mean())

@@ -1,0 +1,97 @@
+"""Things in front of the scene: the nearest piece of a depth image, cut out along jumps of the depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.casting import cast
+from bidnerf_core.se3 import SE3
+
+JUMP = 0.05
+"""Relative difference of the depths of neighbouring pixels from which on they belong to different things."""
+CONSIDERABLE, REST = 0.15, 0.05
+"""Least share of the measured pixels in an occluder, and in the rest."""
+PROBED_POINTS = 300
+"""Largest number of points of an occluder that are compared with the surface."""
+SLACK = 0.02
+"""Distance behind the surface (share of the scene's extent) up to which a point still lies on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Occluder:
+    """The nearest considerable piece of a depth image, and the problem without its pixels."""
+
+    rest: Problem
+    share: float  # of the measured pixels that it has
+    points: Float[Tensor, "n 3"]  # some of it, in the camera's frame, metres
+
+    @torch.no_grad()
+    def share_behind(self, surface: SurfaceMap, T_world_camera: SE3) -> float:
+        """Return the share of its points that lie behind the surface, as seen from a pose: these cannot hide anything."""
+        ends = T_world_camera.apply(self.points.double())
+        lines = (ends - T_world_camera.translation).float()
+        length = torch.linalg.vector_norm(lines, dim=-1)
+        met = cast(surface, T_world_camera.translation.float().expand_as(lines), lines / length[:, None])
+        behind = met.met & (length > met.along + SLACK * surface.extent)
+        return float(behind.float().mean())
+
+
+def nearest_piece(problem: Problem) -> Occluder | None:
+    """Return the piece of the only depth image that may be an occluder: the nearest of the considerable ones.
+
+    None if there is no such piece, if it is all that was measured, or if there are several images or other sensors.
+    """
+    if len(problem.views) != 1 or problem.depth_rays is not None:
+        return None
+    (view,) = problem.views
+    depth = view.frame.depth
+    if depth is None:
+        return None
+    piece = _nearest(depth.cpu())
+    if piece is None:
+        return None
+    hidden = piece.to(depth.device)
+    frame = replace(view.frame, depth=torch.where(hidden, 0, depth), hidden=hidden)
+    pixels = piece.nonzero()
+    some = pixels[torch.linspace(0, len(pixels) - 1, min(len(pixels), PROBED_POINTS)).long()]
+    centres = some.flip(-1).double() + 0.5
+    points = view.frame.intrinsics.unproject(centres) * depth.cpu().double()[some[:, 0], some[:, 1], None]
+    share = len(pixels) / max(1, int((depth > 0).sum()))
+    return Occluder(replace(problem, views=(replace(view, frame=frame),)), share, points.float())
+
+
+def _nearest(depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"] | None:
+    label = _pieces(depth.numpy())
+    measured = label >= 0
+    counts = np.bincount(label[measured]) if measured.any() else np.zeros(0, dtype=int)
+    considerable = (counts >= CONSIDERABLE * counts.sum()).nonzero()[0]
+    if len(considerable) == 0:
+        return None
+    values = depth.numpy()
+    nearest = min(considerable, key=lambda number: float(np.median(values[label == number])))
+    if counts[nearest] > (1 - REST) * counts.sum():
+        return None
+    return torch.from_numpy(label == nearest)
+
+
+def _pieces(depth: np.ndarray) -> np.ndarray:
+    """Return the number of the connected piece of each pixel, -1 where nothing was measured."""
+    number, measured = np.arange(depth.size).reshape(depth.shape), depth > 0
+    pairs = []
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        near, far = np.minimum(depth[a], depth[b]), np.maximum(depth[a], depth[b])
+        joined = (near > 0) & (far - near <= JUMP * near)
+        pairs.append(np.stack([number[a][joined], number[b][joined]]))
+    first, second = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(depth.size, depth.size))
+    _, label = connected_components(graph, directed=False)
+    return np.where(measured, label.reshape(depth.shape), -1)
