@@ -194,6 +194,20 @@ def test_auto_takes_landmarks_first_with_a_start_or_without() -> None:
         assert_within(found.T_world_camera, 0.02, 0.5)
 
 
+def test_doubtful_landmarks_keep_the_scale_that_they_give_a_depth_sensor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The surface would believe the sensor, and be 5 cm off."""
+    monkeypatch.setattr("bidnerf_core.localization.auto.TRUSTED", 2.0)
+    depth = unseen().frame.depth
+    assert depth is not None
+    view = replace(unseen(), frame=replace(unseen().frame, depth=1.03 * depth))
+    found = localized(view, textured_map(surface=True))
+    assert found.converged
+    assert "landmarks agree" in found.reason
+    assert_within(found.T_world_camera, 0.02, 0.5)
+
+
 def test_landmarks_can_be_switched_off() -> None:
     localizer = Localizer(textured_map(surface=True), "auto", replace(QUICK, landmarks=False))
     found = localizer(unseen().frame)

@@ -32,6 +32,7 @@ from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surf
 from bidnerf_core.localization.by_landmarks import (
     LandmarkAnswer,
     answer_by_landmarks,
+    corrected,
     fused_answer,
     is_sharp,
     localization_by_landmarks,
@@ -123,7 +124,8 @@ def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
     """Whether few landmarks gave a pose from which the measured points are off the surface."""
     if problem.surface is None or not answer.verdict.accepted or (answer.confidence or 0.0) >= TRUSTED:
         return False
-    return share_on_surface(problem, problem.surface, answer.T) < SurfaceThresholds().on_surface
+    there = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
+    return there < SurfaceThresholds().on_surface
 
 
 def _is_final(outcome: Outcome, has_points: bool) -> bool:
@@ -182,7 +184,8 @@ def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswe
     """Whether landmarks would move a pose found on the surface to where fewer of the measured points lie on it."""
     if problem.surface is None or _measured_points(problem) < LEAST_POINTS:
         return False
-    before, after = (share_on_surface(problem, problem.surface, T) for T in (found.T_world_camera, answer.T))
+    before = share_on_surface(problem, problem.surface, found.T_world_camera)
+    after = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
     return after < before - FEWER
 
 

@@ -88,7 +88,7 @@ def fused_answer(
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.full_covariance, diagnostics)
     if not verdict.accepted or found.estimates_calibration:
         return _judged(answer)  # the other terms would need intrinsics as exact as the landmarks'
-    problem = _from(problem, found)
+    problem = corrected(problem, found)
     about, generator = pivot("scene", problem), Generator().manual_seed(seed)
     terms = dict[str, FusedTerm]()
     if problem.surface is not None and problem.has_depth:
@@ -106,7 +106,7 @@ def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
     return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
 
 
-def _from(problem: Problem, found: LandmarkPose) -> Problem:
+def corrected(problem: Problem, found: LandmarkPose) -> Problem:
     """Return the problem from the pose found, with its intrinsics and with measured depth on the map's scale."""
     scale, views = shrunk_depth_scale(found), []
     for view in problem.views:
