@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.camera_sources import Raster, read_camera
 from bidnerf_core.datasets.poses import rigid_of_rows
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.images import resampled
 from bidnerf_core.orientation import UPRIGHT
 from bidnerf_core.records import read_record
@@ -63,6 +64,14 @@ class DepthSensor:
             )
         coarse = colour.scaled(min(1.0, camera.fx / colour.fx, camera.fy / colour.fy))
         found = register_depth(depth, camera, coarse, self.T_colour_depth)
+        if bool((depth > 0).any()) and not bool((found > 0).any()):
+            away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
+            warnings.warn(
+                f"{file}: nothing that was measured falls into the colour image; {EXTRINSICS} has the depth camera {away:.3g} m"
+                " from the colour camera, expected metres and OpenCV axes",
+                InputWarning,
+                stacklevel=2,
+            )
         return found if coarse == colour else resampled(found, colour.width, colour.height)
 
 
