@@ -201,7 +201,9 @@ def test_doubtful_landmarks_keep_the_scale_that_they_give_a_depth_sensor(
     monkeypatch.setattr("bidnerf_core.localization.auto.TRUSTED", 2.0)
     depth = unseen().frame.depth
     assert depth is not None
-    view = replace(unseen(), frame=replace(unseen().frame, depth=1.03 * depth))
+    hidden = torch.zeros_like(depth, dtype=torch.bool)
+    hidden[:10] = True
+    view = replace(unseen(), frame=replace(unseen().frame, depth=1.03 * depth, hidden=hidden))
     found = localized(view, textured_map(surface=True))
     assert found.converged
     assert "landmarks agree" in found.reason
