@@ -11,7 +11,7 @@ import torch
 
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
-from bidnerf_core.localization.tracking.answers import METHOD, with_focal_factor
+from bidnerf_core.localization.tracking.answers import METHOD
 from flights import (
     FRAMES,
     INTERVAL,
@@ -24,7 +24,7 @@ from flights import (
     tracked,
     without_depth,
 )
-from textured_field import textured_map, view
+from textured_field import CAMERA, textured_map, view
 
 CHI2_99 = 16.8  # of six degrees of freedom
 
@@ -282,7 +282,7 @@ def test_a_window_reduces_the_error_of_noisy_depth(window: int) -> None:
 
 
 def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
-    """It stands in the state, and corrects frames whose focal length is approximate; others are taken at their word."""
+    """It stands in the state, and corrects later frames."""
     frames = flight()[:4]
     off = replace(frames[0][1].intrinsics, fx=1.06 * 130, fy=1.06 * 130)
     known = [(t, replace(f, depth=None, intrinsics=off, focal_is_approximate=True), T) for t, f, T in frames]
@@ -291,8 +291,22 @@ def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
     answers = tracked(known, tracker)
     assert_right(answers, known)
     assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 1.06] * 4, rel=0.01)
-    exact = with_focal_factor(frames[0][1], 1 / 1.06)
-    assert exact.intrinsics == frames[0][1].intrinsics
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_misstated_camera_of_the_map_is_corrected_in_all_frames(depth: bool) -> None:
+    scene = textured_map(surface=True)
+    assert scene.landmarks is not None
+    scatter = torch.full((4,), 0.002, dtype=torch.float64)
+    landmarks = replace(scene.landmarks, cameras=(CAMERA,), calibration_scatter=scatter, correlation=1.0)
+    localizer = Localizer(replace(scene, landmarks=landmarks))
+    stated = replace(CAMERA, fx=0.97 * CAMERA.fx, fy=0.97 * CAMERA.fy)
+    frames = [
+        (t, replace(f, intrinsics=stated, depth=f.depth if depth else None), T) for t, f, T in flight()[:4]
+    ]
+    answers = tracked(frames, Tracker(localizer))
+    assert_right(answers, frames)
+    assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 0.97] * 4, rel=1e-6)
 
 
 def test_the_state_does_not_grow(tmp_path: Path) -> None:

@@ -245,7 +245,7 @@ class Tracker:
             covariance = self._at_start(frame, found.T_world_camera).covariance
         pose = PoseEstimate(found.T_world_camera, 0.5 * covariance, 0.5 * covariance)
         motion = Motion.at(pose, self._reach(frame))
-        factor = state.focal_factor * found.focal_factor  # other than 1 for approximate focal lengths
+        factor = state.focal_factor * found.focal_factor
         state = replace(
             state, points=FollowedPoints.none(), window=(), motion=motion, focal_factor=factor
         )  # fmt: skip

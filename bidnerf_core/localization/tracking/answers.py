@@ -17,8 +17,8 @@ METHOD = "track"
 
 
 def with_focal_factor(frame: Frame, factor: float) -> Frame:
-    """Return the frame with its focal length multiplied by ``factor``, if that is only an approximate one."""
-    if factor == 1 or not frame.focal_is_approximate:
+    """Return the frame with its focal length multiplied by ``factor``."""
+    if factor == 1:
         return frame
     camera = frame.intrinsics
     return replace(frame, intrinsics=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))

@@ -44,7 +44,7 @@ class TrackerState:
     usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
     miscalibration: Miscalibration = field(default_factory=Miscalibration.unknown)
     calibrated: int | None = None  # the frame (of ``frames``) in which the intrinsics were last checked
-    focal_factor: float = 1.0  # on approximate focal lengths
+    focal_factor: float = 1.0  # on the given focal lengths, from the last search
     noise: float = 1.0  # pixels: of the points in the last image
     window: tuple[CloudInCamera, ...] = ()
 
