@@ -70,17 +70,16 @@ class MapCamera:
         misstated = torch.logaddexp(
             self._log_density(USUAL) + math.log(USUALLY), self._log_density(MISTAKEN) + math.log(MISTAKES)
         )
-        other = self._log_density(OTHER_CAMERA)
-        ratio = float((misstated - other)[self.differs].sum())
-        return ratio + SAME_LOG_ODDS
+        return float(misstated - self._log_density(OTHER_CAMERA)) + SAME_LOG_ODDS
 
     def is_near(self, prior: CalibrationPrior) -> bool:
         """Return whether the intrinsics differ by no more than those of different cameras may, where they are stated so well."""
         return bool((self.correction.abs() <= FARTHEST * prior.deviations).all())
 
-    def _log_density(self, prior: CalibrationPrior) -> Float[Tensor, "4"]:
+    def _log_density(self, prior: CalibrationPrior) -> Float[Tensor, ""]:
+        """Return the logarithm of the density of the parameters that differ, but for a constant."""
         deviations = prior.deviations
-        return -0.5 * (self.correction / deviations).square() - deviations.log()
+        return (-0.5 * (self.correction / deviations).square() - deviations.log())[self.differs].sum()
 
 
 @lru_cache(maxsize=64)

@@ -119,8 +119,9 @@ def probability_of_map_camera(free: ReprojectionFit, landmarks: LandmarkMap, cam
     The image is represented by a fit in which the intrinsics were free.
     """
     value, noise = _estimate(free, landmarks)
-    by_given = _log_densities(value, noise).logsumexp(0)
-    evidence = float((_log_density_by(camera, value, noise) - by_given)[camera.differs].sum())
+    shares = torch.tensor([share for _, share in MIXTURE], dtype=torch.float64)
+    by_given = (_log_densities(value, noise)[:, camera.differs].sum(1) + shares.log()).logsumexp(0)
+    evidence = float(_log_density_by(camera, value, noise)[camera.differs].sum() - by_given)
     return float(torch.tensor(evidence + camera.log_odds, dtype=torch.float64).sigmoid())
 
 
@@ -149,16 +150,16 @@ def unresolved_deviations(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"
     """Return the standard deviations about zero of the true corrections, seen as ``apparent`` with the variances ``noise``."""
     prior = torch.stack([part.deviations.square() for part, _ in MIXTURE])
     total = prior + noise
-    weights = torch.softmax(_log_densities(apparent, noise), dim=0)
+    shares = torch.tensor([[share] for _, share in MIXTURE], dtype=torch.float64)
+    weights = torch.softmax(_log_densities(apparent, noise) + shares.log(), dim=0)
     mean, variance = apparent * prior / total, prior * noise / total
     return (weights * (mean.square() + variance)).sum(0).sqrt()
 
 
 def _log_densities(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "parts 4"]:
-    """Return the logarithm of each part of the mixture, weighted, at an estimate with the variances ``noise``; constants left out."""
+    """Return the logarithm of the density of each part of the mixture at an estimate with the variances ``noise``, but for a constant."""
     total = torch.stack([part.deviations.square() for part, _ in MIXTURE]) + noise
-    shares = torch.tensor([[share] for _, share in MIXTURE], dtype=total.dtype)
-    return -0.5 * (apparent.square() / total + total.log()) + shares.log()
+    return -0.5 * (apparent.square() / total + total.log())
 
 
 def _estimate(free: ReprojectionFit, landmarks: LandmarkMap) -> tuple[Float[Tensor, "4"], Float[Tensor, "4"]]:
