@@ -30,7 +30,7 @@ from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDia
 
 RESULTS = Path(__file__).resolve().parent / "results"
 STORED = Path(confidence.__file__).with_suffix(".json")
-RIDGE = 0.02
+RIDGE = 0.005
 """Penalty of the squared weights of standardised features, relative to the mean log loss."""
 BINS = 10
 FEWEST = 30
