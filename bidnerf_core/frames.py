@@ -47,7 +47,11 @@ class Frame:
     """Whether colours were recorded. Where only depth was, as between the photos of a LiDAR scan, ``rgb`` is black."""
 
     hidden: Bool[Tensor, "hh hw"] | None = None
-    """The pixels where something that the map does not have hides the scene; they are not compared with the map."""
+    """The pixels where something that the map does not have hides the scene.
+
+    Depth is not measured there. No rays are drawn there and no keypoints found, and no landmarks are expected there; only
+    the thumbnails of a search by colour alone still show it.
+    """
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[-1] != 3:
@@ -67,6 +71,18 @@ class Frame:
                 raise InputError(
                     f"frame {self.name}: {what} is {found}, its camera expects {expected[1]}x{expected[0]}"
                 )
+        if self.hidden is not None:
+            self._hide(self.hidden)
+
+    def _hide(self, hidden: Bool[Tensor, "h w"]) -> None:
+        if hidden.dtype != torch.bool or bool(hidden.all()):
+            found = "all true" if hidden.dtype == torch.bool else f"of {hidden.dtype}"
+            raise InputError(
+                f"frame {self.name}: hidden is {found}, expected booleans that leave something visible"
+            )
+        if self.depth is not None and bool((self.depth[hidden.to(self.depth.device)] != 0).any()):
+            depth = torch.where(hidden.to(self.depth.device), 0, self.depth)
+            object.__setattr__(self, "depth", depth)
 
     @staticmethod
     def open(

@@ -30,12 +30,10 @@ class PixelDrawer(Protocol):
 
 
 def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]:
-    """Draw pixels that are not hidden uniformly, with replacement."""
-    size, where = frame.intrinsics, generator.device
+    """Draw uniformly among the pixels that are not hidden, with replacement."""
     if frame.hidden is not None:
-        seen = (~frame.hidden).nonzero().flip(-1).to(where)
-        if len(seen):
-            return seen[torch.randint(len(seen), (count,), generator=generator, device=where)]
+        return among_visible(frame, count, generator)
+    size, where = frame.intrinsics, generator.device
     columns = torch.randint(size.width, (count,), generator=generator, device=where)
     rows = torch.randint(size.height, (count,), generator=generator, device=where)
     return torch.stack([columns, rows], dim=-1)
@@ -161,6 +159,10 @@ class Among:
         if len(found) == 0:
             return uniform(frame, count, generator)
         return found[torch.randint(len(found), (count,), generator=generator, device=found.device)]
+
+
+among_visible = Among(all_pixels)
+"""Draws among all pixels that are not hidden."""
 
 
 def _seen(pixels: Int[Tensor, "n 2"], frame: Frame) -> Int[Tensor, "k 2"]:

@@ -15,10 +15,12 @@ from bidnerf_core import Localization, Localizer, Outcome, View
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
+from bidnerf_core.localization.by_depth import share_on_surface
 from bidnerf_core.localization.by_landmarks import (
     SHARPEST,
     LandmarkAnswer,
     answer_by_landmarks,
+    corrected,
     localization_by_landmarks,
 )
 from bidnerf_core.localization.problem import rig
@@ -194,20 +196,38 @@ def test_auto_takes_landmarks_first_with_a_start_or_without() -> None:
         assert_within(found.T_world_camera, 0.02, 0.5)
 
 
-def test_doubtful_landmarks_keep_the_scale_that_they_give_a_depth_sensor(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The surface would believe the sensor, and be 5 cm off."""
-    monkeypatch.setattr("bidnerf_core.localization.auto.TRUSTED", 2.0)
-    depth = unseen().frame.depth
-    assert depth is not None
-    hidden = torch.zeros_like(depth, dtype=torch.bool)
+def partly_hidden(depth: float = 1.0) -> View:
+    measured = unseen().frame.depth
+    assert measured is not None
+    hidden = torch.zeros_like(measured, dtype=torch.bool)
     hidden[:10] = True
-    view = replace(unseen(), frame=replace(unseen().frame, depth=1.03 * depth, hidden=hidden))
-    found = localized(view, textured_map(surface=True))
-    assert found.converged
-    assert "landmarks agree" in found.reason
-    assert_within(found.T_world_camera, 0.02, 0.5)
+    return replace(unseen(), frame=replace(unseen().frame, depth=depth * measured, hidden=hidden))
+
+
+def test_measured_points_judge_doubtful_landmarks_where_something_hides_the_scene() -> None:
+    scene = textured_map(surface=True)
+    right = answer(partly_hidden(), map=scene)
+    off = right.T.retract(torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64))
+    wrong = replace(right, T=off, confidence=0.6)
+    there = replace(localized(unseen(), scene), T_world_camera=right.T)
+    hidden, clean = (rig(scene, [view], None) for view in (partly_hidden(), unseen()))
+    assert auto_module._is_doubtful(hidden, wrong)
+    assert not auto_module._is_doubtful(hidden, replace(wrong, confidence=0.9))
+    assert not auto_module._is_doubtful(clean, wrong)
+    assert auto_module._leaves_surface(hidden, there, wrong)
+    assert not auto_module._leaves_surface(hidden, there, right)
+    assert not auto_module._leaves_surface(clean, there, wrong)
+
+
+def test_landmarks_keep_the_scale_that_they_give_a_depth_sensor() -> None:
+    """On the sensor's own scale, the points would be off the surface."""
+    scene, view = textured_map(surface=True), partly_hidden(1.05)
+    found = replace(answer(view, map=scene), confidence=0.6)
+    problem = rig(scene, [view], None)
+    assert scene.surface is not None
+    share = share_on_surface(corrected(problem, found.found), scene.surface, found.T)
+    assert share > share_on_surface(problem, scene.surface, found.T) + 0.05
+    assert_within(found.T, 0.02, 0.5)
 
 
 def test_landmarks_can_be_switched_off() -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli.camera_options import depth_registration
 from bidnerf_core.datasets import DepthSensor, TimedFrame, open_dataset, open_sequence
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.se3 import SE3
 from tum_folder import Recorded, write_recording
@@ -220,6 +220,5 @@ def test_the_option_of_the_command_line(option: str | None) -> None:
 def test_a_transform_that_loses_all_depth_is_named() -> None:
     there = SE3(torch.eye(3, dtype=torch.float64), torch.tensor([500.0, 0.0, 0.0], dtype=torch.float64))
     depth = seen(DEPTH, SE3.identity())
-    with pytest.warns(InputWarning, match=r"d\.png: nothing that was measured falls .* 500 m from"):
-        found = DepthSensor(DEPTH, there).registered(depth, COLOUR, "d.png")
-    assert not bool(found.any())
+    with pytest.raises(InputError, match=r"d\.png: nothing that was measured falls .* 500 m from"):
+        DepthSensor(DEPTH, there).registered(depth, COLOUR, "d.png")

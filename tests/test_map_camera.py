@@ -70,9 +70,38 @@ def test_the_correction_between_cameras_is_the_one_that_was_applied(
     given: Intrinsics, correction: Calibration
 ) -> None:
     found = correction_between(given, correction.applied(given))
+    assert found is not None
     tolerance = 3e-3 if given.distortion else 1e-6  # two distortions make up one only approximately
     expected = torch.tensor(astuple(correction), dtype=torch.float64)
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("k", [(-0.28, 0.07), (-0.35, 0.15), (0.1, 0.0)])
+def test_a_strong_lens_is_corrected_where_a_correction_describes_it(k: tuple[float, float]) -> None:
+    """The projections of both cameras agree to a pixel in most of the image, or there is no correction."""
+    true = Intrinsics(320.0, 320.0, 320.0, 240.0, 640, 480, (*k, 0.0, 0.0))
+    given = with_focal(1.02, true)
+    found = correction_between(given, true)
+    if found is None:
+        return
+    rays = true.unproject(true.pixel_centres(torch.float64)[::16, ::16])
+    flat = Calibration(*found.tolist()).pixels(rays[..., :2].reshape(-1, 2), 1.0)
+    seen = given.project(torch.cat([flat, torch.ones(len(flat), 1)], -1))
+    off = (seen - true.project(rays.reshape(-1, 3))).norm(dim=-1)
+    assert float(off.median()) < 1.0
+
+
+def test_a_query_that_states_the_intrinsics_of_any_image_of_the_map_is_believed() -> None:
+    usual, other = [with_focal(1 + 0.001 * i) for i in range(20)], with_focal(1.05)
+    found = map_camera(other, (*usual, other))
+    assert found is not None
+    assert not bool(found.differs.any())
+    assert found.intrinsics == other
+
+
+def test_lenses_that_no_correction_describes_are_not_compared() -> None:
+    fisheye = Intrinsics(150.0, 150.0, 200.0, 150.0, 400, 300, (-0.5, 0.0, 0.0, 0.0))
+    assert map_camera(PINHOLE, (fisheye,)) is None
 
 
 def test_a_resized_image_has_the_maps_camera() -> None:
@@ -139,6 +168,7 @@ def test_an_approximate_focal_length_may_be_that_of_the_map_or_any_other(landmar
 def test_a_misstated_camera_of_the_map_is_recognised(landmarks: LandmarkMap, factor: float) -> None:
     right, corrected = localized(landmarks, PINHOLE), localized(landmarks, with_focal(factor))
     assert corrected.takes_map_camera
+    assert corrected.intrinsics == PINHOLE
     assert corrected.focal_factor == pytest.approx(1 / factor, rel=1e-6)
     assert error(corrected) < 1.5 * error(right) + 0.002
     verdict = landmark_verdict(corrected)
@@ -171,8 +201,14 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
     verdict = landmark_verdict(found)
     assert verdict.outcome is Outcome.MISCALIBRATED
     assert "do not tell whether" in verdict.reason
-    without = found.covariance.diagonal()[:3].sum()
-    assert (found.full_covariance + found.unresolved_calibration).diagonal()[:3].sum() > 2 * without
+    shift = found.alternative_shift
+    assert float(shift[:3].norm()) > 0.02
+    certain = replace(
+        found, miscalibration=replace(found.miscalibration, alternative_probability=torch.tensor(0.0))
+    )
+    added = found.unresolved_calibration - certain.unresolved_calibration
+    expected = found.miscalibration.alternative_probability * torch.outer(shift, shift)
+    torch.testing.assert_close(added, expected)
     indifferent = LandmarkThresholds(alternative=1.0)
     assert landmark_verdict(found, indifferent).outcome is not Outcome.MISCALIBRATED
 

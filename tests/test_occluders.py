@@ -15,7 +15,8 @@ from bidnerf_core.localization import AutoConfig, Localization
 from bidnerf_core.localization.by_depth import share_on_surface
 from bidnerf_core.localization.search.correspondences import query_image
 from bidnerf_core.localization.search.guided import projected_landmarks
-from bidnerf_core.localization.search.occluders import nearest_piece
+from bidnerf_core.localization.search.mirrored import mirror_image
+from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
 from bidnerf_core.mapping.calibration import GIVEN
 from bidnerf_core.mapping.features import SIFT
 from bidnerf_core.pixels import drawer
@@ -100,14 +101,51 @@ def test_only_what_is_in_front_of_the_surface_hides_it() -> None:
     assert depth is not None
     half = torch.zeros_like(depth, dtype=torch.bool)
     half[:, : SIZE // 2] = depth[:, : SIZE // 2] > 0
-    for factor, expected in ((0.6, 0.0), (1.4, 1.0)):
-        moved = torch.where(half, factor * depth, depth)
-        if factor > 1:  # so that this half is still the nearest piece
-            moved = torch.where(half, moved, 3 * depth)
+    for factor, expected in ((0.6, 1.0), (1.0, 0.0), (1.4, 0.0)):
+        # Whatever the factor, this half is the nearest piece.
+        moved = torch.where(half, factor * depth, 3 * depth)
         occluder = nearest_piece(baked.problem(replace(view, frame=replace(view.frame, depth=moved))))
         assert occluder is not None
-        behind = occluder.share_behind(baked.toy(), view.T_ref_camera)
-        assert behind == pytest.approx(expected, abs=0.1)
+        in_front = occluder.share_in_front(baked.toy(), view.T_ref_camera)
+        assert in_front == pytest.approx(expected, abs=0.15), factor
+
+
+def test_a_piece_that_is_not_in_front_was_no_occluder(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = behind_a_board(baked.unseen()[0])
+    assert found_for(view).converged
+    monkeypatch.setattr(Occluder, "share_in_front", lambda self, surface, T: 0.8)
+    found = found_for(view)
+    assert not found.converged
+    assert "in front" not in found.reason
+
+
+def test_pixels_without_a_measurement_are_no_piece() -> None:
+    depth = wall((slice(10, 50), slice(20, 60)), 0.6)
+    holes = depth.clone()
+    holes[::7, ::3], holes[60:] = torch.inf, torch.nan
+    clean, spoilt = (nearest_piece(baked.problem(seen(d))) for d in (depth, holes))
+    assert clean is not None
+    assert spoilt is not None
+    frames = [part.rest.views[0].frame for part in (clean, spoilt)]
+    assert frames[0].hidden is not None
+    assert frames[1].hidden is not None
+    assert torch.equal(frames[1].hidden, frames[0].hidden & holes.isfinite())
+    few = torch.zeros((SIZE, SIZE))
+    few[0, :3] = torch.tensor([1.0, 2.0, 3.0])
+    assert nearest_piece(baked.problem(seen(few))) is None
+
+
+def test_what_the_user_hides_stays_hidden() -> None:
+    view = seen(wall((slice(10, 50), slice(20, 60)), 0.6))
+    own = torch.zeros((SIZE, SIZE), dtype=torch.bool)
+    own[:10] = True
+    occluder = nearest_piece(baked.problem(replace(view, frame=replace(view.frame, hidden=own))))
+    assert occluder is not None
+    hidden = occluder.rest.views[0].frame.hidden
+    assert hidden is not None
+    assert bool(hidden[:10].all())
+    assert bool(hidden[10:50, 20:60].all())
+    assert int(hidden.sum()) == 10 * SIZE + 40 * 40
 
 
 @pytest.mark.parametrize("number", range(3))
@@ -150,10 +188,39 @@ def test_hidden_pixels_are_not_drawn(name: str) -> None:
     assert frame.to("cpu").hidden is hidden
 
 
-def test_a_hidden_part_has_the_size_of_the_image() -> None:
+@pytest.mark.parametrize(
+    ("hidden", "said"),
+    [
+        (torch.zeros((2, 3), dtype=torch.bool), "hidden is 3x2"),
+        (torch.ones((SIZE, SIZE), dtype=torch.bool), "hidden is all true"),
+    ],
+)
+def test_a_hidden_part_is_a_mask_of_the_image(hidden: torch.Tensor, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        Frame("f", torch.zeros((SIZE, SIZE, 3)), baked.CAMERA, hidden=hidden)
+
+
+def test_nothing_is_measured_where_the_scene_is_hidden() -> None:
     frame = baked.unseen()[0].frame
-    with pytest.raises(InputError, match="hidden is 3x2"):
-        replace(frame, hidden=torch.zeros((2, 3), dtype=torch.bool))
+    assert frame.depth is not None
+    hidden = torch.zeros((SIZE, SIZE), dtype=torch.bool)
+    hidden[:, SIZE // 2 :] = True
+    masked = replace(frame, hidden=hidden)
+    assert masked.depth is not None
+    assert torch.equal(masked.depth, torch.where(hidden, 0, frame.depth))
+    mirrored = mirror_image(masked).hidden
+    assert mirrored is not None
+    assert torch.equal(mirrored, hidden.flip(1))
+
+
+def test_a_hidden_board_does_not_matter() -> None:
+    view = behind_a_board(baked.unseen()[0])
+    hidden = torch.zeros((SIZE, SIZE), dtype=torch.bool)
+    hidden[:, : 2 * SIZE // 5] = True
+    found = found_for(replace(view, frame=replace(view.frame, hidden=hidden)))
+    assert found.converged
+    assert "in front" not in found.reason
+    assert float(pose_error(found.T_world_camera, view.T_ref_camera).translation) < 0.05
 
 
 def test_hidden_landmarks_are_not_missed() -> None:

@@ -12,6 +12,7 @@ import torch
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.localization.tracking.answers import METHOD
+from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
 from flights import (
     FRAMES,
     INTERVAL,
@@ -282,15 +283,19 @@ def test_a_window_reduces_the_error_of_noisy_depth(window: int) -> None:
 
 
 def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
-    """It stands in the state, and corrects later frames."""
+    """It stands in the state, and corrects later frames whose focal length is approximate; calibrated ones stay as they are."""
     frames = flight()[:4]
     off = replace(frames[0][1].intrinsics, fx=1.06 * 130, fy=1.06 * 130)
     known = [(t, replace(f, depth=None, intrinsics=off, focal_is_approximate=True), T) for t, f, T in frames]
     tracker = Tracker(localizer())
-    tracker._state = replace(tracker._state, focal_factor=1 / 1.06)
+    tracker._state = replace(tracker._state, camera=CorrectedCamera(off, CAMERA, True))
     answers = tracked(known, tracker)
     assert_right(answers, known)
     assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 1.06] * 4, rel=0.01)
+    exact = flight()[4:6]
+    answers = tracked(exact, tracker)
+    assert_right(answers, exact)
+    assert [answer.focal_factor for answer in answers] == [1, 1]
 
 
 @pytest.mark.parametrize("depth", [True, False])
@@ -300,13 +305,32 @@ def test_a_misstated_camera_of_the_map_is_corrected_in_all_frames(depth: bool) -
     scatter = torch.full((4,), 0.002, dtype=torch.float64)
     landmarks = replace(scene.landmarks, cameras=(CAMERA,), calibration_scatter=scatter, correlation=1.0)
     localizer = Localizer(replace(scene, landmarks=landmarks))
-    stated = replace(CAMERA, fx=0.97 * CAMERA.fx, fy=0.97 * CAMERA.fy)
+    stated = replace(CAMERA, fx=0.97 * CAMERA.fx, fy=0.97 * CAMERA.fy, cx=CAMERA.cx + 1.5)
     frames = [
         (t, replace(f, intrinsics=stated, depth=f.depth if depth else None), T) for t, f, T in flight()[:4]
     ]
     answers = tracked(frames, Tracker(localizer))
     assert_right(answers, frames)
     assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 0.97] * 4, rel=1e-6)
+
+
+def test_corrections_of_intrinsics_follow_one_another(tmp_path: Path) -> None:
+    first = CorrectedCamera(replace(CAMERA, fx=140.0, cx=60.0), CAMERA, False)
+    second = CorrectedCamera(CAMERA, replace(CAMERA, fx=133.0, cy=50.0), False)
+    both = first.then(second)
+    frame = replace(flight()[0][1], intrinsics=first.given)
+    assert both.corrected(frame).intrinsics == second.corrected(first.corrected(frame)).intrinsics
+    assert both.focal_factor(frame) == pytest.approx(133 / 140)
+    other = replace(frame, intrinsics=replace(first.given, fx=154.0))  # it has focused nearer
+    refocused = first.corrected(other).intrinsics
+    assert refocused.fx == pytest.approx(154 * 130 / 140)
+    assert replace(refocused, fx=CAMERA.fx) == CAMERA
+    tracker = Tracker(localizer())
+    tracker._state = replace(tracker._state, camera=both)
+    tracker.save(tmp_path / "state.safetensors")
+    again = Tracker(localizer())
+    again.restore(tmp_path / "state.safetensors")
+    assert again._state.camera == both
 
 
 def test_the_state_does_not_grow(tmp_path: Path) -> None:

@@ -213,7 +213,7 @@ def _check_refinement(out: Path, info: MapInfo, refinement: RefinementChoice) ->
     """Raise ``UsageError`` for a choice of poses that differs from what the interrupted training did."""
     if info.pose_refinement is None:  # "never", or too few keypoints for any
         return
-    refined = info.pose_refinement.refined
+    refined = info.pose_refinement.refined or bool(info.pose_refinement.replaced)
     if refinement == ("never" if refined else "always"):
         has = "refined" if refined else "given"
         raise UsageError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,12 +12,14 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.camera_sources import Raster, read_camera
 from bidnerf_core.datasets.poses import rigid_of_rows
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputError
 from bidnerf_core.images import resampled
 from bidnerf_core.orientation import UPRIGHT
 from bidnerf_core.records import read_record
 from bidnerf_core.se3 import SE3
 
+ENOUGH = 1000
+"""The number of measured pixels from which on some must fall into the colour image."""
 EXTRINSICS = "T_colour_depth"
 """The key of the 4x4 matrix (metres, OpenCV axes) beside the intrinsics in a file of a depth sensor."""
 
@@ -53,7 +54,7 @@ class DepthSensor:
 
         Depth of lower resolution than the colour image is registered at its own resolution and then resampled, since its
         points would otherwise be too far apart to cover each other. Raises ``InputError`` for depth of another aspect ratio
-        than the sensor's.
+        than the sensor's, and where nothing of it falls into the colour image.
         """
         height, width = depth.shape
         camera = Raster(width, height, UPRIGHT).upright(self.camera)
@@ -64,13 +65,11 @@ class DepthSensor:
             )
         coarse = colour.scaled(min(1.0, camera.fx / colour.fx, camera.fy / colour.fy))
         found = register_depth(depth, camera, coarse, self.T_colour_depth)
-        if bool((depth > 0).any()) and not bool((found > 0).any()):
+        if int((depth > 0).sum()) >= ENOUGH and not bool((found > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
-            warnings.warn(
+            raise InputError(
                 f"{file}: nothing that was measured falls into the colour image; {EXTRINSICS} has the depth camera {away:.3g} m"
-                " from the colour camera, expected metres and OpenCV axes",
-                InputWarning,
-                stacklevel=2,
+                " from the colour camera, expected metres and OpenCV axes"
             )
         return found if coarse == colour else resampled(found, colour.width, colour.height)
 

@@ -7,7 +7,7 @@ into an ``Outcome`` and a sentence.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 
@@ -157,11 +157,15 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         return Verdict(Outcome.UNDETERMINED, f"{share}, but do not determine the pose")
     wrong = found.miscalibration
     if not found.estimates_calibration and wrong.worst[1] > thresholds.miscalibration:
-        return Verdict(Outcome.MISCALIBRATED, f"{share}, but they suggest {wrong.sentence}")
+        suggested = torch.tensor(astuple(found.calibration), dtype=torch.float64) + wrong.apparent
+        suspect = Calibration(*suggested.tolist()).sentences[wrong.worst[0]]
+        return Verdict(Outcome.MISCALIBRATED, f"{share}, but they suggest {suspect}")
     if not found.estimates_calibration and doubtful_intrinsics(found, thresholds):
-        other = Calibration(*wrong.alternative.tolist()).sentence
-        given = "the given ones" if found.takes_map_camera else "those of the map's cameras"
-        return Verdict(Outcome.MISCALIBRATED, f"{share}, but do not tell whether {given} are right: {other}")
+        other = found.calibration if found.takes_map_camera else Calibration(*wrong.alternative.tolist())
+        choice = "the given intrinsics or those of the map's images"
+        return Verdict(
+            Outcome.MISCALIBRATED, f"{share}, but do not tell whether {choice} are right: {other.sentence}"
+        )
     deviation = found.position_deviation
     if not deviation <= thresholds.precision * found.distance:
         return Verdict(

@@ -57,8 +57,8 @@ TRUSTED = 0.8
 """Confidence from which on a pose by landmarks is not compared with the surface."""
 FEWER = 0.05
 """Share of the measured points by which landmarks may take a pose off the surface."""
-BEHIND = 0.1
-"""Largest share of the points of an occluder that may lie behind the surface."""
+IN_FRONT = 0.9
+"""Least share of the points of an occluder that must lie before the surface."""
 MANY_LANDMARKS = 500
 """The number of landmarks from which on a scene is textured."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
@@ -80,12 +80,13 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     if occluder is None:
         return found
     rest = _found(occluder.rest, config, seed)
-    if not rest.converged or occluder.share_behind(problem.surface, rest.T_world_camera) > BEHIND:
-        return found
+    seconds = found.seconds + rest.seconds
+    if not rest.converged or occluder.share_in_front(problem.surface, rest.T_world_camera) < IN_FRONT:
+        return replace(found, seconds=seconds)
     hidden = (
         f"without the nearest {occluder.share:.0%} of the measured points, which are on something in front"
     )
-    return replace(rest, reason=f"{rest.reason}, {hidden}", seconds=found.seconds + rest.seconds)
+    return replace(rest, reason=f"{rest.reason}, {hidden}", seconds=seconds)
 
 
 def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:

@@ -111,9 +111,7 @@ def corrected(problem: Problem, found: LandmarkPose) -> Problem:
     scale, views = shrunk_depth_scale(found), []
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
-        camera = view.frame.intrinsics
-        if found.takes_map_camera:
-            camera = found.calibration.applied(camera)
+        camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics
         views.append(replace(view, frame=replace(view.frame, depth=depth, intrinsics=camera)))
     return replace(problem, start=found.T_world_camera, views=tuple(views))
 
@@ -189,6 +187,7 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
         losses=torch.full((len(poses) - 1,), found.noise, dtype=torch.float64),
         covariance=answer.full_covariance,
         focal_factor=found.focal_factor,
+        intrinsics=found.intrinsics_of(problem.views[-1].frame.intrinsics),
         confidence=answer.confidence,
         diagnostics=answer.diagnostics,
     )

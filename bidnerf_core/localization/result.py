@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.files import write_file
 from bidnerf_core.se3 import SE3
 
@@ -69,10 +70,11 @@ class Localization:
     losses: Float[Tensor, "s"]  # at the start and before each further step
     # Covariance of a right update at the camera: translation (metres) before rotation (radians). None if unknown.
     covariance: Float[Tensor, "6 6"] | None = None
-    focal_factor: float = 1.0  # true over given focal length; 1 if it was not estimated
+    focal_factor: float = 1.0  # true over given focal length; 1 if it was not corrected
     # Probability that the pose is right, from the diagnostics; None where no model of it was learned.
     confidence: float | None = None
     diagnostics: Diagnostics | None = None  # the measures by which the pose was judged
+    intrinsics: Intrinsics | None = None  # of the last image, if other than the given ones were taken
 
     @property
     def converged(self) -> bool:

@@ -17,9 +17,9 @@ from bidnerf_core.localization.tracking.answers import (
     METHOD,
     tracked_localization,
     unknown,
-    with_focal_factor,
 )
 from bidnerf_core.localization.tracking.clock import Clock
+from bidnerf_core.localization.tracking.corrected_camera import after_search
 from bidnerf_core.localization.tracking.detection import LandmarkDetector
 from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.judging import determined, shape_verdict
@@ -104,14 +104,15 @@ class Tracker:
         clock, seconds = self._state.clock.step(time)
         image = grey_image(frame.rgb) if frame.has_colour else None
         state = replace(self._state, clock=clock, frames=self._state.frames + 1)
-        frame = with_focal_factor(frame, state.focal_factor)
+        stated, frame = frame, frame if state.camera is None else state.camera.corrected(frame)
         if state.motion is None:
             answer, state = self._begun(frame, image, state)
         else:
             answer, state = self._continued(frame, image, state, state.motion, seconds)
         # Points are followed from the last image, even past frames without one.
         self._state = state = state if image is None else replace(state, image=image)
-        return replace(answer, seconds=clocks.perf_counter() - began, focal_factor=state.focal_factor)
+        factor = 1.0 if state.camera is None else state.camera.focal_factor(stated)
+        return replace(answer, seconds=clocks.perf_counter() - began, focal_factor=factor)
 
     def save(self, path: str | Path) -> None:
         """Write the tracker's state to a file, from which ``restore`` continues exactly here."""
@@ -245,11 +246,10 @@ class Tracker:
             covariance = self._at_start(frame, found.T_world_camera).covariance
         pose = PoseEstimate(found.T_world_camera, 0.5 * covariance, 0.5 * covariance)
         motion = Motion.at(pose, self._reach(frame))
-        factor = state.focal_factor * found.focal_factor
-        state = replace(
-            state, points=FollowedPoints.none(), window=(), motion=motion, focal_factor=factor
-        )  # fmt: skip
-        frame = with_focal_factor(frame, found.focal_factor)
+        camera = state.camera
+        if found.intrinsics is not None:
+            frame, camera = after_search(frame, found.intrinsics, camera)
+        state = replace(state, points=FollowedPoints.none(), window=(), motion=motion, camera=camera)
         measured = self._measured(frame, image, state, state.points, motion)
         if measured is not None and measured.verdict.accepted:
             state = measured.state

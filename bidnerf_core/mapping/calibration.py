@@ -27,7 +27,9 @@ class Calibration:
         return math.exp(self.log_focal)
 
     def applied(self, given: Intrinsics) -> Intrinsics:
-        """Return the corrected intrinsics."""
+        """Return the corrected intrinsics; the given ones if there is nothing to correct."""
+        if self == GIVEN:
+            return given
         k1, *others = given.distortion or (0.0, 0.0, 0.0, 0.0)
         factor = self.focal_factor
         return replace(
@@ -51,10 +53,10 @@ class Calibration:
 
     @property
     def sentence(self) -> str:
-        """The most considerable part of the correction, in words."""
-        parts = torch.tensor(astuple(self), dtype=torch.float64)
-        number = int((parts.abs() / MISTAKEN.deviations).argmax())
-        return self.sentences[number]
+        """The considerable parts of the correction, in words."""
+        parts = torch.tensor(astuple(self), dtype=torch.float64).abs() / CALIBRATED.deviations
+        considerable = [text for text, size in zip(self.sentences, parts.tolist(), strict=True) if size > 2]
+        return " and ".join(considerable) or self.sentences[int(parts.argmax())]
 
     @property
     def sentences(self) -> tuple[str, str, str, str]:

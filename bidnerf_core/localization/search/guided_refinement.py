@@ -17,7 +17,7 @@ from bidnerf_core.localization.search.guided import (
     projected_landmarks,
 )
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.miscalibration import Miscalibration, taken_intrinsics
+from bidnerf_core.localization.search.miscalibration import Miscalibration, TakenIntrinsics, taken_intrinsics
 from bidnerf_core.localization.search.ransac import Hypothesis
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.features import NORM
@@ -47,10 +47,12 @@ LEAST_GUIDED_MATCHES = 6
 class GuidedPose:
     """A pose refined on guided matches."""
 
+    query: LandmarkQuery  # with the intrinsics taken
     fit: ReprojectionFit
     correspondences: LandmarkMatches
     visible: int  # landmarks that should be visible from there
     chance: float  # matches that the last round would find at a wrong pose
+    taken: TakenIntrinsics
     miscalibration: Miscalibration
 
 
@@ -89,17 +91,17 @@ def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches,
     free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
     taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate=query.prior.log_focal > 0)
     wrong = Miscalibration.of(free, query.landmarks, taken)
-    if taken.calibration != GIVEN:
-        fit = resect(
-            query.observed(found), free.T_world_rig, free.noise, FIXED, taken.calibration, correlation
-        )
-        fit, found = _guided(query, FIXED, fit, found, most, RADII[1:])
     if wrong.worst[1] > CERTAIN and not query.prior.log_focal:
+        taken = TakenIntrinsics()
         fit, found = _guided(query, NOMINAL, free, found, most, RADII[1:])
+    elif taken.camera is not None:
+        query = query.seen_by(taken.camera)
+        fit = resect(query.observed(found), free.T_world_rig, free.noise, FIXED, GIVEN, correlation)
+        fit, found = _guided(query, FIXED, fit, found, most, RADII[1:])
     radius = RADII[-1] * query.threshold
     projections = projected_landmarks(query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius)
     visible, chance = sum(map(len, projections)), matches_by_chance(projections, radius, most)
-    return GuidedPose(fit, found, visible, chance, wrong)
+    return GuidedPose(query, fit, found, visible, chance, taken, wrong)
 
 
 def _guided(

@@ -27,7 +27,7 @@ def described(
     query: LandmarkQuery, matches: LandmarkMatches, answer: GuidedPose, seconds: dict[str, float]
 ) -> LandmarkPose:
     """Return a refined pose with the evidence for it; ``matches`` are those by descriptors alone."""
-    fit = answer.fit
+    fit, query, camera = answer.fit, answer.query, answer.taken.camera
     data = query.observed(answer.correspondences).corrected(fit.calibration)
     off = query.observed(matches).corrected(fit.calibration).residuals(fit.T_world_rig)
     agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= query.threshold).sum())
@@ -48,7 +48,8 @@ def described(
         noise_ratio=fit.noise / query.landmarks.noise,
         spread=_spread(query, answer.correspondences),
         distance=median_distance(data, fit.T_world_rig),
-        calibration=fit.calibration,
+        calibration=fit.calibration if camera is None else answer.taken.calibration,
+        intrinsics=None if camera is None else camera.intrinsics,
         calibration_deviations=fit.calibration_deviations,
         slope=fit.slope,
         miscalibration=answer.miscalibration,

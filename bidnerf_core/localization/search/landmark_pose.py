@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
@@ -37,11 +38,14 @@ class LandmarkPose:
     spread: float  # 0 to 1: share of the image that the correspondences lie in
     noise_ratio: float  # ``noise`` over that of the map's own images
     distance: float  # metres: median distance of the correspondences' landmarks
-    calibration: Calibration  # what was estimated of the camera
+    calibration: (
+        Calibration  # of the camera: estimated, or that of the map's images if their intrinsics were taken
+    )
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
     slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each of them
     miscalibration: Miscalibration
     calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
+    intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
@@ -49,6 +53,12 @@ class LandmarkPose:
     def focal_factor(self) -> float:
         """True over given focal length."""
         return self.calibration.focal_factor
+
+    def intrinsics_of(self, given: Intrinsics) -> Intrinsics | None:
+        """Return the intrinsics that were taken or estimated for images with the ``given`` ones; None if these were kept."""
+        if self.intrinsics is not None:
+            return self.intrinsics
+        return None if self.calibration == GIVEN else self.calibration.applied(given)
 
     @property
     def estimates_calibration(self) -> bool:
@@ -58,7 +68,7 @@ class LandmarkPose:
     @property
     def takes_map_camera(self) -> bool:
         """Whether the intrinsics are those of the map's images, in place of the given ones."""
-        return self.calibration != GIVEN and not self.estimates_calibration
+        return self.intrinsics is not None
 
     @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -39,6 +39,17 @@ class LandmarkQuery:
         """The intrinsics of the map's images, if all images of the query state the same."""
         given = {image.intrinsics for image in self.images}
         return map_camera(given.pop(), self.landmarks.cameras) if len(given) == 1 else None
+
+    def seen_by(self, camera: MapCamera) -> LandmarkQuery:
+        """Return the query with images that the map's camera took."""
+        images = [
+            replace(
+                image, intrinsics=camera.intrinsics,
+                rays=camera.intrinsics.unproject(image.keypoints.pixels.double()),
+            )
+            for image in self.images
+        ]  # fmt: skip
+        return replace(self, images=images)
 
     def observed(self, matches: LandmarkMatches) -> ObservedPoints:
         """Return the landmarks and keypoints of ``matches`` as input of a pose solver."""

@@ -27,6 +27,8 @@ from bidnerf_core.mapping.calibration import (
 
 MOST_CAMERAS = 9
 """Number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
+MOST_RESIDUAL = 0.002
+"""Root mean square difference, as a share of the image's width, above which a correction does not describe another camera."""
 GRID = 7
 """Rows and columns of pixels at which cameras are compared."""
 SIGNIFICANT = 2.0
@@ -48,6 +50,7 @@ class MapCamera:
 
     correction: Float[Tensor, "4"]  # of the stated intrinsics, in the order of ``Calibration``
     deviations: Float[Tensor, "4"]  # of single images of the map, errors of a good calibration included
+    intrinsics: Intrinsics  # at the resolution of the query
 
     @property
     def differs(self) -> Bool[Tensor, "4"]:
@@ -84,36 +87,60 @@ class MapCamera:
 
 @lru_cache(maxsize=64)
 def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera | None:
-    """Return the camera of a map's images of the same shape as those with the ``given`` intrinsics; None if there are none."""
-    alike = sorted(
-        {c for c in cameras if same_aspect((c.width, c.height), (given.width, given.height))},
-        key=lambda camera: camera.fx / camera.width,
-    )
-    if not alike:
-        return None
-    chosen = [
-        alike[i] for i in torch.linspace(0, len(alike) - 1, min(len(alike), MOST_CAMERAS)).round().int()
+    """Return the camera of a map's images of the same shape as those with the ``given`` intrinsics; None if there are none.
+
+    It is the one that the given intrinsics agree with or, if there is no such one, that with the median focal length. None
+    as well if its lens is so different that ``Calibration`` cannot describe the difference.
+    """
+    alike = [
+        camera.resized(given.width, given.height)
+        for camera in cameras
+        if same_aspect((camera.width, camera.height), (given.width, given.height))
     ]
-    corrections = torch.stack([correction_between(given, camera) for camera in chosen])
-    correction = corrections.median(0).values
-    spread = (corrections - correction).square().mean(0)
-    return MapCamera(correction, (CALIBRATED.deviations.square() + spread).sqrt())
+    alike = next(([camera] for camera in alike if _agree(given, camera)), alike)
+    alike.sort(key=lambda camera: camera.fx)
+    count = min(len(alike), MOST_CAMERAS)
+    chosen = [alike[i] for i in torch.linspace(0, len(alike) - 1, count).round().int().tolist()]
+    found = [(correction_between(given, camera), camera) for camera in chosen]
+    described = [(correction, camera) for correction, camera in found if correction is not None]
+    if not described:
+        return None
+    correction, camera = described[(len(described) - 1) // 2]
+    spread = torch.stack([(other - correction).square() for other, _ in described]).mean(0)
+    return MapCamera(correction, (CALIBRATED.deviations.square() + spread).sqrt(), camera)
 
 
-def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "4"]:
-    """Return the correction of ``given`` intrinsics, in the order of ``Calibration``, that comes closest to ``true`` ones."""
+def _agree(a: Intrinsics, b: Intrinsics) -> bool:
+    """Return whether two intrinsics differ by no more than two good calibrations of one camera."""
+    known, size = CALIBRATED, max(len(a.distortion), len(b.distortion))
+    parts = [
+        (math.log(a.fx / b.fx), known.log_focal), (math.log(a.fy / b.fy), known.log_focal),
+        ((a.cx - b.cx) / a.fx, known.shift), ((a.cy - b.cy) / a.fy, known.shift),
+    ]  # fmt: skip
+    bends = (camera.distortion + (0.0,) * (size - len(camera.distortion)) for camera in (a, b))
+    parts += [(x - y, known.radial) for x, y in zip(*bends, strict=True)]
+    return all(abs(difference) <= SIGNIFICANT * deviation for difference, deviation in parts)
+
+
+def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "4"] | None:
+    """Return the correction of ``given`` intrinsics, in the order of ``Calibration``, that comes closest to ``true`` ones.
+
+    The squares of the differences in pixels are least. None if these stay considerable.
+    """
     true = true.resized(given.width, given.height)
     u, v = (torch.linspace(0, size, GRID, dtype=torch.float64) for size in (given.width, given.height))
     pixels = torch.stack(torch.meshgrid(u, v, indexing="ij"), dim=-1).reshape(-1, 2)
     stated, real = (camera.unproject(pixels)[:, :2] for camera in (given, true))
+    steps = torch.eye(2, dtype=torch.float64)
+    # The derivative of the plane by the pixels of the given camera, whose inverse turns differences into pixels.
+    slope = torch.stack([given.unproject(pixels + step)[:, :2] - stated for step in steps], dim=-1)
     bend = real * real.square().sum(-1, keepdim=True)
-    zero, one = torch.zeros(len(pixels), dtype=torch.float64), torch.ones(len(pixels), dtype=torch.float64)
     # stated = factor real + shift + factor radial bend, as in ``Calibration.pixels``
-    rows = [
-        torch.stack(
-            [real[:, axis], one if axis == 0 else zero, one if axis == 1 else zero, bend[:, axis]], -1
-        )
-        for axis in (0, 1)
-    ]
-    factor, shift_u, shift_v, bent = torch.linalg.lstsq(torch.cat(rows), stated.mT.reshape(-1)).solution
+    rows = torch.stack([real, *(step.expand_as(real) for step in steps), bend], dim=-1)
+    rows, target = torch.linalg.solve(slope, rows), torch.linalg.solve(slope, stated[..., None])
+    solved = torch.linalg.lstsq(rows.reshape(-1, 4), target.reshape(-1, 1)).solution
+    left = (rows @ solved - target)[..., 0].norm(dim=-1)
+    factor, shift_u, shift_v, bent = solved[:, 0]
+    if not bool(left.square().mean().sqrt() <= MOST_RESIDUAL * given.width) or float(factor) <= 0:
+        return None
     return torch.stack([factor.log(), shift_u, shift_v, bent / factor])

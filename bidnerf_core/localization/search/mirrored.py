@@ -54,6 +54,8 @@ def mirror_evidence(
 def mirror_image(frame: Frame) -> Frame:
     """Return what the frame's camera would see in a mirror: left and right swapped, without depth."""
     swap = Orientation(mirrors_columns=True)
-    alpha = None if frame.alpha is None else swap.upright(frame.alpha)
+    alpha, hidden = (None if image is None else swap.upright(image) for image in (frame.alpha, frame.hidden))
     camera = frame.intrinsics.upright(swap)
-    return replace(frame, rgb=swap.upright(frame.rgb), depth=None, alpha=alpha, intrinsics=camera)
+    return replace(
+        frame, rgb=swap.upright(frame.rgb), depth=None, alpha=alpha, hidden=hidden, intrinsics=camera
+    )

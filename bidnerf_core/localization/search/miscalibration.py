@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.localization.search.map_camera import SAME_LOG_ODDS, MapCamera
+from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, SAME_LOG_ODDS, MapCamera
 from bidnerf_core.mapping.calibration import (
     CALIBRATED,
     GIVEN,
@@ -27,6 +27,7 @@ MIXTURE = ((CALIBRATED, 1 - USUALLY - MISTAKES), (USUAL, USUALLY), (MISTAKEN, MI
 """Prior of the correction of given intrinsics: they are calibrated, off as usual, or wrong."""
 
 
+LOG_SHARES = torch.tensor([share for _, share in MIXTURE], dtype=torch.float64).log()
 LIKELY = 0.8
 """Probability from which on an image whose focal length is approximate is taken to be from the map's camera."""
 
@@ -36,6 +37,9 @@ class TakenIntrinsics:
     """The intrinsics with which an image is localized, and others that may be right instead."""
 
     calibration: Calibration = GIVEN  # correction of the given ones
+    camera: MapCamera | None = (
+        None  # the map's, if it is taken; then ``calibration`` is its approximate correction
+    )
     alternative: Calibration = GIVEN  # correction of those taken
     probability: float = 0.0  # that the alternative is right
 
@@ -87,11 +91,6 @@ class Miscalibration:
         number = int(self.probability.argmax())
         return number, float(self.probability[number])
 
-    @property
-    def sentence(self) -> str:
-        """What the most suspect parameter should be."""
-        return Calibration(*self.apparent.tolist()).sentences[self.worst[0]]
-
 
 def taken_intrinsics(
     free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera | None, approximate: bool
@@ -104,13 +103,13 @@ def taken_intrinsics(
         return TakenIntrinsics()
     if approximate:
         likely = probability_beside_approximate(free, landmarks, camera) > LIKELY
-        return TakenIntrinsics(camera.calibration if likely else GIVEN)
-    if not bool(camera.differs.any()):
+        return TakenIntrinsics(camera.calibration, camera) if likely else TakenIntrinsics()
+    if not bool(camera.differs.any()) or not camera.is_near(OTHER_CAMERA):
         return TakenIntrinsics()
     probability, there = probability_of_map_camera(free, landmarks, camera), camera.correction
     if probability > 0.5:
-        return TakenIntrinsics(camera.calibration, Calibration(*(-there).tolist()), 1 - probability)
-    return TakenIntrinsics(GIVEN, camera.calibration, probability)
+        return TakenIntrinsics(camera.calibration, camera, Calibration(*(-there).tolist()), 1 - probability)
+    return TakenIntrinsics(alternative=camera.calibration, probability=probability)
 
 
 def probability_of_map_camera(free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera) -> float:
@@ -119,8 +118,7 @@ def probability_of_map_camera(free: ReprojectionFit, landmarks: LandmarkMap, cam
     The image is represented by a fit in which the intrinsics were free.
     """
     value, noise = _estimate(free, landmarks)
-    shares = torch.tensor([share for _, share in MIXTURE], dtype=torch.float64)
-    by_given = (_log_densities(value, noise)[:, camera.differs].sum(1) + shares.log()).logsumexp(0)
+    by_given = (_log_densities(value, noise)[:, camera.differs].sum(1) + LOG_SHARES).logsumexp(0)
     evidence = float(_log_density_by(camera, value, noise)[camera.differs].sum() - by_given)
     return float(torch.tensor(evidence + camera.log_odds, dtype=torch.float64).sigmoid())
 
@@ -150,8 +148,7 @@ def unresolved_deviations(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"
     """Return the standard deviations about zero of the true corrections, seen as ``apparent`` with the variances ``noise``."""
     prior = torch.stack([part.deviations.square() for part, _ in MIXTURE])
     total = prior + noise
-    shares = torch.tensor([[share] for _, share in MIXTURE], dtype=torch.float64)
-    weights = torch.softmax(_log_densities(apparent, noise) + shares.log(), dim=0)
+    weights = torch.softmax(_log_densities(apparent, noise) + LOG_SHARES[:, None], dim=0)
     mean, variance = apparent * prior / total, prior * noise / total
     return (weights * (mean.square() + variance)).sum(0).sqrt()
 

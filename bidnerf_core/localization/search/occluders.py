@@ -20,10 +20,12 @@ JUMP = 0.05
 """Relative difference of the depths of neighbouring pixels from which on they belong to different things."""
 CONSIDERABLE, REST = 0.15, 0.05
 """Least share of the measured pixels in an occluder, and in the rest."""
+LEAST_PIXELS = 50
+"""Least number of measured pixels in both."""
 PROBED_POINTS = 300
 """Largest number of points of an occluder that are compared with the surface."""
 SLACK = 0.02
-"""Distance behind the surface (share of the scene's extent) up to which a point still lies on it."""
+"""Distance before the surface (share of the scene's extent) up to which a point still lies on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +37,14 @@ class Occluder:
     points: Float[Tensor, "n 3"]  # some of it, in the camera's frame, metres
 
     @torch.no_grad()
-    def share_behind(self, surface: SurfaceMap, T_world_camera: SE3) -> float:
-        """Return the share of its points that lie behind the surface, as seen from a pose: these cannot hide anything."""
+    def share_in_front(self, surface: SurfaceMap, T_world_camera: SE3) -> float:
+        """Return the share of its points that lie clearly before the surface, or before nothing, as seen from a pose."""
         ends = T_world_camera.apply(self.points.double())
         lines = (ends - T_world_camera.translation).float()
         length = torch.linalg.vector_norm(lines, dim=-1)
         met = cast(surface, T_world_camera.translation.float().expand_as(lines), lines / length[:, None])
-        behind = met.met & (length > met.along + SLACK * surface.extent)
-        return float(behind.float().mean())
+        before = ~met.met | (length < met.along - SLACK * surface.extent)
+        return float(before.float().mean())
 
 
 def nearest_piece(problem: Problem) -> Occluder | None:
@@ -60,12 +62,15 @@ def nearest_piece(problem: Problem) -> Occluder | None:
     if piece is None:
         return None
     hidden = piece.to(depth.device)
-    frame = replace(view.frame, depth=torch.where(hidden, 0, depth), hidden=hidden)
+    given = view.frame.hidden
+    frame = replace(
+        view.frame, depth=torch.where(hidden, 0, depth), hidden=hidden if given is None else hidden | given
+    )
     pixels = piece.nonzero()
     some = pixels[torch.linspace(0, len(pixels) - 1, min(len(pixels), PROBED_POINTS)).long()]
     centres = some.flip(-1).double() + 0.5
     points = view.frame.intrinsics.unproject(centres) * depth.cpu().double()[some[:, 0], some[:, 1], None]
-    share = len(pixels) / max(1, int((depth > 0).sum()))
+    share = len(pixels) / int(((depth > 0) & depth.isfinite()).sum())
     return Occluder(replace(problem, views=(replace(view, frame=frame),)), share, points.float())
 
 
@@ -73,19 +78,20 @@ def _nearest(depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"] | None:
     label = _pieces(depth.numpy())
     measured = label >= 0
     counts = np.bincount(label[measured]) if measured.any() else np.zeros(0, dtype=int)
-    considerable = (counts >= CONSIDERABLE * counts.sum()).nonzero()[0]
+    considerable = (counts >= max(LEAST_PIXELS, CONSIDERABLE * counts.sum())).nonzero()[0]
     if len(considerable) == 0:
         return None
     values = depth.numpy()
     nearest = min(considerable, key=lambda number: float(np.median(values[label == number])))
-    if counts[nearest] > (1 - REST) * counts.sum():
+    if counts.sum() - counts[nearest] < max(LEAST_PIXELS, REST * counts.sum()):
         return None
     return torch.from_numpy(label == nearest)
 
 
 def _pieces(depth: np.ndarray) -> np.ndarray:
     """Return the number of the connected piece of each pixel, -1 where nothing was measured."""
-    number, measured = np.arange(depth.size).reshape(depth.shape), depth > 0
+    number, measured = np.arange(depth.size).reshape(depth.shape), (depth > 0) & np.isfinite(depth)
+    depth = np.where(measured, depth, 0)
     pairs = []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         near, far = np.minimum(depth[a], depth[b]), np.maximum(depth[a], depth[b])

@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import torch
 
-from bidnerf_core.frames import Frame
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.se3 import SE3
 
 METHOD = "track"
 """The method that poses of a tracker name."""
-
-
-def with_focal_factor(frame: Frame, factor: float) -> Frame:
-    """Return the frame with its focal length multiplied by ``factor``."""
-    if factor == 1:
-        return frame
-    camera = frame.intrinsics
-    return replace(frame, intrinsics=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))
 
 
 def tracked_localization(motion: Motion, verdict: Verdict, predicted: Motion, loss: float) -> Localization:

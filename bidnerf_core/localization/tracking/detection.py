@@ -203,6 +203,7 @@ def landmark_pose(
         slope=fit.slope,
         miscalibration=miscalibration,
         calibration_scatter=landmarks.calibration_scatter,
+        intrinsics=None,
         depth_scale=depth_scale(data, fit.T_world_rig),
     )
 

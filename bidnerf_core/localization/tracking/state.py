@@ -18,6 +18,7 @@ from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.tracking.alignment import CloudInCamera
 from bidnerf_core.localization.tracking.clock import Clock
+from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
 from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
@@ -44,7 +45,7 @@ class TrackerState:
     usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
     miscalibration: Miscalibration = field(default_factory=Miscalibration.unknown)
     calibrated: int | None = None  # the frame (of ``frames``) in which the intrinsics were last checked
-    focal_factor: float = 1.0  # on the given focal lengths, from the last search
+    camera: CorrectedCamera | None = None  # by the searches; None while the given intrinsics are taken
     noise: float = 1.0  # pixels: of the points in the last image
     window: tuple[CloudInCamera, ...] = ()
 
@@ -63,7 +64,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
         "reach": None if state.motion is None else state.motion.reach,
         "agility": None if state.motion is None else state.motion.agility, "searchable": state.searchable,
         "waited": state.waited,
-        "calibrated": state.calibrated, "focal_factor": state.focal_factor,
+        "calibrated": state.calibrated, "camera": None if state.camera is None else state.camera.plain(),
     }  # fmt: skip
     tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
     tensors |= {
@@ -106,7 +107,9 @@ def _read(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not isinstance(found, dict) or found.get("format") != STATE_FORMAT:
         raise InputError(f"{path}: not the state of a tracker, expected a file that Tracker.save wrote")
     if found.get("version") != STATE_VERSION:
-        raise InputError(f"{path}: version {found.get('version')!r}, expected {STATE_VERSION}")
+        raise InputError(
+            f"{path}: version {found.get('version')!r}, expected {STATE_VERSION}; begin the sequence anew"
+        )
     if found.get("map") != key:
         raise InputError(f"{path}: belongs to map {found.get('map')!r}, the tracker's is {key!r}")
     return found["state"], tensors
@@ -132,7 +135,7 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
         numbers["searchable"], numbers["waited"], points,
         tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
         float("inf") if usual is None else usual, miscalibration, numbers["calibrated"],
-        numbers["focal_factor"], numbers["noise"], window,
+        None if numbers["camera"] is None else CorrectedCamera.from_plain(numbers["camera"]), numbers["noise"], window,
     )  # fmt: skip
 
 

@@ -1,0 +1,74 @@
+"""Intrinsics that a search has corrected, for the frames that follow."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass, replace
+from typing import Any
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame
+
+
+@dataclass(frozen=True)
+class CorrectedCamera:
+    """The intrinsics that a frame states, and the better ones that were found for it."""
+
+    given: Intrinsics
+    found: Intrinsics
+    approximate: (
+        bool  # whether the frame's focal length was; frames of the other kind are from another source
+    )
+
+    def applies_to(self, frame: Frame) -> bool:
+        """Return whether the intrinsics of a frame come from the same source."""
+        return frame.focal_is_approximate == self.approximate
+
+    def focal_factor(self, frame: Frame) -> float:
+        """Return the true over the given focal length of a frame."""
+        return self.found.fx / self.given.fx if self.applies_to(frame) else 1.0
+
+    def corrected(self, frame: Frame) -> Frame:
+        """Return the frame with better intrinsics."""
+        return replace(frame, intrinsics=self.changed(frame.intrinsics)) if self.applies_to(frame) else frame
+
+    def changed(self, camera: Intrinsics) -> Intrinsics:
+        """Return better intrinsics; those of another focus or size are changed in the same proportion."""
+        given, found = self.given, self.found
+        if camera == given:
+            return found
+        x, y = camera.width / given.width, camera.height / given.height
+        return replace(
+            camera, fx=camera.fx * found.fx / given.fx, fy=camera.fy * found.fy / given.fy,
+            cx=camera.cx + x * (found.cx - given.cx), cy=camera.cy + y * (found.cy - given.cy),
+            distortion=found.distortion if camera.distortion == given.distortion else camera.distortion,
+        )  # fmt: skip
+
+    def then(self, later: CorrectedCamera) -> CorrectedCamera:
+        """Return the correction by which ``later`` follows this one."""
+        return replace(self, found=later.changed(self.found))
+
+    def plain(self) -> list[Any]:
+        """Return the camera as JSON values."""
+        return [list(astuple(self.given)), list(astuple(self.found)), self.approximate]
+
+    @staticmethod
+    def from_plain(values: list[Any]) -> CorrectedCamera:
+        """Return the camera of which ``values`` are the JSON values."""
+        given, found = (_camera(*camera) for camera in values[:2])
+        return CorrectedCamera(given, found, values[2])
+
+
+def _camera(
+    fx: float, fy: float, cx: float, cy: float, width: int, height: int, distortion: list[float]
+) -> Intrinsics:
+    return Intrinsics(fx, fy, cx, cy, width, height, tuple(distortion))
+
+
+def after_search(
+    frame: Frame, found: Intrinsics, before: CorrectedCamera | None
+) -> tuple[Frame, CorrectedCamera]:
+    """Return a frame, which ``before`` has corrected, with the intrinsics that a search found for it, and the correction of later frames."""
+    later = CorrectedCamera(frame.intrinsics, found, frame.focal_is_approximate)
+    if before is not None and before.applies_to(frame):
+        return later.corrected(frame), before.then(later)
+    return later.corrected(frame), later
