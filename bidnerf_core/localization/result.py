@@ -29,7 +29,9 @@ class Outcome(StrEnum):
     NOT_SETTLED = "not settled"  # fresh rays still ask for a long step
     HIGH_LOSS = "high loss"  # a descent ended above the loss that counts as converged
     DIVERGED = "diverged"  # the loss or the pose became infinite or not a number
-    MISCALIBRATED = "miscalibrated"  # the image contradicts the camera's intrinsics
+    MISCALIBRATED = (
+        "miscalibrated"  # the image contradicts the intrinsics, or does not tell them from the map's
+    )
     MIRRORED = "mirrored"  # the mirror image fits the map better than the image
     IMPRECISE = "imprecise"  # the pose is too uncertain, compared with the distance of what is in view
     UNCERTAIN = "uncertain"  # the diagnostics together make a wrong pose too likely
