@@ -91,7 +91,7 @@ def test_a_strong_lens_is_corrected_where_a_correction_describes_it(k: tuple[flo
     assert float(off.median()) < 1.0
 
 
-def test_a_query_that_states_the_intrinsics_of_any_image_of_the_map_is_believed() -> None:
+def test_the_intrinsics_of_any_image_of_the_map_need_no_correction() -> None:
     usual, other = [with_focal(1 + 0.001 * i) for i in range(20)], with_focal(1.05)
     found = map_camera(other, (*usual, other))
     assert found is not None
@@ -185,7 +185,7 @@ def test_without_the_maps_cameras_the_stated_one_misleads(landmarks: LandmarkMap
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.04])
-def test_another_camera_that_is_stated_rightly_is_believed(landmarks: LandmarkMap, factor: float) -> None:
+def test_the_intrinsics_of_another_camera_are_kept(landmarks: LandmarkMap, factor: float) -> None:
     other = with_focal(factor)
     found = localized(landmarks, other, other)
     assert not found.takes_map_camera
