@@ -18,7 +18,7 @@ from bidnerf_core.orientation import UPRIGHT
 from bidnerf_core.records import read_record
 from bidnerf_core.se3 import SE3
 
-ENOUGH = 1000
+ENOUGH_REGISTERED = 1000
 """The number of measured pixels from which on some must fall into the colour image."""
 EXTRINSICS = "T_colour_depth"
 """The key of the 4x4 matrix (metres, OpenCV axes) beside the intrinsics in a file of a depth sensor."""
@@ -65,7 +65,7 @@ class DepthSensor:
             )
         coarse = colour.scaled(min(1.0, camera.fx / colour.fx, camera.fy / colour.fy))
         found = register_depth(depth, camera, coarse, self.T_colour_depth)
-        if int((depth > 0).sum()) >= ENOUGH and not bool((found > 0).any()):
+        if int((depth > 0).sum()) >= ENOUGH_REGISTERED and not bool((found > 0).any()):
             away = float(torch.linalg.vector_norm(self.T_colour_depth.translation))
             raise InputError(
                 f"{file}: nothing that was measured falls into the colour image; {EXTRINSICS} has the depth camera {away:.3g} m"

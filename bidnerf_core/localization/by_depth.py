@@ -8,10 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Generator
 
-from bidnerf_core.localization.acceptance import (
-    SurfaceDiagnostics,
-    surface_diagnostics,
-)
+from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
@@ -35,7 +32,7 @@ from bidnerf_core.se3 import SE3
 
 WORSE = 0.05
 """Largest increase of the cost on the surface by refinement; with more, field and surface contradict each other."""
-COMPARED_POINTS = 1000
+JUDGED_POINTS = 1000
 """Number of points by which two poses are compared."""
 LOSS_POINTS = 200
 """Number of points on which the losses along the path are computed."""
@@ -116,8 +113,6 @@ def _refined(
 @torch.no_grad()
 def share_on_surface(problem: Problem, surface: SurfaceMap, T_world_camera: SE3) -> float:
     """Return the share of the measured points that lie on the surface from a pose."""
-    cloud = PointCloud.measured(
-        problem.views, problem.depth_rays, COMPARED_POINTS, Generator().manual_seed(0)
-    )
+    cloud = PointCloud.measured(problem.views, problem.depth_rays, JUDGED_POINTS, Generator().manual_seed(0))
     judge = finest_cost(surface, cloud)
     return float(judge.inliers(judge.correspondences(T_world_camera[None]))[0].mean())

@@ -32,7 +32,7 @@ from bidnerf_core.se3 import SE3
 
 HELD_OUT, MOST_HELD_OUT = 8, 24
 """One image in so many is held out, and at most so many images."""
-ENOUGH = 6
+ENOUGH_ANSWERS = 6
 """Least number of localized images from which scatter is estimated."""
 QUANTILE = 0.9
 """Quantile of the errors at which their model is fitted: it covers the tails, and one image of ten may have a wrong pose."""
@@ -73,7 +73,7 @@ def tried_landmarks(
     held_out = _held_out(len(views))
     answers = _answers(tracked, views, held_out, features, config)
     landmarks = replace(landmarks, trial=_trial(answers, len(held_out)))
-    if len(answers) < ENOUGH:
+    if len(answers) < ENOUGH_ANSWERS:
         return landmarks
     correlation = _correlation(answers, landmarks.pose_covariance)
     scatter = _calibration_scatter(answers, correlation)

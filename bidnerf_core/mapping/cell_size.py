@@ -26,7 +26,7 @@ PER_CELL = 1.32
 """Least mean number of points in the cells that hold any. Points scattered at random leave 5/9 of the cells empty then; with
 fewer points, surfels are farther from each other on average than the radius of their discs, which is 1.5 cells.
 """
-COMPARED_IMAGES, COMPARED_POINTS = 40, 400
+COMPARED_IMAGES, CELL_POINTS = 40, 400
 """Images, and points of each, from which the noise is estimated."""
 GROSS = 5.0
 """Differences of more than so many medians are occlusions and gross errors, not noise."""
@@ -78,7 +78,7 @@ def _spread(
     found = []
     for number in range(0, len(images), max(1, math.ceil(len(images) / COMPARED_IMAGES))):
         points = images[number].points(images[number].solid(opacity))
-        points = points[:: max(1, len(points) // COMPARED_POINTS)]
+        points = points[:: max(1, len(points) // CELL_POINTS)]
         found += [beyond(images[other], points) for other in witnesses(number, images)]
     differences = torch.cat(found).abs() if found else torch.zeros(0)
     differences = differences[differences.isfinite()]

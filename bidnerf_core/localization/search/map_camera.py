@@ -31,14 +31,14 @@ MOST_RESIDUAL = 0.002
 """Root mean square difference, as a share of the image's width, above which a correction does not describe another camera."""
 GRID = 7
 """Rows and columns of pixels at which cameras are compared."""
-SIGNIFICANT = 2.0
+TOLD_APART = 2.0
 """Standard deviations of a good calibration by which cameras must differ to be told apart."""
 SAME_CAMERA = 0.9
 """Share of queries with nearly the map's intrinsics that are from the map's camera."""
 SAME_LOG_ODDS = math.log(SAME_CAMERA / (1 - SAME_CAMERA))
 OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1)
 """Standard deviations between the intrinsics of different cameras of one shape of image."""
-FARTHEST = 1.5
+MOST_DEVIATIONS = 1.5
 """Differences of so many times ``OTHER_CAMERA``, or of ``NOMINAL`` where the focal length is approximate, are those of another
 camera for certain.
 """
@@ -55,7 +55,7 @@ class MapCamera:
     @property
     def differs(self) -> Bool[Tensor, "4"]:
         """In which parameters the intrinsics differ."""
-        return self.correction.abs() > SIGNIFICANT * self.deviations
+        return self.correction.abs() > TOLD_APART * self.deviations
 
     @property
     def calibration(self) -> Calibration:
@@ -77,7 +77,7 @@ class MapCamera:
 
     def is_near(self, prior: CalibrationPrior) -> bool:
         """Return whether the intrinsics differ by no more than those of different cameras may, where they are stated so well."""
-        return bool((self.correction.abs() <= FARTHEST * prior.deviations).all())
+        return bool((self.correction.abs() <= MOST_DEVIATIONS * prior.deviations).all())
 
     def _log_density(self, prior: CalibrationPrior) -> Float[Tensor, ""]:
         """Return the logarithm of the density of the parameters that differ, but for a constant."""
@@ -119,7 +119,7 @@ def _agree(a: Intrinsics, b: Intrinsics) -> bool:
     ]  # fmt: skip
     bends = (camera.distortion + (0.0,) * (size - len(camera.distortion)) for camera in (a, b))
     parts += [(x - y, known.radial) for x, y in zip(*bends, strict=True)]
-    return all(abs(difference) <= SIGNIFICANT * deviation for difference, deviation in parts)
+    return all(abs(difference) <= TOLD_APART * deviation for difference, deviation in parts)
 
 
 def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "4"] | None:

@@ -25,9 +25,8 @@ from bidnerf_core.mapping.resection import ReprojectionFit
 
 MIXTURE = ((CALIBRATED, 1 - USUALLY - MISTAKES), (USUAL, USUALLY), (MISTAKEN, MISTAKES))
 """Prior of the correction of given intrinsics: they are calibrated, off as usual, or wrong."""
-
-
 LOG_SHARES = torch.tensor([share for _, share in MIXTURE], dtype=torch.float64).log()
+"""Logarithms of the shares of the parts of ``MIXTURE``."""
 LIKELY = 0.8
 """Probability from which on an image whose focal length is approximate is taken to be from the map's camera."""
 
@@ -36,10 +35,10 @@ LIKELY = 0.8
 class TakenIntrinsics:
     """The intrinsics with which an image is localized, and others that may be right instead."""
 
-    calibration: Calibration = GIVEN  # correction of the given ones
-    camera: MapCamera | None = (
-        None  # the map's, if it is taken; then ``calibration`` is its approximate correction
+    calibration: Calibration = (
+        GIVEN  # correction of the given ones, approximate where the map's camera is taken
     )
+    camera: MapCamera | None = None  # the map's, if it is taken
     alternative: Calibration = GIVEN  # correction of those taken
     probability: float = 0.0  # that the alternative is right
 
@@ -130,9 +129,8 @@ def probability_beside_approximate(free: ReprojectionFit, landmarks: LandmarkMap
     value, noise = _estimate(free, landmarks)
     total = NOMINAL.deviations.square() + noise
     by_any = -0.5 * (value.square() / total + total.log())
-    evidence = (_log_density_by(camera, value, noise) - by_any)[
-        0
-    ]  # the other parameters hardly tell cameras apart
+    # The other parameters hardly tell cameras apart.
+    evidence = (_log_density_by(camera, value, noise) - by_any)[0]
     return float((evidence + SAME_LOG_ODDS).sigmoid())
 
 

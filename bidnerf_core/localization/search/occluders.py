@@ -24,7 +24,7 @@ LEAST_PIXELS = 50
 """Least number of measured pixels in both."""
 PROBED_POINTS = 300
 """Largest number of points of an occluder that are compared with the surface."""
-SLACK = 0.02
+CLEARLY_BEFORE = 0.02
 """Distance before the surface (share of the scene's extent) up to which a point still lies on it."""
 
 
@@ -43,7 +43,7 @@ class Occluder:
         lines = (ends - T_world_camera.translation).float()
         length = torch.linalg.vector_norm(lines, dim=-1)
         met = cast(surface, T_world_camera.translation.float().expand_as(lines), lines / length[:, None])
-        before = ~met.met | (length < met.along - SLACK * surface.extent)
+        before = ~met.met | (length < met.along - CLEARLY_BEFORE * surface.extent)
         return float(before.float().mean())
 
 

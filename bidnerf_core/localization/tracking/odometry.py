@@ -19,7 +19,7 @@ LEAST_CORNERS = 20
 """The number of corners that have to agree with a motion."""
 LEAST_SHARE = 0.5
 """Share of the corners that have to agree with it."""
-SIGNIFICANT = -6.0
+SIGNIFICANT_NFA = -6.0
 """Largest logarithm of the number of such agreements expected by chance."""
 REPLENISHED = 0.5
 """Share of the corners left at which new ones are taken."""
@@ -47,7 +47,7 @@ class Odometry:
         evidence = flow_evidence(found, frame.intrinsics)
         if (
             evidence.agreeing < max(LEAST_CORNERS, LEAST_SHARE * len(points))
-            or evidence.log10_nfa > SIGNIFICANT
+            or evidence.log10_nfa > SIGNIFICANT_NFA
         ):
             return None
         relative = found.fit.covariance
