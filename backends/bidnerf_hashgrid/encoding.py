@@ -224,7 +224,7 @@ class _Encode(torch.autograd.Function):
         ]
         parts = zip(tables, levels, rows[: len(levels)], slopes, strict=True)
         tasks = [partial(_encode_level, points, *part) for part in parts]
-        concurrently(tasks, threads_for(points))
+        concurrently(tasks, threads_for(points.shape[1], points.device))
         ctx.save_for_backward(points, *(slope for slope in slopes if slope is not None))
         ctx.levels, ctx.features = levels, features
         encoded = rows.new_empty(count, total * features)
@@ -254,7 +254,7 @@ class _Encode(torch.autograd.Function):
             for part, level, table in zip(rows[: len(to_tables)], ctx.levels, to_tables, strict=True)
             if table is not None
         ]
-        concurrently(tasks, threads_for(points))
+        concurrently(tasks, threads_for(points.shape[1], points.device))
         return to_points, None, None, None, *to_tables
 
 
