@@ -168,7 +168,7 @@ def start_pose(start: Start) -> SE3:
         return start.to("cpu", torch.float64)
     try:
         matrix = torch.as_tensor(np.asarray(start, dtype=np.float64))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"start is a {type(start).__name__}, expected an SE3 or a 4x4 matrix") from error
     return pose_from_matrix(matrix, "start")
 
