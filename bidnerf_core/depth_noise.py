@@ -11,6 +11,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth_sensor import DepthNoise
 from bidnerf_core.depth_steps import DepthSteps, depth_steps
+from bidnerf_core.robust import MAD_TO_SIGMA
 
 WINDOW = 8
 """Rows and columns of the pixels to which a plane is fitted."""
@@ -18,8 +19,6 @@ PLANAR = 0.25
 """Quantile of the windows' residuals: as many are taken for planes. The others may show edges, curved things and relief."""
 QUANTILE_BIAS = 1.11
 """The noise over that quantile, where all windows are planes and all pixels independent."""
-MAD_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
 LEAST_WINDOWS = 20
 """Least number of windows in a range of depths from which its noise is estimated."""
 MOST_RANGES = 8

@@ -17,6 +17,7 @@ from bidnerf_core.field import SceneBounds
 from bidnerf_core.mapping.posed_depth import PosedDepthImage, witnesses
 from bidnerf_core.mapping.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes
 from bidnerf_core.mapping.surfels import surfel_bytes
+from bidnerf_core.robust import MAD_TO_SIGMA
 from bidnerf_core.voxel_grid import VoxelGrid
 
 PIXEL = 0.7
@@ -35,8 +36,6 @@ MOST_NOISE = 2.0
 """Images that differ by more than so many standard deviations of an unknown sensor contradict each other; it is not taken for
 noise.
 """
-MAD_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
 COARSER = 2**0.25
 """Factor by which cells grow until there are enough points in them, or until they take little enough memory."""
 
