@@ -56,7 +56,7 @@ class DepthSensorModel:
 
 
 UNKNOWN = DepthSensorModel(scale=0.01, noise=DepthNoise(linear=0.01))
-"""A sensor of which nothing is said: a scale and noise of 1 % each, which no common sensor exceeds by much within its range."""
+"""A sensor of which nothing is said: 1 % each for scale and noise, a round figure for consumer sensors at a few metres."""
 
 KINECT = DepthSensorModel(scale=0.027, offset=0.0, noise=DepthNoise(quadratic=0.001425))
 """Microsoft's first Kinect, and other sensors by PrimeSense, as they leave the factory.
@@ -81,7 +81,7 @@ the error of the distance to 2 % within 2 m, which is taken for two standard dev
 LIDAR = DepthSensorModel(scale=0.01, offset=0.01, noise=DepthNoise(constant=0.005, linear=0.0025))
 """The lidar of Apple's phones and tablets, as ARKit returns it: few measured points, interpolated along the edges of the image.
 
-Luetzenburg, Kroon and Bjork, "Evaluation of the Apple iPhone 12 Pro LiDAR for an Application in Geosciences", Scientific
+Luetzenburg, Kroon and Bjørk, "Evaluation of the Apple iPhone 12 Pro LiDAR for an Application in Geosciences", Scientific
 Reports 11, 2021, found an accuracy of 1 cm on objects with sides of more than 10 cm, which is taken for the offset and, at
 2 m, for the noise. The scale is that of an unknown sensor.
 """
