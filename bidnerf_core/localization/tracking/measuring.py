@@ -9,6 +9,7 @@ import torch
 from torch import Generator
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
@@ -97,19 +98,16 @@ class ByLandmarks:
     map: SceneMap
     detector: LandmarkDetector
     config: TrackerConfig
-
-    @property
-    def correlation(self) -> float:
-        """The number of landmarks in an image that count as one measurement."""
-        return self.detector.landmarks.correlation
+    sensor: DepthSensorModel = UNKNOWN
 
     def __call__(
         self, frame: Frame, image: Grey, state: TrackerState, points: FollowedPoints, predicted: Motion
     ) -> Measurement | None:
         """Return the pose by landmarks, fused with measured depth; None if too few are seen for any pose."""
         threshold = pixel_threshold(frame.intrinsics)
+        correlation = self.detector.landmarks.correlation_of(len(points))
         found = fit_pose(
-            points.observed(frame), predicted.T_world_camera, state.noise, threshold, self.correlation
+            points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation
         )
         judged = measured = None
         state = replace(state, age=state.age + 1)
@@ -215,12 +213,16 @@ class ByLandmarks:
 
     def _estimate(self, found: LandmarkPose) -> PoseEstimate:
         """Split a pose's covariance: errors that the landmarks of an image have in common are those of the next image, too."""
-        noise = (found.covariance - self.detector.landmarks.pose_covariance) / self.correlation
+        landmarks = self.detector.landmarks
+        correlation = landmarks.correlation_of(len(found.correspondences))
+        noise = (found.covariance - landmarks.pose_covariance) / correlation
         return PoseEstimate(found.T_world_camera, noise, found.full_covariance - noise)
 
     def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:
         generator = Generator().manual_seed(seed)
-        return measured_cloud(frame, self.config.depth_points, shrunk_depth_scale(found), generator)
+        return measured_cloud(
+            frame, self.config.depth_points, shrunk_depth_scale(found, self.sensor), generator
+        )
 
 
 def search_radius(predicted: Motion, camera: Intrinsics) -> float:
