@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -105,8 +105,7 @@ class OccupancyGrid(nn.Module):
         offsets, exits, ends = (part.index_select(0, ray) for part in (offset, spacing.exit, far))
         place = start[:, None] + steps + (offsets * self.step)[:, None]
         positions = _at(flat, RaySpacing(exits, spacing.radius).distance(place), ray)
-        occupied = self.grid.at(self.occupied, positions) & self.grid.contains(positions)
-        block, step = (occupied & (place < ends[:, None])).nonzero(as_tuple=True)
+        block, step = (self._occupied_at(positions) & (place < ends[:, None])).nonzero(as_tuple=True)
         kept = place.view(-1).index_select(0, block * BLOCK + step)
         samples = self._padded(kept, ray.index_select(0, block), near, far)
         width = samples.valid.shape[-1]
@@ -126,7 +125,7 @@ class OccupancyGrid(nn.Module):
         steps = torch.arange(count, dtype=near.dtype, device=near.device)
         place = near[:, None] + (skipped[:, None] + steps + offset[:, None]) * self.step
         positions = rays.at(spacing.distance(place))
-        kept = self.grid.at(self.occupied, positions) & self.grid.contains(positions) & (place < far[:, None])
+        kept = self._occupied_at(positions) & (place < far[:, None])
         order = (~kept).sort(dim=-1, stable=True).indices[:, :MOST]
         place, kept = place.gather(-1, order), kept.gather(-1, order)
         middles = torch.where(kept, place, far[:, None])
@@ -135,6 +134,13 @@ class OccupancyGrid(nn.Module):
             middles = torch.cat([middles, far[:, None].expand(-1, missing)], dim=-1)
             kept = pad(kept, (0, missing))
         return self._intervals(middles, kept, kept.sum(-1), near, far)
+
+    def _occupied_at(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
+        """Return whether positions (metres, world) are within the grid, in an occupied cell."""
+        grid = self.grid
+        if grid.contracted is not None:  # once, and not in each look-up
+            grid, positions = replace(grid, contracted=None), grid.contracted.normalized(positions)
+        return grid.at(self.occupied, positions) & grid.contains(positions)
 
     def _busy_blocks(
         self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor
