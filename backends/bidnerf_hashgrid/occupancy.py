@@ -139,7 +139,8 @@ class OccupancyGrid(nn.Module):
         """Return whether positions (metres, world) are within the grid, in an occupied cell."""
         grid = self.grid
         if grid.contracted is not None:  # once, and not in each look-up
-            grid, positions = replace(grid, contracted=None), grid.contracted.normalized(positions)
+            positions = grid.contracted.normalized(positions)
+            grid = replace(grid, contracted=None)
         return grid.at(self.occupied, positions) & grid.contains(positions)
 
     def _busy_blocks(
