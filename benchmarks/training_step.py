@@ -16,6 +16,7 @@ import argparse
 import os
 import statistics
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -52,6 +53,8 @@ class Timed(Silent):
     wall: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
     samples_per_ray: list[float] = field(default_factory=list)
+    observer: Any = nullcontext()  # entered after the first step, so that it sees no images being loaded
+    entered: bool = False
 
     def resume(self) -> TrainingState:
         self.wall, self.cpu = [time.perf_counter()], [time.process_time()]
@@ -61,6 +64,9 @@ class Timed(Silent):
         self.wall.append(time.perf_counter())
         self.cpu.append(time.process_time())
         self.samples_per_ray.append(progress.samples_per_ray)
+        if not self.entered:
+            self.entered = True
+            self.observer.__enter__()
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +85,15 @@ class Training:
         own = {name: value.clone() for name, value in self.stored.field.state_dict().items()}  # type: ignore[attr-defined]
         return TrainingState(self.config.steps, own, moments)
 
-    def run(self, steps: int) -> Timed:
-        """Carry the training on. The learning rate is at its least by then: the field stays what it is."""
-        report = Timed(self.state())
+    def run(self, steps: int, observer: Any = None) -> Timed:
+        """Carry the training on. The learning rate is at its least by then: the field stays what it is.
+
+        The ``observer`` is a context that all steps but the first run in.
+        """
+        report = Timed(self.state(), observer=observer or nullcontext())
         config = replace(self.config, steps=self.config.steps + steps)
         load_backend(self.stored.info.backend).train(self.stored.field, self.views, config, report)
+        report.observer.__exit__(None, None, None)
         return report
 
 
@@ -113,8 +123,8 @@ def cost(training: Training, steps: int, threads: int) -> dict[str, float]:
 def shares(training: Training) -> dict[str, float]:
     """Return the share of each kind of operator in the CPU time of one thread."""
     torch.set_num_threads(1)
-    with profile(activities=[ProfilerActivity.CPU]) as profiled:
-        training.run(PROFILED)
+    profiled = profile(activities=[ProfilerActivity.CPU])
+    training.run(PROFILED + 1, profiled)
     spent = dict.fromkeys((*KINDS, "elementwise and other"), 0.0)
     for operator in profiled.key_averages():
         fits = (kind for kind, parts in KINDS.items() if any(p in operator.key for p in parts))
@@ -125,8 +135,8 @@ def shares(training: Training) -> dict[str, float]:
 def least(training: Training) -> dict[str, float]:
     """Return the least milliseconds a step on one thread: matrix products, and the gathers of the hash encoding."""
     torch.set_num_threads(1)
-    with FlopCounterMode(display=False) as counter:
-        training.run(PROFILED)
+    counter = FlopCounterMode(display=False)
+    training.run(PROFILED + 1, counter)
     operations = counter.get_total_flops() / PROFILED
     found = {"matrix_products": 1e3 * operations / _operations_a_second()}
     encoding = getattr(training.config, "encoding", None)

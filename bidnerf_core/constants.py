@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import lru_cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Shaped
 from torch import Tensor
 
 
-def constant(values: tuple[float, ...], like: Tensor) -> Float[Tensor, "n"]:
+def constant(values: tuple[float, ...], like: Tensor) -> Shaped[Tensor, "n"]:
     """Return ``values`` in the type and on the device of ``like``. Do not write into the result: it is shared."""
     return _constant(values, like.dtype, like.device)
 

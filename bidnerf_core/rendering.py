@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
@@ -42,20 +42,49 @@ def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> Fiel
     There the field is not queried or, where the host must not wait for the device (see ``waiting``), queried at the origin.
     """
     valid = samples.valid
+    if not may_wait(valid.device) or bool(valid.all()):
+        return _query_all(field, rays, samples)
+    found = _query_valid(field, rays, samples)
+    rgb = found.values.rgb.new_zeros((valid.numel(), 3)).index_copy(0, found.index, found.values.rgb)
+    return FieldValues(_padded(found.values.density, found.index, valid), rgb.reshape(*valid.shape, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class _ValidSamples:
+    """The valid samples of all rays, one ray after the other, and the field's values there."""
+
+    index: Int[Tensor, "n"]  # number of each among all samples
+    ray: Int[Tensor, "n"]  # number of each sample's ray
+    values: FieldValues
+
+
+def _query_all(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
+    """Return the values at all samples, either because all are valid or because the host must not wait to count them."""
     positions = rays.at(samples.middles)
     directions = rays.directions[..., None, :].expand_as(positions)
-    if not may_wait(valid.device):
-        found = field.query(torch.where(valid[..., None], positions, 0), directions)
-        return FieldValues(torch.where(valid, found.density, 0), found.rgb)
-    if bool(valid.all()):
+    if may_wait(samples.valid.device):
         return field.query(positions, directions)
-    index = valid.reshape(-1).nonzero()[:, 0]
-    found = field.query(
-        positions.reshape(-1, 3).index_select(0, index), directions.reshape(-1, 3).index_select(0, index)
+    found = field.query(torch.where(samples.valid[..., None], positions, 0), directions)
+    return FieldValues(torch.where(samples.valid, found.density, 0), found.rgb)
+
+
+def _query_valid(field: RadianceField, rays: Rays, samples: RaySamples) -> _ValidSamples:
+    count = samples.valid.shape[-1]
+    ray, slot = samples.valid.reshape(-1, count).nonzero(as_tuple=True)
+    index = ray * count + slot
+    # Positions are computed of these samples only: often most of a row is padding.
+    origins, directions = (
+        part.reshape(-1, 3).index_select(0, ray) for part in (rays.origins, rays.directions)
     )
-    density = found.density.new_zeros(valid.numel()).index_copy(0, index, found.density)
-    rgb = found.rgb.new_zeros((valid.numel(), 3)).index_copy(0, index, found.rgb)
-    return FieldValues(density.reshape(valid.shape), rgb.reshape(*valid.shape, 3))
+    middles = samples.middles.reshape(-1).index_select(0, index)
+    return _ValidSamples(index, ray, field.query(origins + middles[:, None] * directions, directions))
+
+
+def _padded(
+    values: Float[Tensor, "n"], index: Int[Tensor, "n"], valid: Bool[Tensor, "*r s"]
+) -> Float[Tensor, "*r s"]:
+    """Return the values of the valid samples at their places, and 0 at the others."""
+    return values.new_zeros(valid.numel()).index_copy(0, index, values).reshape(valid.shape)
 
 
 def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:
@@ -84,12 +113,29 @@ def render_samples(
     background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
 ) -> Rendering:
     """Render rays from given samples, see ``render``."""
-    values = query_samples(field, rays, samples)
-    weights = rendering_weights(values.density, samples)
+    weights, density, colour = _composed(field, rays, samples)
     opacity = weights.sum(-1)
     behind = constant(background, weights) if isinstance(background, tuple) else background.to(weights)
-    rgb = (weights[..., None] * values.rgb).sum(-2) + (1 - opacity)[..., None] * behind
-    return Rendering(rgb, (weights * samples.middles).sum(-1), opacity, weights, samples, values.density)
+    rgb = colour + (1 - opacity)[..., None] * behind
+    return Rendering(rgb, (weights * samples.middles).sum(-1), opacity, weights, samples, density)
+
+
+def _composed(
+    field: RadianceField, rays: Rays, samples: RaySamples
+) -> tuple[Float[Tensor, "*r s"], Float[Tensor, "*r s"], Float[Tensor, "*r 3"]]:
+    """Return the weights and densities of the samples, and the sum of weight times colour (eq. 3)."""
+    valid = samples.valid
+    # On other devices a sum over the samples of each ray has no fixed order, and would differ from run to run.
+    if valid.device.type != "cpu" or bool(valid.all()):
+        values = query_samples(field, rays, samples)
+        weights = rendering_weights(values.density, samples)
+        return weights, values.density, (weights[..., None] * values.rgb).sum(-2)
+    found = _query_valid(field, rays, samples)
+    density = _padded(found.values.density, found.index, valid)
+    weights = rendering_weights(density, samples)
+    share = weights.reshape(-1).index_select(0, found.index)[:, None] * found.values.rgb
+    colour = share.new_zeros((rays.near.numel(), 3)).index_add(0, found.ray, share)
+    return weights, density, colour.reshape(*valid.shape[:-1], 3)
 
 
 @torch.no_grad()

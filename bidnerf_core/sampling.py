@@ -100,7 +100,7 @@ def _rows(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
     """Return the rays, or the samples of the rays, with these numbers."""
     leading = (of.near if isinstance(of, Rays) else of.starts[..., 0]).dim()
     parts = (getattr(of, field.name) for field in fields(of))
-    return type(of)(*(part.reshape(-1, *part.shape[leading:])[index] for part in parts))
+    return type(of)(*(part.reshape(-1, *part.shape[leading:]).index_select(0, index) for part in parts))
 
 
 def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:

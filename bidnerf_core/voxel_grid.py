@@ -79,7 +79,9 @@ class VoxelGrid:
 
     def at(self, values: Shaped[Tensor, "x y z"], points: Float[Tensor, "*p 3"]) -> Shaped[Tensor, "*p"]:
         """Return the value of the cell that holds each point (metres, world), or of the one nearest to it on the border."""
-        return values.view(-1)[self.numbers(points)]
+        numbers = self.numbers(points)
+        # On a CPU several times faster than indexing by square brackets.
+        return values.view(-1).index_select(0, numbers.reshape(-1)).view(numbers.shape)
 
     def contains(self, points: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
         """Return whether each point (metres, world) lies within the grid or on its border."""

@@ -245,7 +245,7 @@ def test_the_number_of_threads_does_not_change_the_result(
     encoding, points, usual = make(), torch.rand(50, 3, dtype=torch.float64), torch.get_num_threads()
     results = []
     for threads in (1, 3):
-        monkeypatch.setattr(encoding_module, "threads_for", lambda _, threads=threads: threads)
+        monkeypatch.setattr(encoding_module, "threads_for", lambda *_, threads=threads: threads)
         with torch.inference_mode(inference):
             encoded = encoding(points.clone().requires_grad_(not inference))
         if inference:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds, levels, widened
-from bidnerf_core.rendering import query_samples, render, render_image, rendering_weights
+from bidnerf_core.rendering import query_samples, render, render_image, render_samples, rendering_weights
 from bidnerf_core.sampling import Importance, Stratified, inverse_transform
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.se3 import SE3
@@ -91,6 +91,40 @@ def test_only_valid_samples_are_queried() -> None:
     nothing = RaySamples(samples.starts, samples.ends, torch.zeros_like(samples.valid))
     assert float(query_samples(field, rays, nothing).density.abs().max()) == 0
     assert field.asked[-1] == 0
+
+
+def test_derivatives_of_a_rendering_with_gaps_are_the_numerical_ones() -> None:
+    rays, field = some_rays(6), Fog(Gaps(), [])
+    samples = field.sampler(rays)
+    assert 0 < int(samples.valid.sum()) < samples.valid.numel()
+
+    def function(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        moved = Rays(origins, directions, rays.near, rays.far)
+        rendering = render_samples(field, moved, samples, BLUE)
+        return rendering.rgb, rendering.distance, rendering.opacity, rendering.weights
+
+    of = (rays.origins.clone().requires_grad_(), rays.directions.clone().requires_grad_())
+    assert torch.autograd.gradcheck(function, of)
+
+
+@pytest.mark.parametrize("leading", [(12,), (3, 4), (1, 12)])
+def test_what_is_not_valid_changes_nothing(leading: tuple[int, ...]) -> None:
+    """Rendering with gaps equals rendering the whole rays with a field that has no density in the gaps."""
+    flat, field = some_rays(12), Fog(Gaps(), [])
+    parts = (flat.origins, flat.directions, flat.near, flat.far)
+    rays = Rays(*(part.reshape(*leading, *part.shape[1:]).requires_grad_() for part in parts[:2]),
+                *(part.reshape(leading) for part in parts[2:]))  # fmt: skip
+    samples = field.sampler(rays)
+    values = field.query(rays.at(samples.middles), rays.directions[..., None, :].expand(*leading, 12, 3))
+    everywhere = replace(samples, valid=torch.ones_like(samples.valid))
+    weights = rendering_weights(values.density * samples.valid, everywhere)
+    rgb = (weights[..., None] * values.rgb).sum(-2) + (1 - weights.sum(-1))[..., None] * torch.tensor(BLUE)
+    found = render_samples(field, rays, samples, BLUE)
+    torch.testing.assert_close(found.rgb, rgb)
+    torch.testing.assert_close(found.weights, weights)
+    of = [rays.origins, rays.directions]
+    gradients = [torch.autograd.grad(colour.sin().sum(), of) for colour in (found.rgb, rgb)]
+    torch.testing.assert_close(*gradients)
 
 
 @pytest.mark.parametrize("density", [0.0, 1e-6, 0.3, 20.0])

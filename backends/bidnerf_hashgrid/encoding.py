@@ -23,6 +23,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from bidnerf_core.constants import constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.settings import Range, Settings
 from bidnerf_hashgrid.threads import concurrently, threads_for
@@ -81,15 +82,16 @@ def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
 
 
 def _vertices(
-    points: Float[Tensor, "3 n"], level: _Level, dtype: torch.dtype
+    points: Float[Tensor, "3 n"], level: _Level
 ) -> tuple[Int[Tensor, "3 2 n"], Float[Tensor, "3 n"]]:
     """Return the terms of the lower and upper vertex of each axis in a corner's index, and the position in the cell."""
     scaled = points * level.resolution
     # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
-    lower = scaled.to(dtype).clamp_(0, level.resolution - 1)
-    terms = torch.stack((lower, lower + 1), dim=1)
-    for term, stride in zip(terms, level.strides, strict=True):
-        term.mul_(stride)
+    lower = scaled.to(torch.int32).clamp_(0, level.resolution - 1)
+    strides = constant(level.strides, lower)[:, None]
+    terms = lower.new_empty(3, 2, lower.shape[1])
+    torch.mul(lower, strides, out=terms[:, 0])
+    torch.add(terms[:, 0], strides, out=terms[:, 1])
     return terms.bitwise_and_(level.entries - 1) if level.hashed else terms, scaled.sub_(lower)
 
 
@@ -170,7 +172,7 @@ def _encode_level(
     columns = _as_units(table, unit).unbind(1)
     for chunk in _chunks(points):
         wide = slice(chunk.start * unit, chunk.stop * unit)
-        terms, fraction = _vertices(points[:, chunk], level, torch.int32)
+        terms, fraction = _vertices(points[:, chunk], level)
         weights = _weights(fraction, level, unit)
         index = _corner_indices(terms, level)
         for k, column in enumerate(columns):
@@ -192,10 +194,10 @@ def _add_table_gradient(
     unit = _unit(table.shape[1])
     for chunk in _chunks(points):
         wide = slice(chunk.start * unit, chunk.stop * unit)
-        # scatter_add_ takes int64 only, and is still twice as fast as index_add_ with int32.
-        terms, fraction = _vertices(points[:, chunk], level, torch.int64)
+        terms, fraction = _vertices(points[:, chunk], level)
         weights = _weights(fraction, level, unit)
-        index = _corner_indices(terms, level)
+        # scatter_add_ takes int64 only, and is still twice as fast as index_add_ with int32.
+        index = _corner_indices(terms, level).long()
         for target, row in zip(_as_units(table, unit).unbind(1), gradient, strict=True):
             corners = _spread(row[wide], weights).view(-1)
             target.scatter_add_(0, index, _as_units(corners, unit))
@@ -224,7 +226,7 @@ class _Encode(torch.autograd.Function):
         ]
         parts = zip(tables, levels, rows[: len(levels)], slopes, strict=True)
         tasks = [partial(_encode_level, points, *part) for part in parts]
-        concurrently(tasks, threads_for(points))
+        concurrently(tasks, threads_for(points.shape[1], points.device))
         ctx.save_for_backward(points, *(slope for slope in slopes if slope is not None))
         ctx.levels, ctx.features = levels, features
         encoded = rows.new_empty(count, total * features)
@@ -254,7 +256,7 @@ class _Encode(torch.autograd.Function):
             for part, level, table in zip(rows[: len(to_tables)], ctx.levels, to_tables, strict=True)
             if table is not None
         ]
-        concurrently(tasks, threads_for(points))
+        concurrently(tasks, threads_for(points.shape[1], points.device))
         return to_points, None, None, None, *to_tables
 
 

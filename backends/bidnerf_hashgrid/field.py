@@ -16,6 +16,7 @@ from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
 from bidnerf_core.sampling import Concentrated
 from bidnerf_core.settings import Count, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
+from bidnerf_hashgrid.networks import log_density_and_rgb
 from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
 
 LARGEST_LOG_DENSITY = 12.0
@@ -98,11 +99,12 @@ class HashGridField(nn.Module):
     ) -> FieldValues:
         """Return the values with the first ``active`` levels of the encoding only (None: all)."""
         shape = positions.shape[:-1]
-        features = self.geometry(self.encode(positions.reshape(-1, 3), active))
+        encoded = self.encode(positions.reshape(-1, 3), active)
+        harmonics = spherical_harmonics(directions.reshape(-1, 3))
+        log_density, rgb = log_density_and_rgb(self.geometry, self.colour, encoded, harmonics)
         # Per side of the scene, so that an untrained field is equally thin in any unit of length.
-        density = features[:, 0].clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
-        seen = torch.cat([features[:, 1:], spherical_harmonics(directions.reshape(-1, 3))], dim=-1)
-        return FieldValues(density.reshape(shape), self.colour(seen).reshape(*shape, 3))
+        density = log_density.clamp(max=LARGEST_LOG_DENSITY).exp() / self.side
+        return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
 
     def encode(self, positions: Float[Tensor, "p 3"], active: int | None) -> Float[Tensor, "p f"]:
         encoded: Tensor = self.encoding((self.bounds.normalized(positions) + 1) / 2, active)

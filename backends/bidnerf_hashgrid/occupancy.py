@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -72,9 +72,11 @@ class OccupancyGrid(nn.Module):
         self.observed = True
         cells = self.grid.numbers(positions)
         for known, values in ((self.peak, weights), (self.density, density)):
-            seen = torch.zeros_like(known).view(-1).scatter_reduce_(0, cells, values.to(known), "amax")
             flat = known.view(-1)
-            flat[cells] = torch.maximum(flat[cells] * fade, seen[cells])
+            flat.index_copy_(
+                0, cells, flat.index_select(0, cells) * fade
+            )  # once, however often it is visited
+            flat.scatter_reduce_(0, cells, values.to(known), "amax")
 
     @torch.no_grad()
     def prune(self, threshold: float, grow: bool = True) -> None:
@@ -100,11 +102,12 @@ class OccupancyGrid(nn.Module):
             return RaySamples(starts, ends, samples.valid.reshape(*shape, MOST))
         ray, start = self._busy_blocks(flat, spacing, near, far)
         steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
-        place = start[:, None] + steps + (offset[ray] * self.step)[:, None]
-        positions = _at(flat, ray, RaySpacing(spacing.exit[ray], spacing.radius).distance(place))
-        occupied = self.grid.at(self.occupied, positions) & self.grid.contains(positions)
-        kept = occupied & (place < far[ray][:, None])
-        samples = self._padded(place[kept], ray[:, None].expand_as(kept)[kept], near, far)
+        offsets, exits, ends = (part.index_select(0, ray) for part in (offset, spacing.exit, far))
+        place = start[:, None] + steps + (offsets * self.step)[:, None]
+        positions = _at(flat, RaySpacing(exits, spacing.radius).distance(place), ray)
+        block, step = (self._occupied_at(positions) & (place < ends[:, None])).nonzero(as_tuple=True)
+        kept = place.view(-1).index_select(0, block * BLOCK + step)
+        samples = self._padded(kept, ray.index_select(0, block), near, far)
         width = samples.valid.shape[-1]
         starts, ends = (
             spacing.distance(part).reshape(*shape, width) for part in (samples.starts, samples.ends)
@@ -122,7 +125,7 @@ class OccupancyGrid(nn.Module):
         steps = torch.arange(count, dtype=near.dtype, device=near.device)
         place = near[:, None] + (skipped[:, None] + steps + offset[:, None]) * self.step
         positions = rays.at(spacing.distance(place))
-        kept = self.grid.at(self.occupied, positions) & self.grid.contains(positions) & (place < far[:, None])
+        kept = self._occupied_at(positions) & (place < far[:, None])
         order = (~kept).sort(dim=-1, stable=True).indices[:, :MOST]
         place, kept = place.gather(-1, order), kept.gather(-1, order)
         middles = torch.where(kept, place, far[:, None])
@@ -132,6 +135,14 @@ class OccupancyGrid(nn.Module):
             kept = pad(kept, (0, missing))
         return self._intervals(middles, kept, kept.sum(-1), near, far)
 
+    def _occupied_at(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
+        """Return whether positions (metres, world) are within the grid, in an occupied cell."""
+        grid = self.grid
+        if grid.contracted is not None:  # once, and not in each look-up
+            positions = grid.contracted.normalized(positions)
+            grid = replace(grid, contracted=None)
+        return grid.at(self.occupied, positions) & grid.contains(positions)
+
     def _busy_blocks(
         self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor
     ) -> tuple[Tensor, Tensor]:
@@ -139,20 +150,17 @@ class OccupancyGrid(nn.Module):
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
         starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
-        positions = rays.at(spacing.distance(starts + length / 2))
-        ray, block = ((starts < far[:, None]) & self.grid.at(self.near_occupied, positions)).nonzero(
-            as_tuple=True
-        )
-        return ray, starts[ray, block]
+        positions = _at(rays, spacing.distance(starts + length / 2))
+        near_matter = self.grid.at(self.near_occupied, positions)
+        ray, block = ((starts < far[:, None]) & near_matter).nonzero(as_tuple=True)
+        return ray, starts.view(-1).index_select(0, ray * count + block)
 
     def _padded(self, place: Tensor, ray: Tensor, near: Tensor, far: Tensor) -> RaySamples:
         """Return the samples, gathered at the front of their ray's row; all rows are as long as the longest."""
         counts = torch.bincount(ray, minlength=len(near))
         width = int(counts.amax()) if len(near) else 0
-        slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-        middles = far[:, None].expand(-1, width).clone()
-        middles[ray, slot] = place
         valid = torch.arange(width, device=ray.device) < counts[:, None]
+        middles = far[:, None].expand(-1, width).masked_scatter(valid, place)
         return self._intervals(middles, valid, counts, near, far)
 
     def _intervals(
@@ -193,8 +201,17 @@ class GridDensity:
         return FieldValues(density, torch.zeros_like(positions))
 
 
-def _at(rays: Rays, ray: Int[Tensor, "b"], distance: Float[Tensor, "b s"]) -> Float[Tensor, "b s 3"]:
-    return rays.origins[ray][:, None] + distance[..., None] * rays.directions[ray][:, None]
+def _at(
+    rays: Rays, distance: Float[Tensor, "b s"], ray: Int[Tensor, "b"] | None = None
+) -> Float[Tensor, "b s 3"]:
+    """Return the positions at distances along the rays, or along those with the given numbers.
+
+    In memory, the positions of an axis are side by side: sums over rows of three numbers take ten times as long.
+    """
+    origins, directions = (part.t().contiguous() for part in (rays.origins, rays.directions))
+    if ray is not None:
+        origins, directions = origins.index_select(1, ray), directions.index_select(1, ray)
+    return (origins[..., None] + distance * directions[..., None]).movedim(0, -1)
 
 
 def _dilated(cells: Bool[Tensor, "n n n"], reach: int) -> Bool[Tensor, "n n n"]:

@@ -100,14 +100,19 @@ def _update(
     """Update the occupancy grid by one step's rendering."""
     samples, density = rendering.samples, rendering.density
     assert density is not None  # it comes from ``render``
-    valid = samples.valid
     # The weights that steps of the grid would have: samples are longer or shorter, as they are concentrated.
     place = grid.bounds.spacing(batch.rays).place
     weights = (
         rendering.weights.detach() * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)
     )
-    positions = batch.rays.at(samples.middles).detach()
-    grid.observe(positions[valid], weights[valid].clamp(max=1), density.detach()[valid], config.prune_fade)
-    grid.samples_per_ray.lerp_(valid.sum() / len(valid), 0.1 if step > 10 else 1.0)
+    ray, slot = samples.valid.nonzero(as_tuple=True)
+    index = ray * samples.valid.shape[1] + slot
+    middles, weights, density = (
+        part.detach().reshape(-1).index_select(0, index) for part in (samples.middles, weights, density)
+    )
+    origins, directions = (part.index_select(0, ray) for part in (batch.rays.origins, batch.rays.directions))
+    positions = origins + middles[:, None] * directions
+    grid.observe(positions, weights.clamp(max=1), density, config.prune_fade)
+    grid.samples_per_ray.lerp_(samples.valid.sum() / len(samples.valid), 0.1 if step > 10 else 1.0)
     if step >= config.prune_from and step % config.prune_every in (0, config.coarse_every - 1):
         grid.prune(config.prune_threshold, grow=step < config.grow_until * config.steps)

@@ -8,8 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier, Lock
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 THREADED = 4096  # points from which on several threads work
 
@@ -17,9 +15,9 @@ _pools: dict[int, ThreadPoolExecutor] = {}  # by number of threads
 _opening = Lock()
 
 
-def threads_for(points: Float[Tensor, "3 n"]) -> int:
-    """Return how many threads work on ``points``: one on a GPU, and where there is not work enough for a second."""
-    worth = points.device.type == "cpu" and points.shape[1] >= THREADED
+def threads_for(points: int, device: torch.device) -> int:
+    """Return how many threads work on so many points: one on a GPU, and where there is not work enough for a second."""
+    worth = device.type == "cpu" and points >= THREADED
     return torch.get_num_threads() if worth else 1
 
 

@@ -1,0 +1,178 @@
+"""The two networks of a field (Mueller et al. 2022, section 5.4), evaluated and differentiated in chunks of points on a CPU.
+
+The hidden units of a whole batch are tens of megabytes. In chunks they are computed, rectified and differentiated while they are
+in the cache, and the large blocks of memory that the system would hand out and take back in each step are not needed. Chunks run
+on several threads. The gradients of the weights are summed in the order of the chunks, so that they do not depend on the number
+of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from bidnerf_hashgrid.threads import concurrently, threads_for
+
+CPU_CHUNK = 4096
+
+Layers = list[tuple[Tensor, Tensor]]
+"""Weight (out in) and bias (out) of linear layers with rectifiers between them."""
+
+
+class _Networks(NamedTuple):
+    """The layers of both networks, or the gradients of these."""
+
+    geometry: Layers
+    colour: Layers
+
+
+class _Chunk(NamedTuple):
+    """What both networks computed for m points: the inputs of their layers, and their results."""
+
+    geometry: list[Tensor]
+    colour: list[Tensor]
+    log_density: Float[Tensor, "m"]
+    rgb: Float[Tensor, "m 3"]
+
+
+def log_density_and_rgb(
+    geometry: nn.Sequential, colour: nn.Sequential, encoded: Float[Tensor, "n e"], harmonics: Float[Tensor, "n h"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:  # fmt: skip
+    """Return the first output of ``geometry``, and ``colour`` of its other outputs and of ``harmonics``.
+
+    Both are linear layers with rectifiers between them, ``colour`` with a sigmoid at its end. On a CPU, the results cannot be
+    differentiated twice.
+    """
+    if encoded.device.type != "cpu":
+        features = geometry(encoded)
+        return features[:, 0], colour(torch.cat([features[:, 1:], harmonics], dim=-1))
+    parts = [list(network.parameters()) for network in (geometry, colour)]
+    inputs = [encoded, harmonics, *parts[0], *parts[1]]
+    differentiable = torch.is_grad_enabled() and any(part.requires_grad for part in inputs)
+    found: tuple[Tensor, Tensor] = _Evaluate.apply(differentiable, len(parts[0]) // 2, *inputs)
+    return found
+
+
+def _networks(flat: Sequence[Tensor], geometry_layers: int) -> _Networks:
+    layers = list(zip(flat[::2], flat[1::2], strict=True))
+    return _Networks(layers[:geometry_layers], layers[geometry_layers:])
+
+
+def _forward(x: Float[Tensor, "m i"], layers: Layers) -> tuple[list[Tensor], Float[Tensor, "m o"]]:
+    """Return the inputs of all layers, and the output of the last."""
+    inputs: list[Tensor] = []
+    for weight, bias in layers:
+        inputs.append(x.relu_() if inputs else x)
+        x = torch.addmm(bias, x, weight.t())
+    return inputs, x
+
+
+def _backward(
+    gradient: Float[Tensor, "m o"], inputs: list[Tensor], layers: Layers, to_layers: Layers | None
+) -> Float[Tensor, "m i"]:
+    """Return the gradient to the first input, and write those to the layers."""
+    for k in reversed(range(len(layers))):
+        if to_layers is not None:
+            torch.mm(gradient.t(), inputs[k], out=to_layers[k][0])
+            torch.sum(gradient, 0, out=to_layers[k][1])
+        gradient = gradient @ layers[k][0]
+        if k:
+            gradient = torch.ops.aten.threshold_backward(gradient, inputs[k], 0)
+    return gradient
+
+
+def _evaluate(encoded: Float[Tensor, "m e"], harmonics: Float[Tensor, "m h"], networks: _Networks) -> _Chunk:
+    inputs, features = _forward(encoded, networks.geometry)
+    of_colour, logits = _forward(torch.cat([features[:, 1:], harmonics], dim=-1), networks.colour)
+    return _Chunk(inputs, of_colour, features[:, 0], logits.sigmoid_())
+
+
+def _differentiate(
+    chunk: _Chunk,
+    to_log_density: Float[Tensor, "m"],
+    to_rgb: Float[Tensor, "m 3"],
+    networks: _Networks,
+    to_networks: _Networks | None,
+) -> tuple[Float[Tensor, "m e"], Float[Tensor, "m h"]]:
+    """Return the gradients to the encoding and to the harmonics, and write those to the layers."""
+    to_logits = to_rgb * (chunk.rgb * (1 - chunk.rgb))
+    gradient = _backward(to_logits, chunk.colour, networks.colour, to_networks and to_networks.colour)
+    passed = len(networks.geometry[-1][1]) - 1  # features that go from one network to the other
+    to_features = torch.cat([to_log_density[:, None], gradient[:, :passed]], dim=-1)
+    to_encoded = _backward(
+        to_features, chunk.geometry, networks.geometry, to_networks and to_networks.geometry
+    )
+    return to_encoded, gradient[:, passed:]
+
+
+def _chunks(count: int) -> list[slice]:
+    return [slice(start, min(start + CPU_CHUNK, count)) for start in range(0, count, CPU_CHUNK)]
+
+
+class _Evaluate(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, differentiable: bool, geometry_layers: int, encoded: Float[Tensor, "n e"], harmonics: Float[Tensor, "n h"],
+        *flat: Tensor,
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:  # fmt: skip
+        networks, chunks = _networks(flat, geometry_layers), _chunks(len(encoded))
+        log_density, rgb = encoded.new_empty(len(encoded)), encoded.new_empty(len(encoded), 3)
+        kept: list[list[Tensor]] = [[] for _ in chunks]
+
+        def evaluate(chunk: slice, keep: list[Tensor]) -> None:
+            found = _evaluate(encoded[chunk], harmonics[chunk], networks)
+            log_density[chunk], rgb[chunk] = found.log_density, found.rgb
+            if differentiable:
+                keep.extend([*found.geometry[1:], *found.colour])
+
+        tasks = [partial(evaluate, chunk, keep) for chunk, keep in zip(chunks, kept, strict=True)]
+        concurrently(tasks, threads_for(len(encoded), encoded.device))
+        ctx.geometry_layers = geometry_layers
+        ctx.save_for_backward(encoded, rgb, *flat, *(part for keep in kept for part in keep))
+        return log_density, rgb
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, to_log_density: Float[Tensor, "n"], to_rgb: Float[Tensor, "n 3"]
+    ) -> tuple[Tensor | None, ...]:
+        _, _, wants_encoded, wants_harmonics, *wanted = ctx.needs_input_grad
+        encoded, rgb, *rest = ctx.saved_tensors
+        flat, inputs = rest[: len(wanted)], rest[len(wanted) :]
+        networks, chunks = _networks(flat, ctx.geometry_layers), _chunks(len(encoded))
+        each = len(inputs) // max(len(chunks), 1)
+        width = networks.colour[0][0].shape[1] - len(networks.geometry[-1][1]) + 1
+        to_encoded = torch.empty_like(encoded) if wants_encoded else None
+        to_harmonics = encoded.new_empty(len(encoded), width) if wants_harmonics else None
+        sizes = [part.numel() for part in flat]
+        # Gradients to all layers, a row a chunk.
+        sums = encoded.new_empty(len(chunks), sum(sizes)) if any(wanted) else None
+
+        def differentiate(number: int) -> None:
+            own, at = inputs[number * each : (number + 1) * each], chunks[number]
+            split = ctx.geometry_layers - 1
+            chunk = _Chunk([encoded[at], *own[:split]], own[split:], to_log_density[at], rgb[at])
+            to_networks = None
+            if sums is not None:
+                rows = [
+                    row.view(part.shape) for row, part in zip(sums[number].split(sizes), flat, strict=True)
+                ]
+                to_networks = _networks(rows, ctx.geometry_layers)
+            found = _differentiate(chunk, to_log_density[at], to_rgb[at], networks, to_networks)
+            for target, part in zip((to_encoded, to_harmonics), found, strict=True):
+                if target is not None:
+                    target[at] = part
+
+        concurrently(
+            [partial(differentiate, k) for k in range(len(chunks))], threads_for(len(encoded), encoded.device)
+        )
+        to_flat: Sequence[Tensor | None] = [None] * len(flat)
+        if sums is not None:
+            to_flat = [row.view(part.shape) for row, part in zip(sums.sum(0).split(sizes), flat, strict=True)]
+        return None, None, to_encoded, to_harmonics, *to_flat
