@@ -68,7 +68,7 @@ def surface_covariance(
 
 def scale_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
     """Return the update about the cloud's pivot that keeps it in place while depths grow by 100 %, metres."""
-    return torch.cat([-cloud.middle.double(), torch.zeros(3, dtype=torch.float64)])
+    return torch.cat([-cloud.middle.double().cpu(), torch.zeros(3, dtype=torch.float64)])
 
 
 def without_direction(information: Float[Tensor, "6 6"], slope: Float[Tensor, "6"]) -> Float[Tensor, "6 6"]:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
+from torch import nn
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.moving import moved
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
 _Item = TypeVar("_Item")
+_Map = TypeVar("_Map", bound="SceneMap")
 
 
 @runtime_checkable
@@ -31,6 +35,27 @@ class SceneMap(Protocol):
 
     @property
     def surface(self) -> SurfaceMap | None: ...
+
+
+def on_device(scene: _Map, device: torch.device | str) -> _Map:
+    """Return a map whose field, surface and landmarks lie on ``device``; the one given is left as it is.
+
+    Raises ``InputError`` where the field cannot be moved.
+    """
+    field = scene.field
+    if not isinstance(field, nn.Module):
+        raise InputError(
+            f"device {device}: the map's field is a {type(field).__name__}, expected an nn.Module"
+        )
+    parts = {name: getattr(scene, name, None) for name in ("field", "surface", "landmarks")}
+    there = moved(parts, device)
+    if there is parts:
+        return scene
+    found = copy.copy(scene)
+    for name, part in there.items():
+        if part is not parts[name]:
+            object.__setattr__(found, name, part)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
