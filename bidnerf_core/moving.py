@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import torch
@@ -30,10 +30,9 @@ def _moved(value: Any, device: torch.device) -> Any:
     if isinstance(value, Tensor):
         return value if _is_on(value, device) else value.to(device)
     if is_dataclass(value) and not isinstance(value, type):
-        parts = {part.name: getattr(value, part.name) for part in fields(value) if part.init}
-        there = {name: _moved(part, device) for name, part in parts.items()}
-        changed = {name: part for name, part in there.items() if part is not parts[name]}
-        return replace(value, **changed) if changed else value
+        parts = {part.name: getattr(value, part.name) for part in fields(value)}
+        there = _moved(parts, device)
+        return value if there is parts else _with_fields(value, there)
     if isinstance(value, dict):
         content = {key: _moved(part, device) for key, part in value.items()}
         return content if any(content[key] is not value[key] for key in value) else value
@@ -42,6 +41,14 @@ def _moved(value: Any, device: torch.device) -> Any:
         same = all(new is old for new, old in zip(items, value, strict=True))
         return value if same else type(value)(items)
     return value
+
+
+def _with_fields(value: Any, parts: dict[str, Any]) -> Any:
+    """Return another dataclass of the same kind with these fields, those that its constructor does not take among them."""
+    found = object.__new__(type(value))
+    for name, part in parts.items():
+        object.__setattr__(found, name, part)
+    return found
 
 
 def _is_on(tensor: Tensor, device: torch.device) -> bool:

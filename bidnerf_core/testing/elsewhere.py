@@ -41,7 +41,8 @@ READS = {
     "linalg_lstsq": "is a factorization that waits for the device",
 }
 """Operations that make the host wait, by name."""
-UNCHECKED = {"linalg_inv_ex", "linalg_cholesky_ex", "linalg_lu_factor_ex"}
+INDEXED = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index")
+"""Operations with indices, which may be masks."""
 
 
 class DeviceFault(AssertionError):
@@ -85,7 +86,7 @@ class _There(torch.Tensor):
 
 
 class Elsewhere(TorchDispatchMode):
-    """Makes ``DEVICE`` usable. Faults raise within ``strict()``; outside of it, tensors may be moved and read."""
+    """Makes ``DEVICE`` usable. Faults raise within ``strict()``; outside of it, tensors may be moved and read, not mixed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -128,7 +129,8 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
     if not there and not made_there:
         return func(*args, **kwargs)
     if strict:
-        _check(func, args, kwargs, flat, there, wanted)
+        _check_waiting(func, args, flat, there, wanted)
+    _check_mixing(func, args, flat, there)
     if made_there or func is _aten._to_copy.default:
         kwargs = kwargs | {"device": torch.device("cpu")}
     plain_args, plain_kwargs = tree_map(_values, (args, kwargs))
@@ -152,14 +154,12 @@ def _wrapped(func: Any, args: Any, kwargs: dict[str, Any], found: Any) -> Any:
     return tree_map(lambda part: _There(part) if type(part) is Tensor else part, found)
 
 
-def _check(
-    func: Any, args: Any, kwargs: dict[str, Any], flat: list[Any], there: bool, wanted: torch.device | None
-) -> None:
+def _check_waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: torch.device | None) -> None:
+    """Raise ``DeviceFault`` for copies and for what the host would wait for."""
     name = func._schema.name.removeprefix("aten::")
     if there and name in READS:
         raise DeviceFault(f"{name} {READS[name]}: the host waits for the device")
-    tensors = [part for part in flat if isinstance(part, Tensor)]
-    here = [part for part in tensors if not isinstance(part, _There)]
+    here = [part for part in flat if isinstance(part, Tensor) and not isinstance(part, _There)]
     if name in ("_to_copy", "copy_"):
         target = wanted.type if wanted is not None else args[0].device.type
         if name == "copy_" and here:
@@ -167,12 +167,25 @@ def _check(
         if name == "_to_copy" and there != (target == DEVICE.type):
             raise DeviceFault(f"a tensor of shape {tuple(args[0].shape)} is copied between devices")
         return
-    masks = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index")
-    if name in masks and any(i is not None and i.dtype == torch.bool for i in args[1]):
+    if name in INDEXED and any(i is not None and i.dtype == torch.bool for i in args[1]):
         raise DeviceFault(
             "an index by a mask has a size that depends on values: the host waits for the device"
         )
-    if there and any(part.ndim > 0 for part in here):
+    if there and name in INDEXED and any(part.ndim > 0 for part in here):
+        raise DeviceFault(f"{name} copies an index between devices")
+
+
+def _check_mixing(func: Any, args: Any, flat: list[Any], there: bool) -> None:
+    """Raise ``DeviceFault`` for tensors of both devices in one operation, but for what PyTorch moves by itself: numbers, and
+    the indices of a tensor on the device.
+    """
+    name = func._schema.name.removeprefix("aten::")
+    if not there or name in ("_to_copy", "copy_"):
+        return
+    if name in INDEXED and isinstance(args[0], _There):
+        flat = tree_flatten(args[2:])[0]
+    here = [part for part in flat if isinstance(part, Tensor) and not isinstance(part, _There)]
+    if any(part.ndim > 0 for part in here):
         shapes = ", ".join(str(tuple(part.shape)) for part in here if part.ndim > 0)
         raise DeviceFault(f"{name} mixes devices: a tensor of shape {shapes} is on the CPU")
 

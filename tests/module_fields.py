@@ -1,8 +1,9 @@
-"""A closed-form field as a module, and a map of what it shows, for tests that move maps to another device."""
+"""Closed-form fields as modules, and a map of one, for tests that move maps to another device."""
 
 from __future__ import annotations
 
 import functools
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -11,36 +12,36 @@ import baked
 from bidnerf_core.field import FieldValues, RaySampler
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping import SurfaceMap, bake
+from bidnerf_core.moving import moved
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.se3 import SE3
-
-NAMES = ("centres", "widths", "densities", "waves")
 
 
-class BlobField(nn.Module):
-    """Gaussian blobs whose tensors are buffers."""
+class AsModule(nn.Module):
+    """A closed-form field, a dataclass of tensors, as a module that moves with its tensors."""
 
-    def __init__(self, blobs: GaussianBlobs) -> None:
+    def __init__(self, closed_form: Any) -> None:
         super().__init__()
-        self.blobs_sampler = blobs.sampler
-        for name in NAMES:
-            self.register_buffer(name, getattr(blobs, name).float())
+        self.closed_form = closed_form
+        self.register_buffer("place", torch.zeros(()))
 
     @property
     def sampler(self) -> RaySampler:
-        return self.blobs_sampler
+        return cast(RaySampler, self.closed_form.sampler)
 
     def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
-        tensors = [getattr(self, name) for name in NAMES]
-        here = SE3.identity(positions.dtype, positions.device)
-        return GaussianBlobs(*tensors, here, self.blobs_sampler).query(positions, directions)
+        return cast(FieldValues, self.closed_form.query(positions, directions))
+
+    def _apply(self, *args: Any, **options: Any) -> AsModule:
+        super()._apply(*args, **options)
+        self.closed_form = moved(self.closed_form, self.place.device)
+        return self
 
 
 @functools.cache
-def field() -> BlobField:
-    return BlobField(GaussianBlobs.random(density=1000.0))
+def field() -> AsModule:
+    return AsModule(GaussianBlobs.random(density=1000.0))
 
 
 @functools.cache
