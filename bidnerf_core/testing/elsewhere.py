@@ -8,14 +8,13 @@ depend on values (``nonzero``, indexing by a mask), and tensors of both devices 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map
 
 from bidnerf_core import constants
 
@@ -117,7 +116,7 @@ class Elsewhere(TorchDispatchMode):
 
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
-    flat = tree_flatten((args, kwargs))[0]
+    flat = _leaves((args, kwargs))
     there = any(isinstance(part, _There) for part in flat)
     asked = kwargs.get("device")
     wanted = None if asked is None else torch.device(asked)
@@ -133,7 +132,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
     _check_mixing(func, args, flat, there)
     if made_there or func is _aten._to_copy.default:
         kwargs = kwargs | {"device": torch.device("cpu")}
-    plain_args, plain_kwargs = tree_map(_values, (args, kwargs))
+    plain_args, plain_kwargs = _mapped(_values, (args, kwargs))
     found = func(*plain_args, **plain_kwargs)
     to_host = wanted is not None and wanted.type == "cpu"
     if to_host:
@@ -151,7 +150,7 @@ def _wrapped(func: Any, args: Any, kwargs: dict[str, Any], found: Any) -> Any:
     ]
     if aliases and schema.returns:
         return aliases[0] if len(schema.returns) == 1 else tuple(aliases)
-    return tree_map(lambda part: _There(part) if type(part) is Tensor else part, found)
+    return _mapped(lambda part: _There(part) if type(part) is Tensor else part, found)
 
 
 def _check_waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: torch.device | None) -> None:
@@ -183,11 +182,31 @@ def _check_mixing(func: Any, args: Any, flat: list[Any], there: bool) -> None:
     if not there or name in ("_to_copy", "copy_"):
         return
     if name in INDEXED and isinstance(args[0], _There):
-        flat = tree_flatten(args[2:])[0]
+        flat = _leaves(args[2:])
     here = [part for part in flat if isinstance(part, Tensor) and not isinstance(part, _There)]
     if any(part.ndim > 0 for part in here):
         shapes = ", ".join(str(tuple(part.shape)) for part in here if part.ndim > 0)
         raise DeviceFault(f"{name} mixes devices: a tensor of shape {shapes} is on the CPU")
+
+
+def _leaves(parts: Any) -> list[Any]:
+    """Return what lists, tuples and dictionaries hold."""
+    found: list[Any] = []
+    for part in parts.values() if isinstance(parts, dict) else parts:
+        if isinstance(part, list | tuple | dict):
+            found += _leaves(part)
+        else:
+            found.append(part)
+    return found
+
+
+def _mapped(function: Callable[[Any], Any], parts: Any) -> Any:
+    """Return ``parts`` with ``function`` applied to what lists, tuples and dictionaries hold. PyTorch's trees are slower."""
+    if isinstance(parts, dict):
+        return {key: _mapped(function, part) for key, part in parts.items()}
+    if isinstance(parts, list | tuple):
+        return type(parts)([_mapped(function, part) for part in parts])
+    return function(parts)
 
 
 def _values(part: Any) -> Any:
