@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -45,6 +47,7 @@ def test_no_landmarks_at_all_are_a_map(landmarks: LandmarkMap) -> None:
         ("sizes", lambda v: -1 - v, "sizes is"),
         ("views", lambda v: v - v, "views is"),
         ("noise", torch.zeros_like, "noise is 0"),
+        ("usual_matches", lambda v: v - 1, "usual_matches is -1"),
         ("pose_covariance", lambda v: v - torch.eye(6), "positive semidefinite"),
         ("pose_covariance", lambda v: v + torch.arange(6.0), "symmetric"),
     ],
@@ -61,3 +64,13 @@ def test_a_missing_tensor_is_named(landmarks: LandmarkMap, name: str) -> None:
     del tensors[name]
     with pytest.raises(KeyError, match=name):
         landmarks_from_tensors(tensors)
+
+
+def test_correlation_grows_with_the_square_root_of_the_matches_where_the_usual_number_is_known(
+    landmarks: LandmarkMap,
+) -> None:
+    unknown = replace(landmarks, correlation=17.0)
+    assert unknown.correlation_of(25) == unknown.correlation_of(400) == 17
+    known = replace(unknown, usual_matches=400.0)
+    assert [known.correlation_of(n) for n in (0, 25, 100, 400, 1600)] == [1, 5, 9, 17, 33]
+    assert replace(known, correlation=1.0).correlation_of(25) == 1

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from bidnerf_core import Localizer, Outcome, View
+from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.mirrored import mirror_evidence, mirror_image
+from bidnerf_core.localization.search.mirrored import (
+    MirrorEvidence,
+    mirror_evidence,
+    mirror_image,
+    unguided_log10_nfa,
+)
 from textured_field import textured_map, unseen
 
 
@@ -37,8 +44,38 @@ def test_only_the_mirror_image_of_a_mirror_image_matches() -> None:
     right, wrong = (mirror_evidence(matcher(), [view]) for view in (in_a_mirror(), photo()))
     assert right.log10_nfa < -50
     assert right.log10_nfa < wrong.log10_nfa - 40
-    assert right.contradicts(wrong.log10_nfa)
-    assert not wrong.contradicts(right.log10_nfa)
+    judged = right.rejection(wrong.log10_nfa)
+    assert judged is not None
+    assert judged.outcome is Outcome.MIRRORED
+    assert wrong.rejection(right.log10_nfa) is None
+
+
+@pytest.mark.parametrize(
+    ("image", "mirror", "expected"),
+    [
+        (-20.0, -29.0, None),  # a mirror image that matches by chance says nothing
+        (-10.0, -31.0, Outcome.MIRRORED),
+        (-40.0, -81.0, Outcome.MIRRORED),
+        (-40.0, -79.0, Outcome.AMBIGUOUS),
+        (-59.0, -40.0, Outcome.AMBIGUOUS),
+        (-61.0, -40.0, None),
+    ],
+)
+def test_an_image_is_rejected_unless_it_matches_much_better_than_its_mirror_image(
+    image: float, mirror: float, expected: Outcome | None
+) -> None:
+    judged = MirrorEvidence(30, mirror).rejection(image)
+    assert (judged and judged.outcome) is expected
+
+
+def test_a_right_pose_has_the_evidence_of_its_matches_and_a_wrong_one_has_none() -> None:
+    view = photo()
+    found = propose(matcher(), [view])
+    assert found is not None
+    T = found.T_world_camera
+    assert unguided_log10_nfa(matcher(), [view], T) < 0.8 * found.log10_nfa
+    turned = T.retract(torch.tensor([0, 0, 0, 0, 0, 0.5], dtype=torch.float64))
+    assert unguided_log10_nfa(matcher(), [view], turned) > -10
 
 
 def test_auto_rejects_a_mirror_image_and_accepts_the_photo() -> None:

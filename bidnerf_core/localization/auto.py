@@ -44,7 +44,7 @@ from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence
+from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence, unguided_log10_nfa
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
@@ -53,6 +53,8 @@ FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
 """Reasons for which landmarks reject a pose that nothing else can put right: with wrong intrinsics, the surface is not found at
 the right place either.
 """
+VAGUE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
+"""Reasons for which landmarks reject a pose that they found, as opposed to one that they hardly tell."""
 TRUSTED = 0.8
 """Confidence from which on a pose by landmarks is not compared with the surface."""
 FEWER = 0.05
@@ -116,9 +118,12 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         found = _by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
         found = without_the_imprecise(found, typical)
-    return (
-        found if matcher is None else _compared_with_landmarks(found, problem, matcher, config, seed, began)
-    )
+    if matcher is None:
+        return found
+    found = _compared_with_landmarks(found, problem, matcher, config, seed, began)
+    if answer is not None and found.outcome is Outcome.TOO_FEW_MATCHES and answer.verdict.outcome in VAGUE:
+        return localization_by_landmarks(problem, answer, began)
+    return found
 
 
 def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
@@ -144,9 +149,7 @@ def _mirror_rejection(
     """Return why a pose with this evidence is rejected if the mirror image of the query fits better, else None."""
     if log10_nfa < SUSPICIOUS:
         return None
-    twin = mirror_evidence(matcher, problem.views, seed=seed)
-    why = f"{twin.agreeing} landmarks agree with the mirror image"
-    return Verdict(Outcome.MIRRORED, why) if twin.contradicts(log10_nfa) else None
+    return mirror_evidence(matcher, problem.views, seed=seed).rejection(log10_nfa)
 
 
 def _compared_with_landmarks(
@@ -164,7 +167,8 @@ def _compared_with_landmarks(
         if found.converged and _leaves_surface(problem, found, answer):
             return replace(found, seconds=time.perf_counter() - began)
         refined = localization_by_landmarks(problem, answer, began)
-        twin = _mirror_rejection(problem, matcher, near.pose.log10_nfa, seed)
+        evidence = unguided_log10_nfa(matcher, problem.views, near.pose.T_world_camera)
+        twin = _mirror_rejection(problem, matcher, evidence, seed)
         supported = (
             twin is None
             and found.converged

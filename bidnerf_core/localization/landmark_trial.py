@@ -45,6 +45,11 @@ class _Answer:
     found: LandmarkPose
     update: Float[Tensor, "6"]  # right update from the given pose to the one found
 
+    @property
+    def matches(self) -> int:
+        """The number of correspondences that the pose was refined on."""
+        return len(self.found.correspondences)
+
 
 def build_tried_landmarks(
     views: Sequence[View],
@@ -66,7 +71,7 @@ def tried_landmarks(
 ) -> LandmarkMap:
     """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on images that are held out.
 
-    The trial sets ``correlation``, ``calibration_scatter`` and ``trial`` of the landmarks. Raises ``InputError`` if there
+    The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks. Raises ``InputError`` if there
     are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
@@ -75,9 +80,10 @@ def tried_landmarks(
     landmarks = replace(landmarks, trial=_trial(answers, len(held_out)))
     if len(answers) < ENOUGH_ANSWERS:
         return landmarks
-    correlation = _correlation(answers, landmarks.pose_covariance)
-    scatter = _calibration_scatter(answers, correlation)
-    return replace(landmarks, correlation=correlation, calibration_scatter=scatter)
+    usual = float(torch.tensor([float(answer.matches) for answer in answers]).median())
+    landmarks = replace(landmarks, usual_matches=usual)
+    landmarks = replace(landmarks, correlation=_correlation(answers, landmarks))
+    return replace(landmarks, calibration_scatter=_calibration_scatter(answers, landmarks))
 
 
 def _held_out(count: int) -> list[int]:
@@ -121,27 +127,34 @@ def _trial(answers: Sequence[_Answer], images: int) -> HeldOutTrial:
     )
 
 
-def _correlation(answers: Sequence[_Answer], pose_covariance: Float[Tensor, "6 6"]) -> float:
-    """Return the factor on the covariances of the fits with which the errors have the size that they should have."""
+def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
+    """Return the ``correlation`` with which the errors have the size that the covariances of the fits say."""
     updates = torch.stack([answer.update for answer in answers])
     covariances = torch.stack([answer.found.covariance for answer in answers])
     expected = float(chi2.ppf(QUANTILE, 6))
     low, high = CORRELATIONS
     for _ in range(30):  # bisection, geometrically
         middle = (low * high) ** 0.5
-        information = torch.linalg.inv(middle * covariances + pose_covariance)
+        factors = _factors(answers, replace(landmarks, correlation=middle))
+        information = torch.linalg.inv(factors[:, None, None] * covariances + landmarks.pose_covariance)
         squared = torch.einsum("ni,nij,nj->n", updates, information, updates)
         low, high = (middle, high) if float(squared.quantile(QUANTILE)) > expected else (low, middle)
     return (low * high) ** 0.5
 
 
-def _calibration_scatter(answers: Sequence[_Answer], correlation: float) -> Float[Tensor, "4"]:
+def _factors(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
+    """Return the factors on the covariances of answers whose keypoints were taken to be independent."""
+    return torch.tensor([landmarks.correlation_of(answer.matches) for answer in answers], dtype=torch.float64)
+
+
+def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "4"]:
     """Return the standard deviations of the corrections that the images' right intrinsics seem to need.
 
     What the fits' own uncertainty explains is left out.
     """
     apparent = torch.stack([answer.found.miscalibration.apparent for answer in answers])
-    explained = correlation * torch.stack([a.found.miscalibration.noise for a in answers]).square()
+    noise = torch.stack([answer.found.miscalibration.noise for answer in answers])
+    explained = _factors(answers, landmarks)[:, None] * noise.square()
     low, high = torch.full((4,), 1e-5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
     for _ in range(30):
         middle = (low * high).sqrt()

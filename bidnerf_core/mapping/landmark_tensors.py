@@ -25,6 +25,7 @@ LANDMARK_KINDS = {
 """Shape (-1: any length) and dtype of each tensor."""
 LATER_KINDS = {
     "correlation": ((), torch.float64),
+    "usual_matches": ((), torch.float64),
     "calibration_scatter": ((4,), torch.float64),
     "trial": ((4,), torch.float64),  # the fields of ``HeldOutTrial`` in order
 }
@@ -59,7 +60,7 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
             raise ValueError(f"{name} holds NaN or infinity")
     _check_contents(tensors)
     parts: dict[str, Any] = {name: tensors[name] for name in present}
-    for name in {"noise", "correlation"} & present.keys():
+    for name in {"noise", "correlation", "usual_matches"} & present.keys():
         parts[name] = float(tensors[name])
     if "trial" in parts:
         images, found, translation, rotation_deg = parts["trial"].tolist()
@@ -78,6 +79,8 @@ def _check_contents(tensors: dict[str, Tensor]) -> None:
         raise ValueError(f"noise is {float(tensors['noise'])}, expected a positive number of pixels")
     if "correlation" in tensors and not float(tensors["correlation"]) > 0:
         raise ValueError(f"correlation is {float(tensors['correlation'])}, expected a positive number")
+    if "usual_matches" in tensors and not float(tensors["usual_matches"]) >= 0:
+        raise ValueError(f"usual_matches is {float(tensors['usual_matches'])}, expected 0 or more")
     if "calibration_scatter" in tensors and not bool((tensors["calibration_scatter"] > 0).all()):
         raise ValueError(
             f"calibration_scatter is {tensors['calibration_scatter'].tolist()}, expected positive"

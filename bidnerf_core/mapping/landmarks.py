@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -38,8 +39,10 @@ class LandmarkMap:
     # Covariance of the right updates (translation in metres first) from the given poses of the map's images to those that
     # the landmarks imply: the error that the source of the poses adds to a pose found by landmarks.
     pose_covariance: Float[Tensor, "6 6"]  # float64
-    # The number of keypoints of an image that count as one measurement, because their errors are correlated.
+    # The number of keypoints that count as one measurement in an image with ``usual_matches`` of them, because their errors are
+    # correlated; see ``correlation_of``.
     correlation: float = 10.0
+    usual_matches: float = 0.0  # median of the images of the map; 0 where it is not known
     # Standard deviations of the corrections of intrinsics that images of the map seem to need, although their intrinsics are
     # right: logarithm of the focal length, principal point (u, v) as a share of it, radial distortion. Float64.
     calibration_scatter: Float[Tensor, "4"] = field(
@@ -61,6 +64,16 @@ class LandmarkMap:
         poselib and scipy, for which ``LandmarkMatcher`` keeps a copy of the other tensors.
         """
         return moved(self, device)
+
+    def correlation_of(self, matches: int) -> float:
+        """Return the number of keypoints that count as one in an image with so many ``matches``.
+
+        Keypoints share errors with their neighbours, the more of them the denser they are: errors of images with few matches
+        are smaller than a constant number says. On several captures it grew with the square root of the matches.
+        """
+        if self.usual_matches <= 0:
+            return self.correlation
+        return 1 + max(self.correlation - 1, 0.0) * math.sqrt(matches / self.usual_matches)
 
     @property
     def megabytes(self) -> float:

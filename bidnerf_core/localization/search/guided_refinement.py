@@ -60,7 +60,7 @@ def refined_pose(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothes
     """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change."""
     most = usual_distance(query, inliers)
     start = Calibration(log_focal=math.log(first.focal_factor))
-    correlation = query.landmarks.correlation
+    correlation = query.landmarks.correlation_of(len(inliers))
     fit = resect(
         query.observed(inliers), first.T_world_rig, query.threshold / 2, query.prior, start, correlation
     )
@@ -78,16 +78,15 @@ def confirmed(query: LandmarkQuery, T_world_rig: SE3) -> GuidedPose | None:
     found = guided_matches(query.images, query.landmarks, T_world_rig, radius, MOST_DISTANCE)
     if len(found) < LEAST_GUIDED_MATCHES:
         return None
-    fit = resect(
-        query.observed(found), T_world_rig, radius / 2, query.prior, correlation=query.landmarks.correlation
-    )
+    correlation = query.landmarks.correlation_of(len(found))
+    fit = resect(query.observed(found), T_world_rig, radius / 2, query.prior, correlation=correlation)
     return _settled(query, fit, found, MOST_DISTANCE)
 
 
 def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches, most: float) -> GuidedPose:
     """Refine a pose on guided matches, with the given intrinsics unless the matches contradict them for certain."""
-    correlation = query.landmarks.correlation
     fit, found = _guided(query, query.prior, fit, found, most, RADII)
+    correlation = query.landmarks.correlation_of(len(found))
     free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
     taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate=query.prior.log_focal > 0)
     wrong = Miscalibration.of(free, query.landmarks, taken)
@@ -123,7 +122,8 @@ def _guided(
         if len(guided) < LEAST_GUIDED_MATCHES:
             break
         changed, found = _changed(guided, found), guided
-        fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, query.landmarks.correlation)
+        correlation = query.landmarks.correlation_of(len(found))
+        fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation)
         if changed <= UNCHANGED:
             break
     return fit, found

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.correspondences import query_images
 from bidnerf_core.localization.search.landmark_evidence import log10_agreement
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
@@ -21,9 +24,10 @@ KEYPOINTS = 700
 """Number of keypoints, the strongest of a mirrored image, that are matched."""
 SUSPICIOUS = -150.0
 """Logarithm of the number of false alarms below which an image is not compared with its mirror image."""
-SIGNIFICANT, DECISIVE = -30.0, 2.0
-"""Logarithm of the number of false alarms below which a mirror image is recognised, and how many times that of the image it
-has to be: symmetric things resemble their mirror images.
+SIGNIFICANT, DECISIVE, CLEAR = -30.0, 2.0, 1.5
+"""Logarithm of the number of false alarms below which a mirror image is recognised; how many times that of the image it has to
+be for the image to be mirrored; and how many times that of the mirror image that of the image has to be for it not to be.
+Symmetric things resemble their mirror images.
 """
 
 
@@ -34,9 +38,20 @@ class MirrorEvidence:
     agreeing: int
     log10_nfa: float  # logarithm of the number of such agreements expected by chance
 
-    def contradicts(self, log10_nfa: float) -> bool:
-        """Whether the mirror image is recognised, and matches much better than the image with this ``log10_nfa``."""
-        return self.log10_nfa < min(DECISIVE * log10_nfa, SIGNIFICANT)
+    def rejection(self, log10_nfa: float) -> Verdict | None:
+        """Return why a pose of the image with this ``log10_nfa`` is rejected, or None.
+
+        The image is mirrored if its mirror image is recognised and matches much better. If neither matches much better than
+        the other, the image does not tell.
+        """
+        if self.log10_nfa >= SIGNIFICANT:
+            return None
+        why = f"{self.agreeing} landmarks agree with the mirror image"
+        if self.log10_nfa < DECISIVE * log10_nfa:
+            return Verdict(Outcome.MIRRORED, why)
+        if log10_nfa > CLEAR * self.log10_nfa:
+            return Verdict(Outcome.AMBIGUOUS, f"{why}, about as well as with the image itself")
+        return None
 
 
 def mirror_evidence(
@@ -49,6 +64,20 @@ def mirror_evidence(
     found = sample_consensus(query.observed(matches), matches.view, query.threshold, seed)
     agreeing = 0 if found is None else int(found.inliers.sum())
     return MirrorEvidence(agreeing, log10_agreement(query, matches, agreeing))
+
+
+def unguided_log10_nfa(
+    matcher: LandmarkMatcher, views: Sequence[View], T_world_camera: SE3, features: Features = SIFT
+) -> float:
+    """Return the logarithm of the number of false alarms of a pose of the last of ``views`` by descriptors alone.
+
+    Unlike matches that were sought near the projections, it compares with the evidence for a mirror image.
+    """
+    last = [View(views[-1].frame, SE3.identity())]
+    query = LandmarkQuery(query_images(last, features), matcher.landmarks, FIXED)
+    matches = unguided_matches(query.images, matcher, KEYPOINTS)
+    off = torch.linalg.vector_norm(query.observed(matches).residuals(T_world_camera), dim=-1)
+    return log10_agreement(query, matches, int((off <= query.threshold).sum()))
 
 
 def mirror_image(frame: Frame) -> Frame:

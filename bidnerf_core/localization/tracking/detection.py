@@ -119,7 +119,8 @@ class LandmarkDetector:
         else:
             matches = guided_matches(query.images, query.landmarks, T, radius, most_distance)
         points = FollowedPoints.of_landmarks(query.landmarks, matches.landmark, query.pixels(matches))
-        found = fit_pose(points.observed(frame), T, noise, query.threshold, self.landmarks.correlation)
+        correlation = self.landmarks.correlation_of(len(points))
+        found = fit_pose(points.observed(frame), T, noise, query.threshold, correlation)
         if found is None or not bool(found.inliers.any()):
             return None
         return points, found, usual_distance(query, matches[found.inliers])
@@ -143,7 +144,7 @@ class LandmarkDetector:
         """Judge the given intrinsics by those that fit the landmarks best."""
         free = resect(
             found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL, GIVEN,
-            self.landmarks.correlation,
+            self.landmarks.correlation_of(int(found.inliers.sum())),
         )  # fmt: skip
         return Miscalibration.of(free, self.landmarks, TakenIntrinsics())
 

@@ -98,18 +98,14 @@ class ByLandmarks:
     detector: LandmarkDetector
     config: TrackerConfig
 
-    @property
-    def correlation(self) -> float:
-        """The number of landmarks in an image that count as one measurement."""
-        return self.detector.landmarks.correlation
-
     def __call__(
         self, frame: Frame, image: Grey, state: TrackerState, points: FollowedPoints, predicted: Motion
     ) -> Measurement | None:
         """Return the pose by landmarks, fused with measured depth; None if too few are seen for any pose."""
         threshold = pixel_threshold(frame.intrinsics)
+        correlation = self.detector.landmarks.correlation_of(len(points))
         found = fit_pose(
-            points.observed(frame), predicted.T_world_camera, state.noise, threshold, self.correlation
+            points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation
         )
         judged = measured = None
         state = replace(state, age=state.age + 1)
@@ -215,7 +211,9 @@ class ByLandmarks:
 
     def _estimate(self, found: LandmarkPose) -> PoseEstimate:
         """Split a pose's covariance: errors that the landmarks of an image have in common are those of the next image, too."""
-        noise = (found.covariance - self.detector.landmarks.pose_covariance) / self.correlation
+        landmarks = self.detector.landmarks
+        correlation = landmarks.correlation_of(len(found.correspondences))
+        noise = (found.covariance - landmarks.pose_covariance) / correlation
         return PoseEstimate(found.T_world_camera, noise, found.full_covariance - noise)
 
     def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:

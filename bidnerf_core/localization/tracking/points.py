@@ -109,8 +109,8 @@ def fit_pose(
 ) -> PointFit | None:
     """Return the pose that the points in one camera determine, from a start; None if they are too few.
 
-    ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. Where most points do not agree with the robust fit, a
-    consensus of samples within ``threshold`` pixels replaces the start.
+    ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. Where
+    most points do not agree with the robust fit, a consensus of samples within ``threshold`` pixels replaces the start.
     """
     if len(data) < LEAST_FOLLOWED:
         return None
