@@ -1,9 +1,9 @@
 """A pretended device, which proves on any machine that code neither copies between devices nor waits for one.
 
 Tensors on the device "meta" stand for those on a GPU. While ``Elsewhere`` is active they hold values, which are kept and
-computed on the CPU, so that code runs as it does elsewhere; but what a GPU forbids or makes the host wait for raises
-``DeviceFault``: copies to and from the CPU, numbers read from a tensor (``float``, ``bool``, ``item``, ``tolist``), sizes that
-depend on values (``nonzero``, indexing by a mask), and tensors of both devices in one operation.
+computed on the CPU, so that code runs as it does elsewhere; but tensors of both devices in one operation, which a GPU forbids,
+raise ``DeviceFault``. So does, while ``strict``, what makes the host wait for it: copies to and from the CPU, numbers read from a
+tensor (``float``, ``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask).
 """
 
 from __future__ import annotations
