@@ -59,16 +59,19 @@ class SearchResult:
 
 
 def search(
-    start: SE3, stages: Iterable[SearchStage], distinct: Distinct, keep_runner_up: bool, device: torch.device
-) -> SearchResult:
-    """Run the stages on the hypotheses ``start`` (h), on ``device``, and return the poses that remain.
+    start: SE3, stages: Iterable[SearchStage], distinct: Distinct, keep_runner_up: bool,
+    device: torch.device | None = None,
+) -> SearchResult:  # fmt: skip
+    """Run the stages on the hypotheses ``start`` (h) and return the poses that remain.
+
+    Steps are taken on ``device``, by default where the hypotheses lie.
 
     With ``keep_runner_up``, if the best poses of a stage are all the same answer, the last of them is replaced by the best
     different one, and the margin is that of the last stage. Without it, the margin is that of the last stage that still had
     different poses. The host waits for the device between stages, but not within one.
     """
-    T = start.to(device)
-    distinct = moved(distinct, device)
+    device = start.device if device is None else device
+    T, distinct = start.to(device), moved(distinct, device)
     paths, margin = [T[None]], math.inf
     losses = [torch.zeros((0, len(T.translation)), dtype=torch.float64, device=device)]
     scores = losses[0]
