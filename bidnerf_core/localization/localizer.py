@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.constants import constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only, has_distances
 from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
-from bidnerf_core.localization.problem import SceneMap, on_device, rig
+from bidnerf_core.localization.problem import SceneMap, device_of, on_device, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.observations import Observations
@@ -93,11 +94,10 @@ class Localizer:
     def _warm_up(self) -> None:
         """Render some rays and fill the caches of the surface, so that lazy initialisation does not delay the first call."""
         bounds, field = self.map.bounds, self.map.field
-        device = next((p.device for p in getattr(field, "parameters", list)()), torch.device("cpu"))
-        middle = torch.tensor([bounds.lower, bounds.upper], device=device).mean(0)
         directions = torch.nn.functional.normalize(
             torch.randn((WARM_UP_RAYS, 3), generator=torch.Generator().manual_seed(0)), dim=-1
-        ).to(device)
+        ).to(device_of(field))
+        middle = constant(bounds.centre, directions)
         render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
         if self.map.surface is not None:
             self.map.surface.warm_up()

@@ -37,6 +37,15 @@ class SceneMap(Protocol):
     def surface(self) -> SurfaceMap | None: ...
 
 
+def device_of(field: RadianceField) -> torch.device:
+    """Return the device of a field's parameters or buffers; the CPU for a field that has none."""
+    for kind in ("parameters", "buffers"):
+        first = next(iter(getattr(field, kind, tuple)()), None)
+        if isinstance(first, torch.Tensor):
+            return first.device
+    return torch.device("cpu")
+
+
 def on_device(scene: _Map, device: torch.device | str) -> _Map:
     """Return a map whose field, surface and landmarks lie on ``device``; the one given is left as it is.
 
@@ -96,11 +105,7 @@ class Problem:
     @property
     def device(self) -> torch.device:
         """The device on which the field computes; rays are moved there."""
-        for kind in ("parameters", "buffers"):
-            first = next(iter(getattr(self.field, kind, tuple)()), None)
-            if isinstance(first, torch.Tensor):
-                return first.device
-        return torch.device("cpu")
+        return device_of(self.field)
 
     def level(self, number: int | None) -> RadianceField:
         """Return a level of the field: 0 is the coarsest, -1 the finest, None the field itself."""
