@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from statistics import median
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import View
@@ -42,11 +44,17 @@ class StoredCamera:
         return all(len(part) == 4 and bool(_pose(part).is_rigid()) for part in rows)
 
     @property
-    def moved(self) -> MovedCamera | None:
-        """How far refinement moved the camera; None where it kept the given pose."""
+    def update(self) -> Float[Tensor, "6"] | None:
+        """The right update (translation in metres first) from the given to the refined pose; None where that was kept."""
         if self.given_T_world_camera is None:
             return None
-        update = (_pose(self.given_T_world_camera).inverse() @ self.pose).log()
+        return (_pose(self.given_T_world_camera).inverse() @ self.pose).log()
+
+    @property
+    def moved(self) -> MovedCamera | None:
+        """How far refinement moved the camera; None where it kept the given pose."""
+        if (update := self.update) is None:
+            return None
         metres, radians = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
         return MovedCamera(self.name, metres, math.degrees(radians), self.moved_pixels or 0.0)
 

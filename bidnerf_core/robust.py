@@ -20,6 +20,9 @@ from bidnerf_core.errors import InputError
 
 RobustName = Literal["huber", "l2", "l1", "cauchy", "geman-mcclure"]
 
+MAD_TO_SIGMA = 1.4826
+"""Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
+
 
 def huber(residual: Float[Tensor, "*p"], delta: float) -> Float[Tensor, "*p"]:
     """Return Huber's rho: ``r^2 / 2`` up to ``delta``, then linear with slope ``delta``."""

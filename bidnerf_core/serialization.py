@@ -14,6 +14,7 @@ from bidnerf_core.errors import InputError, spelling_hint
 _T = TypeVar("_T")
 
 LARGEST_NUMBER = sys.float_info.max  # JSON knows NaN, 1e999 and integers that no float holds
+LARGEST_INTEGER = 2**63 - 1  # what tensors and files hold
 
 
 def to_plain(value: Any, where: str = "") -> Any:
@@ -87,6 +88,9 @@ def converted(kind: Any, value: Any, where: str) -> Any:
     elif kind is float and type(value) in (int, float):
         if abs(value) <= LARGEST_NUMBER:
             return float(value)
+    elif kind is int and type(value) is int:
+        if abs(value) <= LARGEST_INTEGER:
+            return value
     elif type(value) is kind or (value is None and kind is type(None)):
         return value
     raise InputError(f"{where}: found {_shown(value)}, expected {_name(kind)}")

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.serialization import converted, to_plain
+from bidnerf_core.serialization import LARGEST_NUMBER, converted, to_plain
 
 S = TypeVar("S")
 
@@ -29,7 +29,7 @@ class Range:
     most: float = math.inf
 
     def __contains__(self, value: float) -> bool:
-        return math.isfinite(value) and self.least <= value <= self.most
+        return abs(value) <= LARGEST_NUMBER and self.least <= value <= self.most
 
     def __str__(self) -> str:
         if self.most == math.inf:

@@ -12,6 +12,7 @@ from torch import Tensor
 import bidnerf_core.localization.auto as auto_module
 import textured_field
 from bidnerf_core import Localization, Localizer, Outcome, View
+from bidnerf_core.depth_sensor import find_depth_sensor
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
@@ -22,6 +23,7 @@ from bidnerf_core.localization.by_landmarks import (
     answer_by_landmarks,
     corrected,
     localization_by_landmarks,
+    shrunk_depth_scale,
 )
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.search.landmarks import Confirmation
@@ -148,6 +150,16 @@ def test_the_scale_of_a_depth_sensor_is_found() -> None:
     assert found.terms == ("depth",)
     assert found.found.depth_scale == pytest.approx(1 / 1.03, rel=0.01)
     assert_within(found.T, 0.015, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "kept"), [("rendered", 0.0), ("unknown", 0.8), ("kinect", 0.054**2 / (0.054**2 + 0.01**2))]
+)
+def test_a_depth_scale_is_shrunk_as_far_as_the_sensor_is_accurate(sensor: str, kept: float) -> None:
+    found = replace(answer(unseen(), map=textured_map(surface=True)).found, depth_scale=1.05)
+    model = find_depth_sensor(sensor)
+    assert shrunk_depth_scale(found, model) == pytest.approx(1 + kept * 0.05)
+    assert shrunk_depth_scale(replace(found, depth_scale=None), model) == 1
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:

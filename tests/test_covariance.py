@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Generator
 
 import baked
+from bidnerf_core.depth_sensor import EXACT
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import (
     INDEPENDENT,
@@ -33,18 +36,31 @@ def test_the_surface_covariance_is_symmetric_and_positive_definite(number: int) 
     assert torch.equal(found, found.mT)
     assert torch.linalg.eigvalsh(found).min() > 0
     assert found.diagonal()[:3].sum().sqrt() < 0.2
-    exact, rigged = (surface_covariance(cost, view.T_ref_camera, views, depth_scale=0.0) for views in (1, 4))
+    exact, rigged = (surface_covariance(cost, view.T_ref_camera, views, sensor=EXACT) for views in (1, 4))
     assert torch.allclose(rigged, exact / 4, rtol=0.05, atol=1e-7)
 
 
 def test_an_uncertain_scale_of_the_depth_makes_the_way_to_the_scene_uncertain() -> None:
     view = baked.unseen()[0]
     cost = baked.point_search(view).judge()
-    exact, uncertain = (surface_covariance(cost, view.T_ref_camera, depth_scale=s) for s in (0.0, 0.02))
+    exact, uncertain = (
+        surface_covariance(cost, view.T_ref_camera, sensor=s) for s in (EXACT, replace(EXACT, scale=0.02))
+    )
     added = (uncertain - exact)[:3, :3]
     expected = 0.02 * cost.cloud.middle.double()
     torch.testing.assert_close(added, expected[:, None] * expected, rtol=1e-6, atol=1e-12)
     assert (uncertain - exact)[3:].abs().max() < 1e-12
+
+
+def test_an_uncertain_offset_of_the_depth_makes_the_way_along_the_line_of_sight_uncertain() -> None:
+    cloud = seen_patch(0.0)
+    cost = SurfaceCost(baked.patch(), cloud, PointScales(0.1))
+    sensors = (EXACT, replace(EXACT, offset=0.02))
+    exact, uncertain = (surface_covariance(cost, SE3.identity(), sensor=sensor) for sensor in sensors)
+    sight = (cloud.points - cloud.origins).double()
+    mean = (sight / sight.norm(dim=-1, keepdim=True)).mean(0)
+    added = (uncertain - exact)[:3, :3]
+    torch.testing.assert_close(added, 0.02**2 * mean[:, None] * mean, rtol=1e-6, atol=1e-12)
 
 
 def test_information_without_a_direction_is_that_of_a_larger_covariance(generator: Generator) -> None:
@@ -58,7 +74,7 @@ def test_information_without_a_direction_is_that_of_a_larger_covariance(generato
 def test_the_surface_covariance_grows_with_the_square_of_noise() -> None:
     surface = baked.patch()
     little, more = (
-        surface_covariance(PointSearch(surface, seen_patch(noise)).judge(), SE3.identity(), depth_scale=0.0)[
+        surface_covariance(PointSearch(surface, seen_patch(noise)).judge(), SE3.identity(), sensor=EXACT)[
             2, 2
         ]
         for noise in (0.002, 0.004)
@@ -93,7 +109,7 @@ def test_the_surface_covariance_of_a_plane_is_that_of_a_few_independent_distance
     noise, surface = 0.003, baked.patch()
     bare = torch.zeros(100, dtype=torch.bool)
     cloud = baked.points(seen_patch(noise).points, torch.zeros((100, 3)), coloured=bare)
-    found = surface_covariance(PointSearch(surface, cloud).judge(), SE3.identity(), depth_scale=0.0)
+    found = surface_covariance(PointSearch(surface, cloud).judge(), SE3.identity(), sensor=EXACT)
     assert float(found[2, 2].sqrt()) == pytest.approx(noise / (2 * INDEPENDENT) ** 0.5, rel=0.15)
 
 

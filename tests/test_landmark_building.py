@@ -12,7 +12,7 @@ from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.mapping.features import Sift
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, build_landmarks, tracked_views
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.pose_scatter import robust_covariance
+from bidnerf_core.mapping.pose_scatter import robust_covariance, update_scatter
 from bidnerf_core.mapping.tracks import Matches, joined_tracks
 from bidnerf_core.mapping.triangulation import Sightings, intersected, parallax, refined_points
 from bidnerf_core.mapping.view_pairs import likely_pairs
@@ -211,3 +211,14 @@ def test_robust_covariance_is_right_for_normal_values_and_holds_with_outliers(
     found = whitening @ robust_covariance(values) @ whitening.mT
     assert float(torch.linalg.eigvalsh(found)[0]) > 0.85
     assert float(torch.linalg.eigvalsh(found)[-1]) < 1.4
+
+
+def test_scatter_of_updates_is_that_of_the_images_that_moved_if_most_did() -> None:
+    deviations = torch.tensor([3, 2, 1, 0.3, 0.2, 0.1], dtype=torch.float64)
+    noise = torch.randn((400, 6), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    updates = list(noise * deviations)
+    found = update_scatter(updates)
+    torch.testing.assert_close(found.diagonal().sqrt(), deviations, rtol=0.15, atol=0)
+    assert torch.equal(update_scatter([*updates, *[None] * 400]), found)
+    for few in ([*updates, *[None] * 401], updates[:7], []):
+        assert torch.equal(update_scatter(few), torch.zeros((6, 6), dtype=torch.float64))

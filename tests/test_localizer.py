@@ -126,6 +126,7 @@ MIRRORED[:3, 0] *= -1
         (FRAME, START.matrix() * torch.nan, "start has the last row .*nan"),
         (FRAME, [[1.0, 2.0], [3.0]], "start is a list, expected an SE3 or a 4x4 matrix"),
         (FRAME, "pose.json", "start is a str, expected an SE3 or a 4x4 matrix"),
+        (FRAME, [[10**400] * 4] * 4, "start is a list, expected an SE3 or a 4x4 matrix"),
         (FRAME, SE3.stack([START, START]), "start holds 2 poses, expected one"),
         (FRAME, None, "method 'bid' needs a start; give one, or take method 'auto'"),
         (

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.serialization import LARGEST_INTEGER, from_plain, to_plain
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,13 @@ class Outer:
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
-inners = st.builds(Inner, st.text(alphabet="abc"), st.lists(st.integers()).map(tuple))
+integers = st.integers(-LARGEST_INTEGER, LARGEST_INTEGER)
+inners = st.builds(Inner, st.text(alphabet="abc"), st.lists(integers).map(tuple))
 outers = st.builds(
-    Outer, st.integers(), finite, st.booleans(), st.sampled_from(["a", "b"]), st.none() | st.integers(),
-    st.integers() | finite | st.text(), st.tuples(finite, st.text()), st.lists(st.integers()).map(tuple), inners,
+    Outer, integers, finite, st.booleans(), st.sampled_from(["a", "b"]), st.none() | integers,
+    integers | finite | st.text(), st.tuples(finite, st.text()), st.lists(integers).map(tuple), inners,
     st.lists(inners, max_size=3).map(tuple), st.lists(st.lists(finite)),
-    st.dictionaries(st.text(), st.lists(st.integers()).map(tuple)), st.none() | st.booleans(),
+    st.dictionaries(st.text(), st.lists(integers).map(tuple)), st.none() | st.booleans(),
 )  # fmt: skip
 
 
@@ -79,6 +80,8 @@ def test_missing_keys_take_their_defaults_and_whole_numbers_serve_as_floats() ->
         ({"need": 1, "derived": 2}, "here: Outer has no field 'derived', expected some of need, rate"),
         ({"need": 1.5}, "here: need: found 1.5, expected int"),
         ({"need": True}, "here: need: found True, expected int"),
+        ({"need": 2**63}, "here: need: found 9223372036854775808, expected int"),
+        ({"need": -(10**400)}, "expected int"),
         ({"need": None}, "here: need: found None, expected int"),
         ({"need": 1, "rate": "2"}, "here: rate: found '2', expected float"),
         ({"need": 1, "rate": True}, "here: rate: found True, expected float"),

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, Localizer, Outcome, Tracker
+from bidnerf_core.depth_sensor import KINECT
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.costs.prior import GaussianPrior
@@ -163,6 +164,14 @@ def test_odometry_refuses_corners_that_contradict_each_other() -> None:
     order = torch.randperm(len(corners), generator=torch.Generator().manual_seed(0))
     shuffled = replace(corners, pixels=corners.pixels[order])
     assert odometry.moved(second, shuffled, at(T_first), T_first, INTERVAL) is None
+
+
+def test_corners_have_the_depth_noise_of_the_sensor() -> None:
+    _, frame, T = flight()[0]
+    corners = Odometry(100, KINECT.noise).replenished(frame, grey_image(frame.rgb), FollowedPoints.none(), T)
+    depth = T.inverse().apply(corners.positions)[:, 2]
+    assert len(corners) > 0
+    torch.testing.assert_close(corners.deviations[:, 1], KINECT.noise.quadratic * depth**2)
 
 
 def test_corners_without_measured_depth_are_left_out() -> None:

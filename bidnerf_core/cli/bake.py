@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,7 @@ from bidnerf_core.mapping.capture_advice import summary
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
 from bidnerf_core.mapping.landmarks import HeldOutTrial
+from bidnerf_core.mapping.pose_scatter import update_scatter
 from bidnerf_core.storage import (
     LandmarkSource,
     Map,
@@ -156,6 +158,10 @@ def _bake_landmarks(
         say(f"{folder}: no landmarks: {error}")
     else:
         trial = landmarks.trial
+        # New poses are compared with others of the source of the given ones. Where training kept those, all but some wrong ones,
+        # they have no errors to speak of.
+        by_source = update_scatter([camera.update for camera in stored.info.cameras])
+        landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
         save_landmarks(folder, stored.info, landmarks, noise, source)
         say(
             f"{folder}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(views)} {source},"

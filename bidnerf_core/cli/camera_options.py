@@ -9,6 +9,7 @@ import tyro
 
 from bidnerf_core.cli.common import option
 from bidnerf_core.datasets import DepthRegistration
+from bidnerf_core.depth_sensor import DEPTH_SENSORS
 
 NO = "no"
 """The value of ``--register-depth`` that takes depth as it is."""
@@ -50,6 +51,8 @@ RegisterDepth = Annotated[
         "as the format has it",
     ),
 ]
+
+DepthSensorName = Annotated[str, option("NAME", "what measured the depth: " + ", ".join(DEPTH_SENSORS))]
 
 
 def depth_registration(given: str | None) -> DepthRegistration | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time as clocks
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.images import Background
 from bidnerf_core.photos import photos_in
+from bidnerf_core.serialization import LARGEST_NUMBER
 
 STDIN = "-"
 POLL = 0.05
@@ -115,6 +115,6 @@ def _number(found: dict[str, Any], name: str) -> float | None:
     value = found.get(name)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST_NUMBER:
         raise InputError(f'"{name}" is {value!r}, expected a finite number or null')
     return float(value)

@@ -26,6 +26,7 @@ from bidnerf_core.cli.common import (
     require,
     say,
 )
+from bidnerf_core.cli.depth_remark import depth_remark
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import (
@@ -188,6 +189,8 @@ def _answered(
     if bare and query.truth is not None and query.depth_rays is None and not said:
         said += bare
         say(f"{', '.join(bare)}: no measured depth; colour only")
+    if number == 0 and (remark := depth_remark(query.frame, localizer.config)) is not None:
+        say(f"{query.name}: {remark}")
     start = begin.pose(query.truth, seed)
     found = localizer(query.views, start, query.depth_rays, seed)
     if not bool(found.T_world_camera.matrix().isfinite().all()):

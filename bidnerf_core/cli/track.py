@@ -13,6 +13,7 @@ import tyro
 
 from bidnerf_core.cli.camera_options import (
     CameraFile,
+    DepthSensorName,
     FieldOfView,
     FocalLength,
     RegisterDepth,
@@ -39,7 +40,7 @@ from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.plot_style import require_matplotlib
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization import Localization, Localizer, Tracker, TrackerConfig
+from bidnerf_core.localization import AutoConfig, Localization, Localizer, Tracker, TrackerConfig
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
 
@@ -75,6 +76,7 @@ def run(arguments: list[str]) -> None:
         hfov: FieldOfView = None,
         register_depth: RegisterDepth = None,
         depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
+        depth_sensor: DepthSensorName = "unknown",
         every: Annotated[int, option("N", "take every Nth frame only")] = 1,
         start: Annotated[
             Path | None, option("POSE.json", "file with a 4x4 T_world_camera of about the first frame", "")
@@ -106,10 +108,10 @@ def run(arguments: list[str]) -> None:
         given, registration = GivenCamera(camera, focal, hfov), depth_registration(register_depth)
         if follow:
             given = replace(given, sensor=given_sensor(sequence, registration))
-        begin = None if start is None else read_pose(start)
+        begin, settings = None if start is None else read_pose(start), AutoConfig(depth_sensor=depth_sensor)
         stored = load_map(map)
         path = TrackedPath(stored.info.backend)
-        tracker = Tracker(Localizer(stored), config, begin)
+        tracker = Tracker(Localizer(stored, config=settings), config, begin)
         drawn = nullcontext() if video is None else TrackingVideo(video, stored)
         began = clocks.perf_counter()
         try:

@@ -14,6 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Generator
 
+from bidnerf_core.depth_sensor import find_depth_sensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.acceptance import (
     LandmarkThresholds,
@@ -75,6 +76,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     An image whose pose is not accepted is tried once more without the nearest thing that was measured, which may hide the
     scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
     """
+    problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
     found = _found(problem, config, seed)
     if found.converged or found.outcome in FINAL or problem.surface is None:
         return found

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from bidnerf_core.depth_sensor import DEPTH_SENSORS
 from bidnerf_core.localization.by_colour import ByColourConfig
-from bidnerf_core.settings import EXPERT, Range, Settings
+from bidnerf_core.settings import EXPERT, OneOf, Range, Settings
 
 LEAST_POINTS = 50
 """Least number of measured depths from which the shape of the scene can be recognised."""
@@ -27,4 +28,6 @@ class AutoConfig(Settings):
     landmarks: bool = True  # match image features with the map's landmarks first, where it has some
     # number of rendered rays that are fused with landmarks; 0: none
     fused_rays: Annotated[int, Range(0, 10**6)] = 1024
+    # what measured the depth: unknown, kinect, realsense, lidar or rendered
+    depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
     by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()

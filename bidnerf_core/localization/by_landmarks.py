@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf_core.depth_sensor import DepthSensorModel
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_diagnostics, landmark_verdict
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
@@ -40,8 +41,10 @@ FUSION_STEPS = 2
 """Number of second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
-DEPTH_SCALE_PRIOR, DEPTH_SCALE_NOISE = 0.02, 0.01
-"""Relative standard deviations of a depth sensor's scale, and of the scale that a few landmarks give."""
+DEPTH_SCALE_NOISE = 0.01
+"""Relative standard deviation of the depth scale that a few landmarks give."""
+PRIOR_WIDTH = 2.0
+"""Standard deviation of the prior of the depth scale over that of the sensor's scale, since single sensors are off by far more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +111,7 @@ def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
 
 def corrected(problem: Problem, found: LandmarkPose) -> Problem:
     """Return the problem from the pose found, with its intrinsics and with measured depth on the map's scale."""
-    scale, views = shrunk_depth_scale(found), []
+    scale, views = shrunk_depth_scale(found, problem.sensor), []
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
         camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics
@@ -116,11 +119,15 @@ def corrected(problem: Problem, found: LandmarkPose) -> Problem:
     return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 
-def shrunk_depth_scale(found: LandmarkPose) -> float:
-    """Return the factor on measured depth that landmarks give, shrunk towards 1 by the prior; 1 if they give none."""
+def shrunk_depth_scale(found: LandmarkPose, sensor: DepthSensorModel) -> float:
+    """Return the factor on measured depth that landmarks give, shrunk towards 1 by the prior; 1 if they give none.
+
+    The prior is that of the sensor's scale, ``PRIOR_WIDTH`` times as wide.
+    """
     if found.depth_scale is None:
         return 1.0
-    weight = DEPTH_SCALE_PRIOR**2 / (DEPTH_SCALE_PRIOR**2 + DEPTH_SCALE_NOISE**2)
+    prior = PRIOR_WIDTH * sensor.scale
+    weight = prior**2 / (prior**2 + DEPTH_SCALE_NOISE**2)
     return 1 + weight * (found.depth_scale - 1)
 
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.se3 import SE3
 
@@ -20,8 +21,6 @@ LEAST_VARIANCE = 1e-9
 """Lower limit of the variance of residuals, in units of their scale; below it there are only rounding errors."""
 FINEST = 2.0
 """Scale of distances at the end of a search, in cells of the surface's grid."""
-DEPTH_SCALE = 0.01
-"""Relative standard deviation of a depth sensor's scale, an error that all its points share."""
 
 
 def sandwich_covariance(
@@ -47,21 +46,22 @@ def sandwich_covariance(
 
 
 def surface_covariance(
-    cost: SurfaceCost, T: SE3, views: int = 1, depth_scale: float = DEPTH_SCALE
+    cost: SurfaceCost, T: SE3, views: int = 1, sensor: DepthSensorModel = UNKNOWN
 ) -> Float[Tensor, "6 6"]:
     """Return the covariance of a pose that aligns measured points with the surface; positive definite.
 
     It is the inverse of the Hessian divided by the variance of the residuals. Directions that the points do not determine,
-    such as the way along a bare wall, have the size of the scene or half a turn as standard deviation. The uncertainty
-    of the sensor's scale is added, whose relative standard deviation is ``depth_scale``.
+    such as the way along a bare wall, have the size of the scene or half a turn as standard deviation. The uncertainties
+    of the sensor's scale and offset are added, which all its points share.
     """
     finest = PointScales(FINEST * cost.surface.cell)
     cost = SurfaceCost(cost.surface, cost.cloud, finest)
     variance = cost.residual_variance(T[None])[0].clamp(min=LEAST_VARIANCE) / (INDEPENDENT * views)
     prior = torch.tensor([cost.surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
     information = cost(T[None]).hessian[0] / variance + torch.diag(prior**-2)
-    by_scale = depth_scale * scale_slope(cost.cloud)
-    covariance = torch.linalg.inv(information) + by_scale[:, None] * by_scale
+    covariance = torch.linalg.inv(information)
+    for shared in (sensor.scale * scale_slope(cost.cloud), sensor.offset * offset_slope(cost.cloud)):
+        covariance = covariance + shared[:, None] * shared
     found = cost.cloud.pivot.at_camera(T, covariance)
     return (found + found.mT) / 2
 
@@ -69,6 +69,12 @@ def surface_covariance(
 def scale_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
     """Return the update about the cloud's pivot that keeps it in place while depths grow by 100 %, metres."""
     return torch.cat([-cloud.middle.double().cpu(), torch.zeros(3, dtype=torch.float64)])
+
+
+def offset_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
+    """Return the update about the cloud's pivot that keeps it in place while all distances grow by a metre, metres a metre."""
+    sight = torch.nn.functional.normalize((cloud.points - cloud.origins).double(), dim=-1)
+    return torch.cat([-sight.mean(0).cpu(), torch.zeros(3, dtype=torch.float64)])
 
 
 def without_direction(information: Float[Tensor, "6 6"], slope: Float[Tensor, "6"]) -> Float[Tensor, "6 6"]:

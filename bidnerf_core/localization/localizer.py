@@ -11,8 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.constants import constant
+from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel, find_depth_sensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
+from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only, has_distances
 from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
 from bidnerf_core.localization.problem import SceneMap, device_of, on_device, rig
@@ -90,6 +92,12 @@ class Localizer:
         found = METHODS[self.method].run(problem, self.config, seed)
         return found if has_distances(self.map) else direction_only(found)
 
+    @property
+    def depth_sensor(self) -> DepthSensorModel:
+        """The model of the sensor that measures depth; methods without such a setting have that of an unknown one."""
+        config = self.config
+        return find_depth_sensor(config.depth_sensor) if isinstance(config, AutoConfig) else UNKNOWN
+
     @torch.no_grad()
     def _warm_up(self) -> None:
         """Render some rays and fill the caches of the surface, so that lazy initialisation does not delay the first call."""
@@ -153,7 +161,7 @@ def start_pose(start: Start) -> SE3:
         return start.to("cpu", torch.float64)
     try:
         matrix = torch.as_tensor(np.asarray(start, dtype=np.float64))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"start is a {type(start).__name__}, expected an SE3 or a 4x4 matrix") from error
     return pose_from_matrix(matrix, "start")
 

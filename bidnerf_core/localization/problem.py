@@ -10,6 +10,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import torch
 from torch import nn
 
+from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import View
@@ -83,6 +84,7 @@ class Problem:
     matcher: LandmarkMatcher | None = None  # of the map's landmarks
     # Root mean square difference of the field's colours from its own training images; None where unknown.
     colour_noise: float | None = None
+    sensor: DepthSensorModel = UNKNOWN  # that measured the depth
 
     def __post_init__(self) -> None:
         if not self.views:

@@ -79,8 +79,8 @@ class Tracker:
         self._by_landmarks: ByLandmarks | None = None
         if uses_landmarks(localizer) and localizer.matcher is not None:
             detector = LandmarkDetector(localizer.matcher.landmarks, Sift(count=config.keypoints))
-            self._by_landmarks = ByLandmarks(scene, detector, config)
-        self._odometry = Odometry(config.points)
+            self._by_landmarks = ByLandmarks(scene, detector, config, localizer.depth_sensor)
+        self._odometry = Odometry(config.points, localizer.depth_sensor.noise)
 
     @property
     def tracking(self) -> bool:

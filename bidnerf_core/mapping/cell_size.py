@@ -11,11 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.depth_sensor import UNKNOWN
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.mapping.posed_depth import PosedDepthImage, witnesses
 from bidnerf_core.mapping.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes
 from bidnerf_core.mapping.surfels import surfel_bytes
+from bidnerf_core.robust import MAD_TO_SIGMA
 from bidnerf_core.voxel_grid import VoxelGrid
 
 PIXEL = 0.7
@@ -30,10 +32,10 @@ COMPARED_IMAGES, CELL_POINTS = 40, 400
 """Images, and points of each, from which the noise is estimated."""
 GROSS = 5.0
 """Differences of more than so many medians are occlusions and gross errors, not noise."""
-MOST_NOISE = 0.02
-"""Images that differ by more than this share of the median distance contradict each other; it is not taken for noise."""
-MAD_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation to the median absolute deviation of a Gaussian."""
+MOST_NOISE = 2.0
+"""Images that differ by more than so many standard deviations of an unknown sensor contradict each other; it is not taken for
+noise.
+"""
 COARSER = 2**0.25
 """Factor by which cells grow until there are enough points in them, or until they take little enough memory."""
 
@@ -86,7 +88,9 @@ def _spread(
         return 0.0
     near = differences[differences <= GROSS * differences.median()]
     distance = _median([float(depths.median()) for _, depths in _depths(images, opacity)])
-    return min(MAD_TO_SIGMA * float(near.median()) / math.sqrt(2), MOST_NOISE * distance)
+    return min(
+        MAD_TO_SIGMA * float(near.median()) / math.sqrt(2), MOST_NOISE * UNKNOWN.noise.deviation(distance)
+    )
 
 
 def chosen_grid(

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from bidnerf_core.depth_sensor import UNKNOWN
 from bidnerf_core.frames import Frame
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
@@ -14,8 +15,6 @@ DEPTH_EDGE = 0.05
 """Largest relative change of the depth around a keypoint; more indicates a depth edge."""
 LEAST_MEASURED = 6
 """Least number of the nine pixels around a keypoint that must have measured depth."""
-DEFAULT_NOISE = 0.01
-"""Relative standard deviation of depth that is assumed if it cannot be estimated."""
 ENOUGH_DEPTHS = 30
 """Least number of triangulated observations with depth from which the depth noise is estimated."""
 OUTLIER_DEVIATIONS = 3.0
@@ -48,10 +47,13 @@ def measured_depth(frame: Frame, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, 
 def keypoint_depth_noise(
     sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]
 ) -> float:
-    """Return a robust relative standard deviation of measured depth, by comparison with triangulated points."""
+    """Return a robust relative standard deviation of measured depth, by comparison with triangulated points.
+
+    With too few of them, it is that of an unknown sensor.
+    """
     known = depth > 0
     if int(known.sum()) < ENOUGH_DEPTHS:
-        return DEFAULT_NOISE
+        return UNKNOWN.noise.linear
     off = depth[known] / sightings.in_camera(points)[known, 2] - 1
     return max(1e-4, 1.4826 * float(off.abs().median()))
 

@@ -37,7 +37,7 @@ class LandmarkMap:
     views: Int[Tensor, "n"]  # how many images saw it, int32
     noise: float  # pixels: standard deviation of a keypoint along each axis, in the images of the map
     # Covariance of the right updates (translation in metres first) from the given poses of the map's images to those that
-    # the landmarks imply: the error that the source of the poses adds to a pose found by landmarks.
+    # the landmarks imply, refinement by the training included: the error that the source of the poses adds.
     pose_covariance: Float[Tensor, "6 6"]  # float64
     # The number of keypoints that count as one measurement in an image with ``usual_matches`` of them, because their errors are
     # correlated; see ``correlation_of``.

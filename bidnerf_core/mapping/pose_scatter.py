@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from scipy.stats import chi2
@@ -29,10 +31,15 @@ def pose_scatter(
     them towards its own error. This is corrected for: if a point has k views, resection shows the factor 1 - 1/k of the pose
     variance, whereas the pose of a new image would show 1 + 1/k.
     """
-    updates = list(pose_updates(tracked, positions, noise).values())
-    if len(updates) < ENOUGH_IMAGES:
+    return update_scatter(list(pose_updates(tracked, positions, noise).values()))
+
+
+def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"]:
+    """Return the covariance of updates of poses, robustly; zero if there are too few, or less than half of the images have one."""
+    known = [update for update in updates if update is not None]
+    if len(known) < max(ENOUGH_IMAGES, len(updates) / 2):
         return torch.zeros((6, 6), dtype=torch.float64)
-    return robust_covariance(torch.stack(updates))
+    return robust_covariance(torch.stack(known))
 
 
 def pose_updates(

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf_core.depth_sensor import EXACT
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.costs.prior import GaussianPrior
@@ -148,5 +149,5 @@ def aligned(
             .normalized()
         )
     judge = SurfaceCost(surface, cloud, PointScales(JUDGED * surface.extent))
-    found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, views, depth_scale=0.0)
+    found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, views, EXACT)
     return Alignment(T, found, surface_diagnostics(judge, T, torch.inf))

@@ -9,6 +9,7 @@ import torch
 from torch import Generator
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
@@ -97,6 +98,7 @@ class ByLandmarks:
     map: SceneMap
     detector: LandmarkDetector
     config: TrackerConfig
+    sensor: DepthSensorModel = UNKNOWN
 
     def __call__(
         self, frame: Frame, image: Grey, state: TrackerState, points: FollowedPoints, predicted: Motion
@@ -218,7 +220,9 @@ class ByLandmarks:
 
     def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:
         generator = Generator().manual_seed(seed)
-        return measured_cloud(frame, self.config.depth_points, shrunk_depth_scale(found), generator)
+        return measured_cloud(
+            frame, self.config.depth_points, shrunk_depth_scale(found, self.sensor), generator
+        )
 
 
 def search_radius(predicted: Motion, camera: Intrinsics) -> float:

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import torch
 
+from bidnerf_core.depth_sensor import UNKNOWN, DepthNoise
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization.search.landmark_query import pixel_threshold
 from bidnerf_core.localization.tracking.detection import flow_evidence
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, fit_pose
-from bidnerf_core.mapping.keypoint_depth import DEFAULT_NOISE, measured_depth
+from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.se3 import SE3
 
 LEAST_CORNERS = 20
@@ -29,9 +30,10 @@ CORRELATION = 4.0
 
 @dataclass(frozen=True)
 class Odometry:
-    """Follows up to ``count`` corners whose depth was measured."""
+    """Follows up to ``count`` corners whose depth was measured, with this noise."""
 
     count: int
+    noise: DepthNoise = UNKNOWN.noise
 
     def moved(
         self, frame: Frame, points: FollowedPoints, motion: Motion, start: SE3, seconds: float
@@ -71,7 +73,7 @@ class Odometry:
         return FollowedPoints(
             pixels,
             T_world_camera.apply(ray * depth[:, None]),
-            torch.stack([across, DEFAULT_NOISE * depth], dim=-1),
+            torch.stack([across, self.noise.deviation(depth)], dim=-1),
             -T_world_camera.rotate(torch.nn.functional.normalize(ray, dim=-1)),
             torch.full((len(pixels),), FRESH, dtype=torch.long),
         )

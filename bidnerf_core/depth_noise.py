@@ -1,0 +1,87 @@
+"""The noise of measured depth, estimated from one depth image: how far its pixels are from planes through their neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.optimize import nnls
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.depth_sensor import DepthNoise
+from bidnerf_core.depth_steps import DepthSteps, depth_steps
+from bidnerf_core.robust import MAD_TO_SIGMA
+
+WINDOW = 8
+"""Rows and columns of the pixels to which a plane is fitted."""
+PLANAR = 0.25
+"""Quantile of the windows' residuals: as many are taken for planes. The others may show edges, curved things and relief."""
+QUANTILE_BIAS = 1.11
+"""The noise over that quantile, where all windows are planes and all pixels independent."""
+LEAST_WINDOWS = 20
+"""Least number of windows in a range of depths from which its noise is estimated."""
+MOST_RANGES = 8
+"""Largest number of ranges of depths, with equal numbers of windows."""
+ENOUGH_SPREAD = 1.5
+"""Least ratio of the farthest to the nearest range with which the growth of the noise is estimated."""
+
+
+def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> DepthNoise | None:
+    """Return the noise of a depth image (planar z, metres, 0: not measured), as a function of the depth.
+
+    It is relative noise that is constant or grows linearly, ``linear + quadratic * z``, fitted to robust residuals of local
+    planes and to the rounding of stored values, the larger of both. None where too few windows of the image are measured
+    without gaps. Errors that neighbouring pixels share are not noticed, such as those of a warped image, or what is left of
+    a lidar's after interpolation. Where hardly a window shows a plane, relief of the scene counts as noise.
+    """
+    windows = _residuals(depth, intrinsics)
+    if len(windows) < LEAST_WINDOWS:
+        return None
+    ranges = _by_depth(windows, depth_steps(depth))
+    return _fitted(ranges)
+
+
+def _residuals(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> Float[Tensor, "n 2"]:
+    """Return the median depth (metres) of each window that is measured throughout, and its relative noise about a plane.
+
+    The inverse depth of a plane is linear in the coordinates of the image, whichever its slant. A deviation of 1/z by e is
+    one of z by the share ``z e``.
+    """
+    z = _windows(depth.detach().cpu().double())
+    image = intrinsics.unproject(intrinsics.pixel_centres(torch.float64))
+    x = torch.stack([_windows(image[..., axis]) for axis in (0, 1)], dim=-1)
+    whole = ((z > 0) & z.isfinite()).all(-1)
+    z, x = z[whole], x[whole]
+    inverse, x = 1 / z, x - x.mean(1, keepdim=True)
+    off = inverse - inverse.mean(-1, keepdim=True)
+    slope = torch.linalg.solve(x.mT @ x, x.mT @ off[..., None])
+    off = off - (x @ slope)[..., 0]
+    middle, spare = z.median(-1).values, z.shape[-1] / (z.shape[-1] - 3)
+    return torch.stack([middle, MAD_TO_SIGMA * spare**0.5 * middle * off.abs().median(-1).values], dim=-1)
+
+
+def _windows(image: Float[Tensor, "h w"]) -> Float[Tensor, "n p"]:
+    """Return the pixels of windows side by side; rows and columns that are left over are not used."""
+    return image.unfold(0, WINDOW, WINDOW).unfold(1, WINDOW, WINDOW).reshape(-1, WINDOW**2)
+
+
+def _by_depth(windows: Float[Tensor, "n 2"], steps: DepthSteps | None) -> Float[Tensor, "b 2"]:
+    """Return the median depth and the relative noise of ranges of depths with equal numbers of windows."""
+    ordered = windows[windows[:, 0].argsort()]
+    count = min(MOST_RANGES, len(windows) // LEAST_WINDOWS)
+    found = []
+    for part in ordered.tensor_split(count):
+        middle = float(part[:, 0].median())
+        noise = QUANTILE_BIAS * float(part[:, 1].quantile(PLANAR))
+        rounding = 0.0 if steps is None else steps.deviation(middle) / middle
+        found.append([middle, max(noise, rounding)])
+    return torch.tensor(found, dtype=torch.float64)
+
+
+def _fitted(ranges: Float[Tensor, "b 2"]) -> DepthNoise:
+    depth, noise = ranges.numpy().T
+    if depth.max() < ENOUGH_SPREAD * depth.min():
+        return DepthNoise(linear=float(np.median(noise)))
+    (linear, quadratic), _ = nnls(np.stack([np.ones_like(depth), depth], axis=-1), noise)
+    return DepthNoise(linear=float(linear), quadratic=float(quadratic))

@@ -1,0 +1,76 @@
+"""The steps in which a sensor measures depth, told from the distinct values of one depth image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+REPEATED = 4
+"""Least mean number of pixels with the same depth; where it is less, depth is continuous or most of its values do not occur."""
+RANGE_VALUES, MOST_RANGES = 8, 40
+"""Least number of distinct values in a range of depths of which the median spacing is taken, and largest number of ranges."""
+BETTER = 2.0
+"""Factor by which the misfit of constant steps must exceed that of growing ones before these are assumed."""
+
+
+@dataclass(frozen=True)
+class DepthSteps:
+    """The spacing of neighbouring depth values: the larger of a constant and a multiple of the squared depth."""
+
+    constant: float  # metres: the unit in which depth is stored
+    quadratic: float  # metres a square metre; 0 where depth was not computed from whole steps of disparity
+
+    @property
+    def of_disparity(self) -> bool:
+        """Whether the steps grow with the square of the depth, as those of a sensor that measures disparity."""
+        return self.quadratic > 0
+
+    def step(self, depth: float) -> float:
+        """Return the spacing (metres) at a depth (metres)."""
+        return max(self.constant, self.quadratic * depth**2)
+
+    def deviation(self, depth: float) -> float:
+        """Return the standard deviation (metres) of the rounding to whole steps, whose error is uniform."""
+        return self.step(depth) / math.sqrt(12)
+
+
+def depth_steps(depth: Float[Tensor, "h w"]) -> DepthSteps | None:
+    """Return the steps of a depth image (metres, 0: not measured), or None where its values are continuous or too few.
+
+    Depth of whole millimetres has the same spacing everywhere. Where a disparity d is measured in whole steps, the depth
+    ``f b / d`` has a spacing that is proportional to its square. So have the rows of an exact image of a floor, which cannot be
+    distinguished from that.
+    """
+    measured = depth[(depth > 0) & depth.isfinite()].double().cpu()
+    values, counts = measured.unique(return_counts=True)
+    if len(values) < RANGE_VALUES or len(measured) < REPEATED * len(values):
+        return None
+    spacings = _spacings(values, counts)
+    return None if not len(spacings) else _fitted(spacings)
+
+
+def _spacings(values: Float[Tensor, "v"], counts: Tensor) -> Float[Tensor, "b 2"]:
+    """Return the median depth and the median spacing of the values in ranges of depths where nearly all values occur."""
+    ranges, found = min(MOST_RANGES, len(values) // RANGE_VALUES), []
+    for some, pixels in zip(values.tensor_split(ranges), counts.tensor_split(ranges), strict=True):
+        if int(pixels.sum()) >= REPEATED * len(some):
+            found.append(torch.stack([some.median(), some.diff().median()]))
+    return torch.stack(found) if found else torch.zeros((0, 2), dtype=values.dtype)
+
+
+def _fitted(spacings: Float[Tensor, "b 2"]) -> DepthSteps:
+    """Return the steps with the least mean deviation of the spacings' logarithms, among all that meet spacings exactly."""
+    depth, gap = spacings.unbind(-1)
+    units, factors = gap.unique(), gap / depth.square()
+    same = (gap.log() - units.log()[:, None]).abs().mean(-1)
+    growing = torch.maximum(units[:, None, None], factors[:, None] * depth.square())
+    misfit = (gap.log() - growing.log()).abs().mean(-1)
+    best = int(misfit.argmin())
+    unit, factor = units[best // len(factors)], factors[best % len(factors)]
+    if float(same.min()) <= BETTER * float(misfit.min()) + 1e-3:
+        return DepthSteps(float(units[same.argmin()]), 0.0)
+    return DepthSteps(float(unit), float(factor))
