@@ -105,6 +105,10 @@ class SE3:
     def detach(self) -> SE3:
         return SE3(self.rotation.detach(), self.translation.detach())
 
+    @property
+    def device(self) -> torch.device:
+        return self.translation.device
+
     def to(self, *args: Any, **kwargs: Any) -> SE3:
         """Convert to another dtype or device, given as for ``Tensor.to``."""
         return SE3(self.rotation.to(*args, **kwargs), self.translation.to(*args, **kwargs))

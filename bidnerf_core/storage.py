@@ -24,6 +24,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.files import read_file, write_file
+from bidnerf_core.localization.problem import on_device
 from bidnerf_core.map_cameras import PoseRefinement, StoredCamera
 from bidnerf_core.map_parts import load_landmarks, load_surface
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
@@ -99,6 +100,13 @@ class Map:
         """Root mean square error of the field's colours on its own training images, in [0, 1]."""
         return self.info.colour_noise
 
+    def to(self, device: torch.device | str) -> Map:
+        """Return the map with its field, surface and landmarks on ``device``; what is not there yet is copied.
+
+        Of what is done with landmarks, only the comparison of descriptors takes place there, see ``LandmarkMap.to``.
+        """
+        return on_device(self, device)
+
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:
     """Return an untrained field (an ``nn.Module``) and its config, as ``info`` describes them."""
@@ -129,15 +137,9 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
     training = None if info.complete else f"training-{name}"
     info = replace(
-        info,
-        weights=f"weights-{name}",
-        training=training,
-        surface=None,
-        landmarks=None,
-        landmark_source=None,
-        capture=None,
-        colour_noise=None,
-    )
+        info, weights=f"weights-{name}", training=training, surface=None, landmarks=None, landmark_source=None,
+        capture=None, colour_noise=None,
+    )  # fmt: skip
     description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -236,10 +238,10 @@ def load_info(folder: Path) -> MapInfo:
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
-    """Return the map in ``folder``, its field built by its backend, frozen, and on ``device``.
+    """Return the map in ``folder``, on ``device``, its field built by its backend and frozen.
 
-    The surface and the landmarks stay on the CPU; ``baked`` says whether to read them. Raises ``InputError`` where the
-    folder is no map, or a damaged one.
+    ``baked`` says whether to read the surface and the landmarks. Raises ``InputError`` where the folder is no map, or a
+    damaged one.
     """
     folder = Path(folder)
     info, tensors, surface, landmarks = _read(folder, baked)
@@ -250,12 +252,11 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     field, _ = build_field(backend, info, where)
     if outline is None:
         tensors = checked_weights(field, tensors, folder / info.weights)
-    module = cast(nn.Module, field)
-    module.load_state_dict(tensors)
-    module.requires_grad_(False).eval().to(device)
+    cast(nn.Module, field).load_state_dict(tensors)
+    cast(nn.Module, field).requires_grad_(False).eval()
     if landmarks is not None:
         landmarks = replace(landmarks, cameras=tuple(camera.intrinsics for camera in info.cameras))
-    return Map(info, field, surface, landmarks)
+    return Map(info, field, surface, landmarks).to(device)
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:

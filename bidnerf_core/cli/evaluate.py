@@ -94,7 +94,7 @@ def run(arguments: list[str]) -> None:
                 "none",
             ),
         ] = (),
-        device: Annotated[str, option("NAME", "device that the field computes on: cpu, cuda ...")] = "cpu",
+        device: Annotated[str, option("NAME", "device on which the map lies: cpu, cuda ...")] = "cpu",
         workers: Annotated[
             int | None, option("N", "number of processes, of one thread each", "one a core; one on a GPU")
         ] = None,

@@ -15,6 +15,7 @@ from torch import Tensor
 from bidnerf_core.evaluation.arcs import mean_up
 from bidnerf_core.evaluation.plot_style import new_figure, styled
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.moving import moved
 from bidnerf_core.se3 import SE3
 
 SURFELS = 12_000
@@ -88,10 +89,11 @@ def _draw_surface(
     panel: Any, surface: SurfaceMap, projection: Float[np.ndarray, "3 2"], places: Float[np.ndarray, "n 2"]
 ) -> None:
     """Draw a sample of the surfels around the path in their colours."""
-    points = surface.surfels.positions.double().numpy() @ projection
+    surfels = moved(surface.surfels, "cpu")
+    points = surfels.positions.double().numpy() @ projection
     middle = places.mean(0)
     size = max(0.5 * surface.extent, PATH_MARGIN * float(np.abs(places - middle).max()))
     near = np.flatnonzero((np.abs(points - middle) <= size).all(-1))
     some = near[:: max(1, -(-len(near) // SURFELS))]
-    colours = surface.surfels.rgb[torch.from_numpy(some)].clamp(0, 1).numpy()
+    colours = surfels.rgb[torch.from_numpy(some)].clamp(0, 1).numpy()
     panel.scatter(*points[some].T, s=2, c=0.3 + 0.7 * colours, linewidths=0, rasterized=True)

@@ -31,7 +31,7 @@ class Trial:
     config: str = "{}"  # JSON of the method's settings that differ from its defaults
     seed: int = 0  # of the start and of every random choice of the method
     split: str = "test"
-    device: str = "cpu"  # where the field computes
+    device: str = "cpu"  # on which the map lies
     depth: bool = True  # whether the method gets the measured depth
     depth_points: str | None = None  # folder of a COLMAP model whose points the method gets as depth rays
     fault: str = "none"  # faults of the images and their sizes, as depth-scale:1.02+exposure:0.7

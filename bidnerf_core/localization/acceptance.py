@@ -186,6 +186,7 @@ def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> 
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
     """Return the share of lines of sight that meet the surface well before the point that was measured."""
     some, surface = cost.cloud.first(SIGHT_LINES), cost.surface
+    T = T.to(surface.device)
     origins, ends = (T.apply(x.double()).to(some.points) for x in (some.origins, some.points))
     length = torch.linalg.vector_norm(ends - origins, dim=-1)
     met = trace(surface, origins, (ends - origins) / length.clamp(min=1e-9)[:, None])

@@ -220,7 +220,8 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     exposure = config.by_colour.refinement.exposure or not search.has_background
     refinement = replace(config.by_colour.refinement, exposure=exposure)
     by_colour = replace(config.by_colour, refinement=refinement)
-    known = Surroundings(SE3.from_matrix(surface.keyframes), surface.extent, torch.zeros(3), search.middle)
+    keyframes = SE3.from_matrix(surface.keyframes).to("cpu")
+    known = Surroundings(keyframes, surface.extent, torch.zeros(3), search.middle)
     while True:
         with torch.no_grad():
             found = search(hypotheses_for_images(known, problem.start, config.hypotheses, generator))

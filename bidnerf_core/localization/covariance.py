@@ -68,13 +68,13 @@ def surface_covariance(
 
 def scale_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
     """Return the update about the cloud's pivot that keeps it in place while depths grow by 100 %, metres."""
-    return torch.cat([-cloud.middle.double(), torch.zeros(3, dtype=torch.float64)])
+    return torch.cat([-cloud.middle.double().cpu(), torch.zeros(3, dtype=torch.float64)])
 
 
 def offset_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
     """Return the update about the cloud's pivot that keeps it in place while all distances grow by a metre, metres a metre."""
     sight = torch.nn.functional.normalize((cloud.points - cloud.origins).double(), dim=-1)
-    return torch.cat([-sight.mean(0), torch.zeros(3, dtype=torch.float64)])
+    return torch.cat([-sight.mean(0).cpu(), torch.zeros(3, dtype=torch.float64)])
 
 
 def without_direction(information: Float[Tensor, "6 6"], slope: Float[Tensor, "6"]) -> Float[Tensor, "6 6"]:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
+from bidnerf_core.constants import constant
 from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel, find_depth_sensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only, has_distances
 from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
-from bidnerf_core.localization.problem import SceneMap, rig
+from bidnerf_core.localization.problem import SceneMap, device_of, on_device, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.observations import Observations
@@ -50,8 +50,9 @@ class Localizer:
 
         ``config``: an instance of the method's settings (``METHODS[method].config_type``), by default with its defaults.
         ``preset``: the name of other settings (``METHODS[method].presets``), in place of ``config``.
-        ``device``: where the field computes, by default where it is; a field that lies elsewhere is copied. ``warm_up``:
-        do now what the first call would otherwise have to wait for. Raises ``InputError`` for what does not fit.
+        ``device``: where the field, the surface and the landmarks lie, by default where they are; the parts of a map that lie
+        elsewhere are copied. ``warm_up``: do now what the first call would otherwise have to wait for. Raises ``InputError``
+        for what does not fit.
         """
         if not isinstance(map, SceneMap):
             hint = (
@@ -61,7 +62,7 @@ class Localizer:
             )
             raise InputError(f"Localizer: got a {type(map).__name__}, expected a Map{hint}")
         self.method = method
-        self.map: SceneMap = map if device is None else _on_device(map, torch.device(device))
+        self.map: SceneMap = map if device is None else on_device(map, device)
         self.config = _checked_config(find_method(method), method, config, preset)
         landmarks = getattr(self.map, "landmarks", None)
         self.matcher = None if landmarks is None or method != "auto" else LandmarkMatcher(landmarks)
@@ -101,11 +102,10 @@ class Localizer:
     def _warm_up(self) -> None:
         """Render some rays and fill the caches of the surface, so that lazy initialisation does not delay the first call."""
         bounds, field = self.map.bounds, self.map.field
-        device = next((p.device for p in getattr(field, "parameters", list)()), torch.device("cpu"))
-        middle = torch.tensor([bounds.lower, bounds.upper], device=device).mean(0)
         directions = torch.nn.functional.normalize(
             torch.randn((WARM_UP_RAYS, 3), generator=torch.Generator().manual_seed(0)), dim=-1
-        ).to(device)
+        ).to(device_of(field))
+        middle = constant(bounds.centre, directions)
         render(field, bounds.rays(middle - directions * bounds.near, directions), bounds.background)
         if self.map.surface is not None:
             self.map.surface.warm_up()
@@ -131,21 +131,6 @@ def _checked_config(method: Method, name: str, config: Any, preset: str | None) 
         expected, found = method.config_type.__name__, type(config).__name__
         raise InputError(f"method {name!r} takes a {expected}, got a {found}")
     return config
-
-
-def _on_device(map: SceneMap, device: torch.device) -> SceneMap:
-    """Return the map with its field on ``device``; the user's own is left where it is."""
-    field = map.field
-    if not isinstance(field, nn.Module):
-        raise InputError(
-            f"device {device}: the map's field is a {type(field).__name__}, expected an nn.Module"
-        )
-    here = next((p.device for p in field.parameters()), torch.device("cpu"))
-    if here == device:
-        return map
-    moved = copy.copy(map)
-    object.__setattr__(moved, "field", copy.deepcopy(field).to(device))
-    return moved
 
 
 def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
+from torch import nn
 
 from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
 from bidnerf_core.errors import InputError
@@ -14,10 +16,12 @@ from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.moving import moved
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
 _Item = TypeVar("_Item")
+_Map = TypeVar("_Map", bound="SceneMap")
 
 
 @runtime_checkable
@@ -32,6 +36,36 @@ class SceneMap(Protocol):
 
     @property
     def surface(self) -> SurfaceMap | None: ...
+
+
+def device_of(field: RadianceField) -> torch.device:
+    """Return the device of a field's parameters or buffers; the CPU for a field that has none."""
+    for kind in ("parameters", "buffers"):
+        first = next(iter(getattr(field, kind, tuple)()), None)
+        if isinstance(first, torch.Tensor):
+            return first.device
+    return torch.device("cpu")
+
+
+def on_device(scene: _Map, device: torch.device | str) -> _Map:
+    """Return a map whose field, surface and landmarks lie on ``device``; the one given is left as it is.
+
+    Raises ``InputError`` where the field cannot be moved.
+    """
+    field = scene.field
+    if not isinstance(field, nn.Module):
+        raise InputError(
+            f"device {device}: the map's field is a {type(field).__name__}, expected an nn.Module"
+        )
+    parts = {name: getattr(scene, name, None) for name in ("field", "surface", "landmarks")}
+    there = moved(parts, device)
+    if there is parts:
+        return scene
+    found = copy.copy(scene)
+    for name, part in there.items():
+        if part is not parts[name]:
+            object.__setattr__(found, name, part)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +107,7 @@ class Problem:
     @property
     def device(self) -> torch.device:
         """The device on which the field computes; rays are moved there."""
-        for kind in ("parameters", "buffers"):
-            first = next(iter(getattr(self.field, kind, tuple)()), None)
-            if isinstance(first, torch.Tensor):
-                return first.device
-        return torch.device("cpu")
+        return device_of(self.field)
 
     def level(self, number: int | None) -> RadianceField:
         """Return a level of the field: 0 is the coarsest, -1 the finest, None the field itself."""

@@ -88,12 +88,11 @@ def take_few_steps(
     a step that would not lower the cost. The last pose is assessed on the same rays and without derivatives, which costs half
     as much as ``refine``.
     """
-    # The surface lies on the CPU. Without it, all steps stay where the field computes.
-    device, name = problem.device if surface is None else torch.device("cpu"), settings.refinement.pivot
+    device, name, views = problem.device, settings.refinement.pivot, len(problem.views)
     about = pivot(name, replace(problem, start=start)) if surface is None else surface.cloud.pivot
-    about, views = about.to(device), len(problem.views)
+    about, start = about.to(device), start.to(device)
     cost = settings.drawn(problem.on_device(), stage, about, generator)
-    poses, inliers, lower = [start.to(device)], list[Tensor](), list[Tensor]()
+    poses, inliers, lower = [start], list[Tensor](), list[Tensor]()
     with without_waiting():
         here = cost.residuals(poses[0][None])
         inliers.append(here.inliers()[0])

@@ -8,10 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.constants import constant
 from bidnerf_core.mapping.surface_map import SurfaceMap
+from bidnerf_core.waiting import may_wait
 
 ROUND = 6
-"""Steps between which rays that have met the surface or left the grid are dropped."""
+"""Number of steps after which rays that have met the surface or left the grid are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,31 +35,34 @@ def cast(
     """Trace rays (metres, world; unit directions) until they are within ``reach`` of a surfel (metres; by default the
     surface's own). A step is as long as the clearance, and a cell at least.
 
-    A ray that does not cross the grid counts as closest where it is nearest to the grid's centre.
+    A ray that does not cross the grid counts as closest where it is nearest to the grid's centre. Rays lie where the surface
+    does. Where the host must not wait, dropped rays are traced to the end, without effect.
     """
     reach = surface.reach if reach is None else reach
     rays, cell = surface.grid.rays(origins, directions), surface.grid.cell
-    best = ((origins.new_tensor(surface.grid.centre) - origins) * directions).sum(-1).clamp(min=0)
+    best = ((constant(surface.grid.centre, origins) - origins) * directions).sum(-1).clamp(min=0)
     index = surface.nearest(rays.at(best[:, None])[:, 0])
     least, met = torch.full_like(best, torch.inf), torch.zeros_like(best, dtype=torch.bool)
-    left = (rays.near < rays.far).nonzero()[:, 0]
-    here, o, d, far = rays.near[left], origins[left], directions[left], rays.far[left]
+    left, on = torch.arange(len(best), device=best.device), rays.near < rays.far
+    here, o, d, far = rays.near, origins, directions, rays.far
     for step in range(steps):
+        if step % ROUND == 0 and may_wait(best.device):
+            left, here, o, d, far = left[on], here[on], o[on], d[on], far[on]
+            on = torch.ones_like(left, dtype=torch.bool)
+            if not len(left):
+                break
         points = o + here[:, None] * d
         nearest = surface.nearest(points)
         clearance = torch.linalg.vector_norm(points - surface.surfels.positions[nearest], dim=-1)
         hit = clearance < reach
         angle = torch.where(hit, 0, clearance / here.clamp(min=cell))
-        closer = angle < least[left]
-        which = left[closer]
-        least[which], best[which], index[which] = angle[closer], here[closer], nearest[closer]
-        met[left[hit]] = True
+        closer = on & (angle < least[left])
+        for values, new in ((least, angle), (best, here), (index, nearest)):
+            values[left] = torch.where(closer, new, values[left])
+        met[left] |= on & hit
         here = torch.where(hit, here, here + clearance.clamp(min=cell))
         if step % ROUND == ROUND - 1:
-            on = (here < far) & ~hit
-            left, here, o, d, far = left[on], here[on], o[on], d[on], far[on]
-            if not len(left):
-                break
+            on = on & (here < far) & ~hit
     return Cast(met, best, index)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.moving import moved
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class HeldOutTrial:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMap:
-    """Points in the world frame (metres) with descriptors; all tensors are on the CPU."""
+    """Points in the world frame (metres) with descriptors."""
 
     positions: Float[Tensor, "n 3"]
     deviations: Float[Tensor, "n 2"]  # metres: standard deviation across and along ``directions``
@@ -55,6 +56,14 @@ class LandmarkMap:
 
     def __getitem__(self, index: Tensor) -> LandmarkMap:
         return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
+
+    def to(self, device: torch.device | str) -> LandmarkMap:
+        """Return the landmarks on another device; the same ones where they lie there already.
+
+        Only descriptors are compared there. Keypoints, RANSAC and the resection of a pose are computed on the CPU, by OpenCV,
+        poselib and scipy, for which ``LandmarkMatcher`` keeps a copy of the other tensors.
+        """
+        return moved(self, device)
 
     def correlation_of(self, matches: int) -> float:
         """Return the number of keypoints that count as one in an image with so many ``matches``.

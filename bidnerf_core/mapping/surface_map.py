@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.mapping.surfel_index import SurfelIndex
 from bidnerf_core.mapping.surfels import Surfels, surfel_bytes
+from bidnerf_core.moving import moved
 from bidnerf_core.voxel_grid import VoxelGrid
 
 REACH = 0.7
@@ -26,6 +27,15 @@ class SurfaceMap:
     surfels: Surfels
     index: SurfelIndex
     keyframes: Float[Tensor, "k 4 4"]  # T_world_camera from which the surface was seen
+
+    @property
+    def device(self) -> torch.device:
+        """Where the surfels, their index and the keyframes lie, and where rays and points meet them."""
+        return self.surfels.positions.device
+
+    def to(self, device: torch.device | str) -> SurfaceMap:
+        """Return the surface on another device; the same one where it lies there already."""
+        return moved(self, device)
 
     @property
     def grid(self) -> VoxelGrid:
@@ -65,7 +75,7 @@ class SurfaceMap:
         It is a share of the distance to the fourth neighbour, which nine tenths of the surfels do not exceed: large enough
         to leave few holes between them, small enough to keep edges.
         """
-        points = self.surfels.positions.numpy()
+        points = self.surfels.positions.cpu().numpy()  # scipy's tree is the host's
         away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=min(5, len(points)))
         return (
             REACH * float(np.quantile(np.asarray(away).reshape(-1, min(5, len(points)))[:, -1], 0.9))

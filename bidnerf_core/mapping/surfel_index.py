@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.moving import moved
 from bidnerf_core.voxel_grid import VoxelGrid
 
 BLOCK_SIDE = 8
@@ -120,13 +121,15 @@ class SurfelIndex:
         rate = torch.eye(3) / self.grid.cell
         offset = 1 - torch.tensor(self.grid.lower, dtype=torch.float64) / self.grid.cell
         base = longest * torch.arange(3, dtype=torch.int32)[:, None]
-        return offset.float()[:, None], rate, torch.cat(parts).int(), base
+        tables = offset.float()[:, None], rate, torch.cat(parts).int(), base
+        return moved(tables, self.entries.device)
 
     @cached_property
     def _blocks(self) -> tuple[Int[Tensor, "b"], Int[Tensor, "b"]]:
         """Each block's ``start`` and ``shift``: a cell's entry is ``start + (number >> shift)``."""
         shift = 3 * self.level.view(-1).long()
-        start = self.first.view(-1) - (torch.arange(shift.numel()) * CELLS_OF_BLOCK >> shift)
+        numbers = torch.arange(shift.numel(), device=shift.device)
+        start = self.first.view(-1) - (numbers * CELLS_OF_BLOCK >> shift)
         return start.int(), shift.int()
 
 

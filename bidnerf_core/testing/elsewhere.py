@@ -1,21 +1,20 @@
 """A pretended device, which proves on any machine that code neither copies between devices nor waits for one.
 
 Tensors on the device "meta" stand for those on a GPU. While ``Elsewhere`` is active they hold values, which are kept and
-computed on the CPU, so that code runs as it does elsewhere; but what a GPU forbids or makes the host wait for raises
-``DeviceFault``: copies to and from the CPU, numbers read from a tensor (``float``, ``bool``, ``item``, ``tolist``), sizes that
-depend on values (``nonzero``, indexing by a mask), and tensors of both devices in one operation.
+computed on the CPU, so that code runs as it does elsewhere; but tensors of both devices in one operation, which a GPU forbids,
+raise ``DeviceFault``. So does, while ``strict``, what makes the host wait for it: copies to and from the CPU, numbers read from a
+tensor (``float``, ``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map
 
 from bidnerf_core import constants
 
@@ -41,7 +40,8 @@ READS = {
     "linalg_lstsq": "is a factorization that waits for the device",
 }
 """Operations that make the host wait, by name."""
-UNCHECKED = {"linalg_inv_ex", "linalg_cholesky_ex", "linalg_lu_factor_ex"}
+INDEXED = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index")
+"""Operations with indices, which may be masks."""
 
 
 class DeviceFault(AssertionError):
@@ -85,7 +85,7 @@ class _There(torch.Tensor):
 
 
 class Elsewhere(TorchDispatchMode):
-    """Makes ``DEVICE`` usable. Faults raise within ``strict()``; outside of it, tensors may be moved and read."""
+    """Makes ``DEVICE`` usable. Faults raise within ``strict()``; outside of it, tensors may be moved and read, not mixed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class Elsewhere(TorchDispatchMode):
 
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
-    flat = tree_flatten((args, kwargs))[0]
+    flat = _leaves((args, kwargs))
     there = any(isinstance(part, _There) for part in flat)
     asked = kwargs.get("device")
     wanted = None if asked is None else torch.device(asked)
@@ -128,10 +128,11 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
     if not there and not made_there:
         return func(*args, **kwargs)
     if strict:
-        _check(func, args, kwargs, flat, there, wanted)
+        _check_waiting(func, args, flat, there, wanted)
+    _check_mixing(func, args, flat, there)
     if made_there or func is _aten._to_copy.default:
         kwargs = kwargs | {"device": torch.device("cpu")}
-    plain_args, plain_kwargs = tree_map(_values, (args, kwargs))
+    plain_args, plain_kwargs = _mapped(_values, (args, kwargs))
     found = func(*plain_args, **plain_kwargs)
     to_host = wanted is not None and wanted.type == "cpu"
     if to_host:
@@ -149,17 +150,15 @@ def _wrapped(func: Any, args: Any, kwargs: dict[str, Any], found: Any) -> Any:
     ]
     if aliases and schema.returns:
         return aliases[0] if len(schema.returns) == 1 else tuple(aliases)
-    return tree_map(lambda part: _There(part) if type(part) is Tensor else part, found)
+    return _mapped(lambda part: _There(part) if type(part) is Tensor else part, found)
 
 
-def _check(
-    func: Any, args: Any, kwargs: dict[str, Any], flat: list[Any], there: bool, wanted: torch.device | None
-) -> None:
+def _check_waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: torch.device | None) -> None:
+    """Raise ``DeviceFault`` for copies and for what the host would wait for."""
     name = func._schema.name.removeprefix("aten::")
     if there and name in READS:
         raise DeviceFault(f"{name} {READS[name]}: the host waits for the device")
-    tensors = [part for part in flat if isinstance(part, Tensor)]
-    here = [part for part in tensors if not isinstance(part, _There)]
+    here = [part for part in flat if isinstance(part, Tensor) and not isinstance(part, _There)]
     if name in ("_to_copy", "copy_"):
         target = wanted.type if wanted is not None else args[0].device.type
         if name == "copy_" and here:
@@ -167,14 +166,47 @@ def _check(
         if name == "_to_copy" and there != (target == DEVICE.type):
             raise DeviceFault(f"a tensor of shape {tuple(args[0].shape)} is copied between devices")
         return
-    masks = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index")
-    if name in masks and any(i is not None and i.dtype == torch.bool for i in args[1]):
+    if name in INDEXED and any(i is not None and i.dtype == torch.bool for i in args[1]):
         raise DeviceFault(
             "an index by a mask has a size that depends on values: the host waits for the device"
         )
-    if there and any(part.ndim > 0 for part in here):
+    if there and name in INDEXED and any(part.ndim > 0 for part in here):
+        raise DeviceFault(f"{name} copies an index between devices")
+
+
+def _check_mixing(func: Any, args: Any, flat: list[Any], there: bool) -> None:
+    """Raise ``DeviceFault`` for tensors of both devices in one operation, but for what PyTorch moves by itself: numbers, and
+    the indices of a tensor on the device.
+    """
+    name = func._schema.name.removeprefix("aten::")
+    if not there or name in ("_to_copy", "copy_"):
+        return
+    if name in INDEXED and isinstance(args[0], _There):
+        flat = _leaves(args[2:])
+    here = [part for part in flat if isinstance(part, Tensor) and not isinstance(part, _There)]
+    if any(part.ndim > 0 for part in here):
         shapes = ", ".join(str(tuple(part.shape)) for part in here if part.ndim > 0)
         raise DeviceFault(f"{name} mixes devices: a tensor of shape {shapes} is on the CPU")
+
+
+def _leaves(parts: Any) -> list[Any]:
+    """Return what lists, tuples and dictionaries hold."""
+    found: list[Any] = []
+    for part in parts.values() if isinstance(parts, dict) else parts:
+        if isinstance(part, list | tuple | dict):
+            found += _leaves(part)
+        else:
+            found.append(part)
+    return found
+
+
+def _mapped(function: Callable[[Any], Any], parts: Any) -> Any:
+    """Return ``parts`` with ``function`` applied to what lists, tuples and dictionaries hold. PyTorch's trees are slower."""
+    if isinstance(parts, dict):
+        return {key: _mapped(function, part) for key, part in parts.items()}
+    if isinstance(parts, list | tuple):
+        return type(parts)([_mapped(function, part) for part in parts])
+    return function(parts)
 
 
 def _values(part: Any) -> Any:

@@ -126,5 +126,5 @@ def _by_point(
     A point (X, Y, Z) is seen at x = X / Z, y = Y / Z, and moves there by (dX - x dZ, dY - y dZ) / Z.
     """
     by_z = -(slope * small.flat[:, :2]).sum(-1, keepdim=True)
-    turned = torch.cat([slope, by_z], -1) @ small.T_last_camera.rotation.to(slope).mT
+    turned = torch.cat([slope, by_z], -1) @ small.rotation.mT
     return turned / depth[:, None, :, None]

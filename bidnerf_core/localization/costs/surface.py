@@ -13,6 +13,7 @@ from bidnerf_core.frames import View
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.moving import moved
 from bidnerf_core.observations import Observations
 from bidnerf_core.pixels import observe
 from bidnerf_core.robust import geman_mcclure_inlier
@@ -61,6 +62,10 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    def to(self, device: torch.device | str) -> PointCloud:
+        """Return the points on another device; the same ones where they lie there already."""
+        return moved(self, device)
+
     def first(self, count: int) -> PointCloud:
         """Return the first ``count`` points: a random sample, since their order is random."""
         parts = (self.points, self.rgb, self.origins, self.coloured)
@@ -79,7 +84,8 @@ class PointCloud:
     def basis(self) -> Float[Tensor, "p 3 6"]:
         """Derivative of the points, in the camera's axes, by an update about their middle."""
         turned = -skew(self.points - self.middle)
-        return torch.cat([torch.eye(3).to(turned).expand_as(turned), turned], dim=-1)
+        eye = torch.eye(3, dtype=turned.dtype, device=turned.device)
+        return torch.cat([eye.expand_as(turned), turned], dim=-1)
 
     @cached_property
     def squares(self) -> Float[Tensor, "p 36"]:
@@ -88,7 +94,7 @@ class PointCloud:
 
     @cached_property
     def pivot(self) -> Pivot:
-        """The middle of the points, about which updates turn."""
+        """The middle of the points, about which updates turn; on the CPU."""
         return Pivot.at_point(self.middle)
 
 
@@ -117,20 +123,23 @@ class SurfaceCost:
     between the surfel's colour and the measured one; w is ``colour_weight``.
 
     Its normal equations are those of iteratively reweighted least squares: the gradient is exact, the Hessian positive
-    semidefinite.
+    semidefinite. All is computed where the surface lies, and returned on the device of the poses.
     """
 
     surface: SurfaceMap
     cloud: PointCloud
     scales: PointScales
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cloud", self.cloud.to(self.surface.device))
+
     def __call__(self, T: SE3) -> NormalEquations:
-        return self._equations(self.correspondences(T))
+        return moved(self._equations(self.correspondences(T)), T.device)
 
     def with_variance(self, T: SE3) -> tuple[NormalEquations, Float[Tensor, "h"]]:
         """Return the normal equations and ``residual_variance``; neighbours are sought once for both."""
         found = self.correspondences(T)
-        return self._equations(found), self._variance(found)
+        return moved((self._equations(found), self._variance(found)), T.device)
 
     def _equations(self, found: Correspondences) -> NormalEquations:
         scales = self.scales
@@ -148,9 +157,8 @@ class SurfaceCost:
     def cost(self, T: SE3) -> Float[Tensor, "h"]:
         """Return the cost without the time that derivatives take."""
         near, alike = self.inliers(self.correspondences(T))
-        if not self.scales.colour_weight:
-            return (1 - near).mean(-1).double()
-        return self._cost(near, alike)
+        colour = self.scales.colour_weight
+        return moved(self._cost(near, alike) if colour else (1 - near).mean(-1).double(), T.device)
 
     def inliers(self, found: Correspondences) -> tuple[Float[Tensor, "h p"], Float[Tensor, "h p"]]:
         """Return how much of an inlier each point is, by its distance and by its colour."""
@@ -160,7 +168,7 @@ class SurfaceCost:
 
     def residual_variance(self, T: SE3) -> Float[Tensor, "h"]:
         """Return the weighted mean of the squared residuals, in units of their scales."""
-        return self._variance(self.correspondences(T))
+        return moved(self._variance(self.correspondences(T)), T.device)
 
     def _variance(self, found: Correspondences) -> Float[Tensor, "h"]:
         scales = self.scales
@@ -175,7 +183,7 @@ class SurfaceCost:
         return (total / weights.sum((0, -1)).clamp(min=1e-12)).double()
 
     def correspondences(self, T: SE3) -> Correspondences:
-        """Match each point with its nearest surfel.
+        """Match each point with its nearest surfel, where the surface lies.
 
         A point beside an edge lies in the plane of the surfel there, but not on the surfel; ``beyond`` accounts for it.
         """

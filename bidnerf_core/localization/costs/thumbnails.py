@@ -11,13 +11,14 @@ from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, interpolate, pad
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.constants import constant
 from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
 
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A view resampled to a small camera without distortion, on the CPU."""
+    """A view resampled to a small camera without distortion. All that follows from it lies where ``rgb`` does."""
 
     camera: Intrinsics
     T_last_camera: SE3
@@ -26,7 +27,7 @@ class Thumbnail:
     @cached_property
     def flat(self) -> Float[Tensor, "n 3"]:
         """The pixels' points on the plane z = 1 of the camera frame, row by row."""
-        return self.camera.unproject(self.camera.pixel_centres()).reshape(-1, 3)
+        return self.camera.unproject(self.camera.pixel_centres()).reshape(-1, 3).to(self.rgb.device)
 
     @cached_property
     def directions(self) -> Float[Tensor, "n 3"]:
@@ -43,12 +44,17 @@ class Thumbnail:
         return self.T_last_camera.translation.to(self.flat)
 
     @cached_property
+    def rotation(self) -> Float[Tensor, "3 3"]:
+        """From the camera's axes to the last camera's."""
+        return self.T_last_camera.rotation.to(self.flat)
+
+    @cached_property
     def slopes(self) -> Float[Tensor, "3 n 2"]:
         return slopes(self.rgb, self.camera)
 
 
 def thumbnail(view: View, width: int) -> Thumbnail:
-    """Return ``view`` reduced to at most ``width`` pixels on its longer side, without distortion, smoothed."""
+    """Return ``view`` reduced to at most ``width`` pixels on its longer side, without distortion, smoothed; on the CPU."""
     camera = view.frame.intrinsics
     small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
     rgb = view.frame.rgb.cpu().float().permute(2, 0, 1)[None]
@@ -64,7 +70,7 @@ def thumbnail(view: View, width: int) -> Thumbnail:
 
 def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     """Convolve with a binomial kernel of 5x5 pixels, about a Gaussian of one pixel; the border is repeated."""
-    kernel = image.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+    kernel = constant((1.0, 4.0, 6.0, 4.0, 1.0), image) / 16
     flat = image.reshape(-1, 1, *image.shape[-2:])
     flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
     flat = conv2d(pad(flat, (0, 0, 2, 2), mode="replicate"), kernel.view(1, 1, 5, 1))

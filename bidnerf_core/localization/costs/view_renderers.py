@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.constants import constant
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.casting import cast
@@ -20,7 +21,7 @@ CHUNK = 16384
 
 @dataclass(frozen=True, eq=False)
 class RayColours:
-    """The rendered colour and distance of rays, on the CPU."""
+    """The rendered colour and distance of rays."""
 
     rgb: Float[Tensor, "r 3"]  # times ``known``, where that is less than 1
     known: Float[Tensor, "r"]  # 0 where a ray leads to where the map has nothing
@@ -30,7 +31,12 @@ class RayColours:
 
 @runtime_checkable
 class ViewRenderer(Protocol):
-    """Renders half-lines with unit directions (world frame, on the CPU)."""
+    """Renders half-lines with unit directions (world frame)."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the rays have to lie, and where their colours will."""
+        ...
 
     def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours: ...
 
@@ -44,10 +50,14 @@ class SurfaceRenderer:
         tuple[float, float, float] | None
     )  # None: a ray that meets nothing looks through a hole of the map
 
+    @property
+    def device(self) -> torch.device:
+        return self.surface.device
+
     def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours:
         found = cast(self.surface, origins, directions)
         met = found.met[:, None].to(origins)
-        behind = origins.new_tensor(self.background or (0.0, 0.0, 0.0))
+        behind = constant(self.background or (0.0, 0.0, 0.0), origins)
         rgb = met * self.surface.surfels.rgb[found.index] + (1 - met) * behind
         known = met[:, 0] if self.background is None else torch.ones_like(found.along)
         return RayColours(rgb, known, found.along.clamp(min=self.surface.cell))
@@ -63,11 +73,11 @@ class FieldRenderer:
 
     @torch.no_grad()
     def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours:
-        middle = origins.new_tensor([self.bounds.lower, self.bounds.upper]).mean(0)
+        lower, upper = (constant(corner, origins) for corner in (self.bounds.lower, self.bounds.upper))
+        middle = (lower + upper) / 2
         passing = ((middle - origins) * directions).sum(-1)
         parts = [
-            self._rendered(*(part.to(self.device) for part in some))
-            for some in zip(origins.split(CHUNK), directions.split(CHUNK), strict=True)
+            self._rendered(*some) for some in zip(origins.split(CHUNK), directions.split(CHUNK), strict=True)
         ]
         rgb, along, opacity = (torch.cat(values) for values in zip(*parts, strict=True))
         along = torch.where(opacity > 0.5, along / opacity.clamp(min=0.5), passing)
@@ -75,4 +85,4 @@ class FieldRenderer:
 
     def _rendered(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = render(self.field, self.bounds.rays(origins, directions), self.bounds.background)
-        return seen.rgb.cpu(), seen.distance.cpu(), seen.opacity.cpu()
+        return seen.rgb, seen.distance, seen.opacity

@@ -19,6 +19,7 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.casting import Cast, cast
+from bidnerf_core.moving import moved
 from bidnerf_core.se3 import SE3
 
 APART, TURNED = 0.15, math.radians(20)
@@ -51,7 +52,7 @@ class ImageSearch:
 
     views: Sequence[View]
     renderer: ViewRenderer
-    middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of what it sees
+    middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of what it sees; on the CPU
     extent: float  # metres: size of the scene
     has_background: bool
     scales: ColourScales = field(default_factory=ColourScales)
@@ -62,7 +63,7 @@ class ImageSearch:
 
         Rays cast from the keyframes give the typical distance of the scene, and whether it has a background.
         """
-        seen = _from_keyframes(surface, thumbnail(problem.views[-1], 16))
+        seen = _from_keyframes(surface, moved(thumbnail(problem.views[-1], 16), surface.device))
         away = float(seen.along[seen.met].median()) if bool(seen.met.any()) else surface.extent
         has_background = float(seen.met.float().mean()) < 1 - OPEN
         renderer = SurfaceRenderer(surface, problem.bounds.background if has_background else None)
@@ -73,7 +74,7 @@ class ImageSearch:
     def in_field(problem: Problem, start: SE3) -> ImageSearch:
         """Return a search in a field's coarsest level; a rendering from the start gives the scene's typical distance."""
         renderer = FieldRenderer(problem.level(0), problem.bounds, problem.device)
-        small = thumbnail(problem.views[-1], 16)
+        small = moved(thumbnail(problem.views[-1], 16), renderer.device)
         T = start.to(small.flat)
         directions = T.rotate(torch.nn.functional.normalize(small.flat, dim=-1))
         away = float(renderer(T.translation.expand_as(directions), directions).along.median())
@@ -81,12 +82,13 @@ class ImageSearch:
         return ImageSearch(problem.views, renderer, torch.tensor([0.0, 0.0, away]), extent, True)
 
     def __call__(self, T: SE3, stages: Sequence[ImageStage] = IMAGE_STAGES) -> SearchResult:
-        """Search from the hypotheses T (h)."""
+        """Search from the hypotheses T (h), by steps on the device of the renderer."""
         distinct = Distinct(self.middle, APART * self.extent, TURNED)
-        return search(T, self._stages(stages), distinct, keep_runner_up=True)
+        device = self.renderer.device
+        return search(T, self._stages(stages), distinct, keep_runner_up=True, device=device)
 
     def thumbnails(self, width: int) -> list[Thumbnail]:
-        return [thumbnail(view, width) for view in self.views]
+        return [moved(thumbnail(view, width), self.renderer.device) for view in self.views]
 
     @property
     def pivot(self) -> Pivot:
@@ -94,7 +96,9 @@ class ImageSearch:
 
     def _stages(self, stages: Sequence[ImageStage]) -> Iterator[SearchStage]:
         for stage in stages:
-            cost = ImageCost(self.renderer, self.thumbnails(stage.width), self.scales, self.middle)
+            cost = ImageCost(
+                self.renderer, self.thumbnails(stage.width), self.scales, self.middle.to(self.renderer.device)
+            )
             yield SearchStage(cost, self.pivot, stage.steps, stage.keep, damping=1e-2)
 
 

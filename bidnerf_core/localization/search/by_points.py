@@ -14,6 +14,7 @@ from bidnerf_core.localization.covariance import FINEST
 from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_points
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.moving import moved
 from bidnerf_core.se3 import SE3
 
 JUDGED = 0.02
@@ -47,10 +48,16 @@ POINT_STAGES = (
 
 @dataclass(frozen=True, eq=False)
 class PointSearch:
-    """Aligns measured points with a surface, starting from hypotheses all over the scene."""
+    """Aligns measured points with a surface, starting from hypotheses all over the scene.
+
+    Steps are taken where the surface lies. Poses come from the CPU and return to it.
+    """
 
     surface: SurfaceMap
     cloud: PointCloud
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cloud", self.cloud.to(self.surface.device))
 
     def __call__(self, start: SE3 | None, count: int, generator: Generator) -> SearchResult:
         """Search once, from ``count`` fresh hypotheses."""
@@ -59,15 +66,15 @@ class PointSearch:
     def from_poses(self, T: SE3, stages: tuple[PointStage, ...] = POINT_STAGES) -> SearchResult:
         """Search from the hypotheses T (h)."""
         apart = APART * self.surface.extent
-        return search(
-            T, self._stages(stages), Distinct(self.cloud.middle, apart, TURNED), keep_runner_up=False
-        )
+        distinct = Distinct(self.cloud.middle, apart, TURNED)
+        return search(T, self._stages(stages), distinct, keep_runner_up=False, device=self.surface.device)
 
     @property
     def surroundings(self) -> Surroundings:
+        """What hypotheses are drawn from; on the CPU, where the same seed draws the same ones for every device."""
         surface = self.surface
-        middle = surface.surfels.positions.median(0).values
-        return Surroundings(SE3.from_matrix(surface.keyframes), surface.extent, middle, self.cloud.middle)
+        keyframes, middle = SE3.from_matrix(surface.keyframes), surface.surfels.positions.median(0).values
+        return moved(Surroundings(keyframes, surface.extent, middle, self.cloud.middle), "cpu")
 
     def judge(self, points: int | None = None) -> SurfaceCost:
         """Return the cost of the first ``points`` (all by default), at the one scale at which poses are compared."""

@@ -13,7 +13,9 @@ from torch import Tensor
 from bidnerf_core.localization.normal_equations import Cost
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.moving import moved
 from bidnerf_core.se3 import SE3
+from bidnerf_core.waiting import without_waiting
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +41,7 @@ class Distinct:
 
     def __call__(self, T: SE3) -> Bool[Tensor, "h"]:
         """Return which of the poses are different from the first."""
-        middles = T.apply(self.middle.double())
+        middles = T.apply(self.middle.to(T.translation))
         away = torch.linalg.vector_norm(middles - middles[0], dim=-1) > self.distance
         trace = (T.rotation[0].mT @ T.rotation).diagonal(dim1=-2, dim2=-1).sum(-1)
         return away | (trace < 1 + 2 * math.cos(self.angle))
@@ -47,7 +49,7 @@ class Distinct:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The poses that remain at the end of a search, and how much better the best is than any different one."""
+    """The poses that remain at the end of a search, and how much better the best is than any different one; on the CPU."""
 
     T: SE3  # (h), best first
     scores: Float[Tensor, "h"]
@@ -57,20 +59,26 @@ class SearchResult:
 
 
 def search(
-    start: SE3, stages: Iterable[SearchStage], distinct: Distinct, keep_runner_up: bool
-) -> SearchResult:
+    start: SE3, stages: Iterable[SearchStage], distinct: Distinct, keep_runner_up: bool,
+    device: torch.device | None = None,
+) -> SearchResult:  # fmt: skip
     """Run the stages on the hypotheses ``start`` (h) and return the poses that remain.
+
+    Steps are taken on ``device``, by default where the hypotheses lie.
 
     With ``keep_runner_up``, if the best poses of a stage are all the same answer, the last of them is replaced by the best
     different one, and the margin is that of the last stage. Without it, the margin is that of the last stage that still had
-    different poses.
+    different poses. The host waits for the device between stages, but not within one.
     """
-    T, paths, margin = start, [start[None]], math.inf
-    losses = [torch.zeros((0, len(start.translation)), dtype=torch.float64)]
+    device = start.device if device is None else device
+    T, distinct = start.to(device), moved(distinct, device)
+    paths, margin = [T[None]], math.inf
+    losses = [torch.zeros((0, len(T.translation)), dtype=torch.float64, device=device)]
     scores = losses[0]
     for stage in stages:
-        done = descend(stage.cost, T, stage.steps, stage.pivot.moved, stage.damping)
-        scores = done.equations.cost if stage.score is None else stage.score(done.T)
+        with without_waiting():
+            done = descend(stage.cost, T, stage.steps, stage.pivot.to(device).moved, stage.damping)
+            scores = done.equations.cost if stage.score is None else stage.score(done.T)
         best = _best(done.T, scores, stage.keep, distinct if keep_runner_up else None)
         paths = [path[:, best] for path in (*paths, done.poses[1:])]
         losses = [values[:, best] for values in (*losses, done.costs[:-1])]
@@ -80,7 +88,8 @@ def search(
             margin = now if keep_runner_up or math.isfinite(now) else margin
         scores = scores[best]
     path = SE3.cat([path[:, 0] for path in paths])
-    return SearchResult(T, scores, margin, path, torch.cat([values[:, 0] for values in losses]))
+    found = SearchResult(T, scores, margin, path, torch.cat([values[:, 0] for values in losses]))
+    return moved(found, "cpu")
 
 
 def _best(T: SE3, scores: Float[Tensor, "h"], count: int, distinct: Distinct | None) -> Int[Tensor, "k"]:

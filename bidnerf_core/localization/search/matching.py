@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bidnerf_core.mapping.features import squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.moving import moved
 
 EXACT = 4_000
 """The number of landmarks up to which the search is exhaustive, and no cells are built."""
@@ -33,10 +34,13 @@ class LandmarkMatcher:
 
     Above ``EXACT`` landmarks it uses an inverted file: k-means divides the landmarks into about sqrt(n) cells, and only the
     cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a matcher.
+
+    Descriptors are compared where those of ``landmarks`` lie; everything else that is done with landmarks is done on the CPU.
     """
 
     def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
-        self.landmarks = landmarks
+        self.landmarks = landmarks.to("cpu")
+        self._descriptors = landmarks.descriptors
         self._cells: _Cells | None = None
         if len(landmarks) > EXACT:
             self._cells = _Cells(landmarks.descriptors, seed)
@@ -46,14 +50,15 @@ class LandmarkMatcher:
     ) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
         """Return the squared distances and the indices of the ``count`` nearest landmarks, nearest first.
 
-        If there are fewer landmarks, the remaining distances are infinite and the indices 0.
+        If there are fewer landmarks, the remaining distances are infinite and the indices 0. Both are on the CPU.
         """
+        there = descriptors.to(self._descriptors.device)
         if self._cells is not None and len(descriptors) * len(self.landmarks) > COMPARISONS:
-            return self._cells.nearest(descriptors, count)
-        distances = descriptors.new_full((len(descriptors), count), 0).float() + torch.inf
+            return moved(self._cells.nearest(there, count), "cpu")
+        distances = torch.full((len(descriptors), count), torch.inf)
         index = torch.zeros(distances.shape, dtype=torch.long)
         if len(self.landmarks):
-            found = _smallest(squared_distances(descriptors, self.landmarks.descriptors), count)
+            found = moved(_smallest(squared_distances(there, self._descriptors), count), "cpu")
             distances[:, : found[0].shape[1]], index[:, : found[0].shape[1]] = found
         return distances, index
 
@@ -78,10 +83,10 @@ class _Cells:
         probed = _smallest(squared_distances(descriptors, self._centres), PROBED)[1]
         cell, order = probed.flatten().sort(stable=True)
         query = order // probed.shape[1]
-        distances = torch.full((probed.numel(), count), torch.inf)
-        index = torch.zeros(distances.shape, dtype=torch.long)
+        distances = torch.full((probed.numel(), count), torch.inf, device=probed.device)
+        index = torch.zeros(distances.shape, dtype=torch.long, device=probed.device)
         values = descriptors.float()
-        bounds = torch.searchsorted(cell, torch.arange(len(self._centres) + 1)).tolist()
+        bounds = torch.searchsorted(cell, torch.arange(len(self._centres) + 1, device=cell.device)).tolist()
         for number, (begin, end) in enumerate(pairwise(bounds)):
             first, last = self._last[number - 1] if number else 0, self._last[number]
             if begin == end or first == last:
@@ -101,7 +106,7 @@ def _k_means(
 ) -> Float[Tensor, "c d"]:
     """Return the centres of k-means cells (Lloyd 1982) on a sample; a centre that loses all its members stays in place."""
     sample = torch.randperm(len(descriptors), generator=generator)[: SAMPLE * count]
-    values = descriptors[sample].float()
+    values = descriptors[sample.to(descriptors.device)].float()
     centres = values[:count].clone()
     for _ in range(K_MEANS_ROUNDS):
         cell = _nearest_centre(values, centres)

@@ -39,10 +39,11 @@ class Occluder:
     @torch.no_grad()
     def share_in_front(self, surface: SurfaceMap, T_world_camera: SE3) -> float:
         """Return the share of its points that lie clearly before the surface, or before nothing, as seen from a pose."""
-        ends = T_world_camera.apply(self.points.double())
-        lines = (ends - T_world_camera.translation).float()
+        T = T_world_camera.to(surface.device)
+        ends = T.apply(self.points.to(T.translation))
+        lines = (ends - T.translation).float()
         length = torch.linalg.vector_norm(lines, dim=-1)
-        met = cast(surface, T_world_camera.translation.float().expand_as(lines), lines / length[:, None])
+        met = cast(surface, T.translation.float().expand_as(lines), lines / length[:, None])
         before = ~met.met | (length < met.along - CLEARLY_BEFORE * surface.extent)
         return float(before.float().mean())
 

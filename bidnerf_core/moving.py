@@ -1,0 +1,57 @@
+"""Moving what consists of tensors to a device."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+_T = TypeVar("_T")
+
+
+def moved(value: _T, device: torch.device | str) -> _T:
+    """Return ``value`` with every tensor in it on ``device``; ``value`` itself is left as it is.
+
+    Tensors are found in modules, in the fields of dataclasses, and in lists, tuples and dictionaries of these; whatever else
+    there is stays the same object, and so does all of ``value`` if it lies on ``device`` already. What a dataclass has cached
+    is computed anew on the device.
+    """
+    found: Any = _moved(value, torch.device(device))
+    return found
+
+
+def _moved(value: Any, device: torch.device) -> Any:
+    if isinstance(value, nn.Module):
+        tensors = (*value.parameters(), *value.buffers())
+        return value if all(_is_on(t, device) for t in tensors) else copy.deepcopy(value).to(device)
+    if isinstance(value, Tensor):
+        return value if _is_on(value, device) else value.to(device)
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = {part.name: getattr(value, part.name) for part in fields(value)}
+        there = _moved(parts, device)
+        return value if there is parts else _with_fields(value, there)
+    if isinstance(value, dict):
+        content = {key: _moved(part, device) for key, part in value.items()}
+        return content if any(content[key] is not value[key] for key in value) else value
+    if type(value) in (list, tuple):
+        items = [_moved(part, device) for part in value]
+        same = all(new is old for new, old in zip(items, value, strict=True))
+        return value if same else type(value)(items)
+    return value
+
+
+def _with_fields(value: Any, parts: dict[str, Any]) -> Any:
+    """Return another dataclass of the same kind with these fields, those that its constructor does not take among them."""
+    found = object.__new__(type(value))
+    for name, part in parts.items():
+        object.__setattr__(found, name, part)
+    return found
+
+
+def _is_on(tensor: Tensor, device: torch.device) -> bool:
+    """Return whether a tensor lies on ``device``, whose number, where it has none, does not matter."""
+    here = tensor.device
+    return here.type == device.type and device.index in (None, here.index)
