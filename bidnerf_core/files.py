@@ -63,6 +63,11 @@ def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGES
         raise InputError(f"{path}: cannot be read ({error.strerror}), expected {expected}") from error
 
 
+def is_file(path: Path) -> bool:
+    """Return whether a name that a file states is that of a file; no name that the system refuses is one."""
+    return os.path.isfile(path)
+
+
 def temporary(path: Path) -> Path:
     """Return a new name beside ``path`` that ``is_temporary`` recognises."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}")

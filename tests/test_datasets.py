@@ -563,6 +563,8 @@ BAD_DESCRIPTIONS: dict[str, tuple[Callable[[Json], Any], str]] = {
         edit_frame(file_path="images/nix"),
         "images/nix, expected that file (also tried with .png, .jpg, .jpeg added)",
     ),
+    "image of too long a name": (edit_frame(file_path="a" * 300), "frame 1 (aaa"),
+    "depth of too long a name": (edit_frame(depth_file_path="a" * 300), ": no depth image "),
     "depth missing": (edit_frame(depth_file_path="nix.png"), "frame 1 (images/r_1.png): no depth image "),
     "size": (edit_file(w=13), "frame 1 (images/r_1.png): r_1.png is 12x8, expected 13x8 as w and h say"),
 }

@@ -23,6 +23,7 @@ from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import is_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.orientation import UPRIGHT
@@ -113,6 +114,6 @@ def _frame(model: Path, folder: Path, image: ModelImage, cameras: dict[int, Intr
     if image.camera not in cameras:
         raise InputError(f"{model}: image {image.name!r} has the camera {image.camera}, which cameras lacks")
     name = PurePosixPath(image.name.replace("\\", "/"))
-    if not (folder / name).is_file():
+    if not is_file(folder / name):
         raise InputError(f"{folder / name}: no such file, expected it as {model} has that image")
     return ColmapFrame(name, folder / name, cameras[image.camera], image.T_camera_model.inverse())

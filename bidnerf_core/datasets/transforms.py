@@ -27,6 +27,7 @@ from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
 from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import is_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, background_colour, over, read_header, read_image
 
@@ -95,7 +96,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
     def _image_file(self, frame: FrameRecord) -> Path:
         tried = [Path(f"{self.path / frame.file_path}{suffix}") for suffix in TRIED_SUFFIXES]
         for path in tried:
-            if path.is_file():
+            if is_file(path):
                 return path
         suffixes = ", ".join(suffix for suffix in TRIED_SUFFIXES if suffix)
         raise frame.record.error(
@@ -104,7 +105,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
 
     def _depth_file(self, frame: FrameRecord) -> Path:
         path = self.path / str(frame.depth_path)
-        if not path.is_file():
+        if not is_file(path):
             raise frame.record.error(f"no depth image {path}, expected that file (depth_file_path)")
         return path
 

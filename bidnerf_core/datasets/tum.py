@@ -36,6 +36,7 @@ from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows, require_
 from bidnerf_core.datasets.trajectories import LARGEST_GAP, read_trajectory
 from bidnerf_core.depth_images import DepthReader
 from bidnerf_core.errors import InputError
+from bidnerf_core.files import is_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.images import Background, over, read_header, read_image
 from bidnerf_core.se3 import SE3
@@ -153,7 +154,7 @@ class TumDataset(OpaqueDataset[TumFrame]):
 
     def _posed(self, frame: TumFrame, name: str) -> tuple[Frame, SE3 | None]:
         for listed in (frame, frame.depth):
-            if listed is not None and not listed.image.is_file():
+            if listed is not None and not is_file(listed.image):
                 raise InputError(f"{listed.where}: no image {listed.image}, expected that file")
         header = read_header(frame.image)
         camera = self._camera.at(frame.image, header.width, header.height)
