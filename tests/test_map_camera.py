@@ -9,7 +9,11 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, Intrinsics, View
-from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
+from bidnerf_core.localization.acceptance import (
+    LandmarkThresholds,
+    doubtful_intrinsics,
+    landmark_verdict,
+)
 from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
@@ -209,8 +213,18 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
     added = found.unresolved_calibration - certain.unresolved_calibration
     expected = found.miscalibration.alternative_probability * torch.outer(shift, shift)
     torch.testing.assert_close(added, expected)
-    indifferent = LandmarkThresholds(alternative=1.0)
+    indifferent = LandmarkThresholds(alternative_motion=1.0)
     assert landmark_verdict(found, indifferent).outcome is not Outcome.MISCALIBRATED
+
+
+def test_the_farther_off_a_pose_may_be_the_less_probable_that_has_to_be(landmarks: LandmarkMap) -> None:
+    found = localized(landmarks, with_focal(1.05), with_focal(1.05))  # of another camera, and told apart
+    motion = float(found.alternative_shift[:3].norm()) / found.distance
+    assert 0.02 < motion < 0.1
+    thresholds = LandmarkThresholds(alternative=0.5, alternative_motion=0.2 * motion)
+    for probability, doubtful in ((0.19, False), (0.21, True)):
+        judged = replace(found.miscalibration, alternative_probability=torch.tensor(probability))
+        assert doubtful_intrinsics(replace(found, miscalibration=judged), thresholds) is doubtful
 
 
 def test_a_misplaced_principal_point_is_corrected_too(landmarks: LandmarkMap) -> None:

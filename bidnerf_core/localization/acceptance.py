@@ -138,9 +138,9 @@ class LandmarkThresholds:
     miscalibration: float = 0.1  # probability that the given intrinsics are wrong, at most
     # probability that the intrinsics not taken, given or the map's, are right, at most, ...
     alternative: float = 0.2
-    alternative_motion: float = (
-        0.005  # ... if they move the camera by more than this share of the landmarks' distance
-    )
+    # ... if they move the camera by more than this share of the landmarks' distance; at most as well of the expected motion, the
+    # product of both, since the farther off a pose may be, the less probable that has to be
+    alternative_motion: float = 0.005
     precision: float = 0.03  # standard deviation of the position, as a share of that distance, at most
 
 
@@ -178,9 +178,10 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
 
 def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> bool:
     """Return whether the intrinsics that were not taken, the given or the map's, may be right and would move the pose far."""
-    shift = float(torch.linalg.vector_norm(found.alternative_shift[:3]))
-    possible = float(found.miscalibration.alternative_probability) > thresholds.alternative
-    return possible and shift > thresholds.alternative_motion * found.distance
+    motion = float(torch.linalg.vector_norm(found.alternative_shift[:3])) / found.distance
+    probability = float(found.miscalibration.alternative_probability)
+    most = thresholds.alternative_motion
+    return motion > most and (probability > thresholds.alternative or probability * motion > most)
 
 
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
