@@ -29,6 +29,8 @@ MOST_CAMERAS = 9
 """Number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
 MOST_RESIDUAL = 0.002
 """Root mean square difference, as a share of the image's width, above which a correction does not describe another camera."""
+UNUSUAL = 0.03
+"""Share of the map's images up to which a camera among theirs is at the edge of one that focuses, rather than another one."""
 GRID = 7
 """Rows and columns of pixels at which cameras are compared."""
 TOLD_APART = 2.0
@@ -89,15 +91,17 @@ class MapCamera:
 def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera | None:
     """Return the camera of a map's images of the same shape as those with the ``given`` intrinsics; None if there are none.
 
-    It is the one that the given intrinsics agree with or, if there is no such one, that with the median focal length. None
-    as well if its lens is so different that ``Calibration`` cannot describe the difference.
+    It is the one that the given intrinsics agree with or, if that took hardly any of the images, that with the median focal
+    length. None as well if its lens is so different that ``Calibration`` cannot describe the difference.
     """
     alike = [
         camera.resized(given.width, given.height)
         for camera in cameras
         if same_aspect((camera.width, camera.height), (given.width, given.height))
     ]
-    alike = next(([camera] for camera in alike if _agree(given, camera)), alike)
+    agreeing = [camera for camera in alike if _agree(given, camera)]
+    if len(agreeing) > UNUSUAL * len(alike):
+        alike = agreeing[:1]
     alike.sort(key=lambda camera: camera.fx)
     count = min(len(alike), MOST_CAMERAS)
     chosen = [alike[i] for i in torch.linspace(0, len(alike) - 1, count).round().int().tolist()]
