@@ -55,12 +55,20 @@ def test_noise_grows_with_the_distance_and_is_the_same_for_numbers_and_tensors(n
 
 
 def test_negative_deviations_are_refused() -> None:
-    with pytest.raises(InputError, match="expected coefficients of 0 or more"):
+    with pytest.raises(InputError, match="expected finite coefficients of 0 or more"):
         DepthNoise(linear=-0.01)
-    with pytest.raises(InputError, match="expected 0 or more"):
-        replace(UNKNOWN, scale=math.nan)
-    with pytest.raises(InputError, match="expected 0 or more"):
+    with pytest.raises(InputError, match="expected finite numbers of 0 or more"):
         DepthSensorModel(0.01, DepthNoise(), offset=-1)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_deviations_that_are_not_finite_are_refused(value: float) -> None:
+    for part in ("constant", "linear", "quadratic"):
+        with pytest.raises(InputError, match="expected finite coefficients of 0 or more"):
+            DepthNoise(**{part: value})
+    for part in ("scale", "offset"):
+        with pytest.raises(InputError, match="expected finite numbers of 0 or more"):
+            replace(UNKNOWN, **{part: value})
 
 
 def test_another_name_is_an_error_that_lists_the_names() -> None:
