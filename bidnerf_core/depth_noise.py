@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth_sensor import DepthNoise
-from bidnerf_core.depth_steps import DepthSteps, depth_steps
+from bidnerf_core.depth_steps import DepthSteps, depth_steps, lines_of_sensor
 from bidnerf_core.robust import MAD_TO_SIGMA
 
 WINDOW_SIDE = 8
@@ -35,6 +35,8 @@ def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -
     without gaps. Errors that neighbouring pixels share are not noticed, such as those of a warped image, or what is left of
     a lidar's after interpolation. Where hardly a window shows a plane, relief of the scene counts as noise.
     """
+    if min(depth.shape) < WINDOW_SIDE:
+        return None
     windows = _residuals(depth, intrinsics)
     if len(windows) < LEAST_WINDOWS:
         return None
@@ -48,8 +50,10 @@ def _residuals(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> Float[Ten
     The inverse depth of a plane is linear in the coordinates of the image, whichever its slant. A deviation of 1/z by e is
     one of z by the share ``z e``.
     """
-    z = _windows(depth.detach().cpu().double())
-    image = intrinsics.unproject(intrinsics.pixel_centres(torch.float64))
+    depth = depth.detach().cpu()
+    rows, columns = lines_of_sensor(depth)
+    z = _windows(depth[rows][:, columns].double())
+    image = intrinsics.unproject(intrinsics.pixel_centres(torch.float64)[rows][:, columns])
     x = torch.stack([_windows(image[..., axis]) for axis in (0, 1)], dim=-1)
     whole = ((z > 0) & z.isfinite()).all(-1)
     z, x = z[whole], x[whole]
