@@ -10,10 +10,10 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth_sensor import DepthNoise
-from bidnerf_core.depth_steps import DepthSteps, depth_steps
+from bidnerf_core.depth_steps import DepthSteps, depth_steps, lines_of_sensor
 from bidnerf_core.robust import MAD_TO_SIGMA
 
-WINDOW = 8
+WINDOW_SIDE = 8
 """Rows and columns of the pixels to which a plane is fitted."""
 PLANAR = 0.25
 """Quantile of the windows' residuals: as many are taken for planes. The others may show edges, curved things and relief."""
@@ -21,7 +21,7 @@ QUANTILE_BIAS = 1.11
 """The noise over that quantile, where all windows are planes and all pixels independent."""
 LEAST_WINDOWS = 20
 """Least number of windows in a range of depths from which its noise is estimated."""
-MOST_RANGES = 8
+DEPTH_RANGES = 8
 """Largest number of ranges of depths, with equal numbers of windows."""
 ENOUGH_SPREAD = 1.5
 """Least ratio of the farthest to the nearest range with which the growth of the noise is estimated."""
@@ -35,6 +35,8 @@ def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -
     without gaps. Errors that neighbouring pixels share are not noticed, such as those of a warped image, or what is left of
     a lidar's after interpolation. Where hardly a window shows a plane, relief of the scene counts as noise.
     """
+    if min(depth.shape) < WINDOW_SIDE:
+        return None
     windows = _residuals(depth, intrinsics)
     if len(windows) < LEAST_WINDOWS:
         return None
@@ -48,8 +50,10 @@ def _residuals(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> Float[Ten
     The inverse depth of a plane is linear in the coordinates of the image, whichever its slant. A deviation of 1/z by e is
     one of z by the share ``z e``.
     """
-    z = _windows(depth.detach().cpu().double())
-    image = intrinsics.unproject(intrinsics.pixel_centres(torch.float64))
+    depth = depth.detach().cpu()
+    rows, columns = lines_of_sensor(depth)
+    z = _windows(depth[rows][:, columns].double())
+    image = intrinsics.unproject(intrinsics.pixel_centres(torch.float64)[rows][:, columns])
     x = torch.stack([_windows(image[..., axis]) for axis in (0, 1)], dim=-1)
     whole = ((z > 0) & z.isfinite()).all(-1)
     z, x = z[whole], x[whole]
@@ -63,13 +67,17 @@ def _residuals(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> Float[Ten
 
 def _windows(image: Float[Tensor, "h w"]) -> Float[Tensor, "n p"]:
     """Return the pixels of windows side by side; rows and columns that are left over are not used."""
-    return image.unfold(0, WINDOW, WINDOW).unfold(1, WINDOW, WINDOW).reshape(-1, WINDOW**2)
+    return (
+        image.unfold(0, WINDOW_SIDE, WINDOW_SIDE)
+        .unfold(1, WINDOW_SIDE, WINDOW_SIDE)
+        .reshape(-1, WINDOW_SIDE**2)
+    )
 
 
 def _by_depth(windows: Float[Tensor, "n 2"], steps: DepthSteps | None) -> Float[Tensor, "b 2"]:
     """Return the median depth and the relative noise of ranges of depths with equal numbers of windows."""
     ordered = windows[windows[:, 0].argsort()]
-    count = min(MOST_RANGES, len(windows) // LEAST_WINDOWS)
+    count = min(DEPTH_RANGES, len(windows) // LEAST_WINDOWS)
     found = []
     for part in ordered.tensor_split(count):
         middle = float(part[:, 0].median())

@@ -6,6 +6,7 @@ the offset is the same in all pixels of an image and moves the whole pose; noise
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import overload
 
@@ -24,8 +25,8 @@ class DepthNoise:
     quadratic: float = 0.0  # metres a square metre; sensors that measure disparity have this kind of noise
 
     def __post_init__(self) -> None:
-        if not min(self.constant, self.linear, self.quadratic) >= 0:
-            raise InputError(f"depth noise is {self}, expected coefficients of 0 or more")
+        if not all(0 <= value < math.inf for value in (self.constant, self.linear, self.quadratic)):
+            raise InputError(f"depth noise is {self}, expected finite coefficients of 0 or more")
 
     @overload
     def deviation(self, depth: float) -> float: ...
@@ -49,9 +50,9 @@ class DepthSensorModel:
     offset: float = 0.0  # metres, of the constant that all depths of the sensor share
 
     def __post_init__(self) -> None:
-        if not min(self.scale, self.offset) >= 0:
+        if not all(0 <= value < math.inf for value in (self.scale, self.offset)):
             raise InputError(
-                f"depth sensor has scale {self.scale} and offset {self.offset}, expected 0 or more"
+                f"depth sensor has scale {self.scale} and offset {self.offset}, expected finite numbers of 0 or more"
             )
 
 

@@ -6,13 +6,15 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 REPEATED = 4
 """Least mean number of pixels with the same depth; where it is less, depth is continuous or most of its values do not occur."""
 RANGE_VALUES, MOST_RANGES = 8, 40
 """Least number of distinct values in a range of depths of which the median spacing is taken, and largest number of ranges."""
+LEAST_LINES, MOST_LINES = 8, 0.8
+"""Least number of different rows, and of columns, of a depth image that was resampled, and largest share of all of them."""
 BETTER = 2.0
 """Factor by which the misfit of constant steps must exceed that of growing ones before these are assumed."""
 
@@ -45,12 +47,35 @@ def depth_steps(depth: Float[Tensor, "h w"]) -> DepthSteps | None:
     ``f b / d`` has a spacing that is proportional to its square. So have the rows of an exact image of a floor, which cannot be
     distinguished from that.
     """
+    rows, columns = lines_of_sensor(depth)
+    depth = depth[rows][:, columns]
     measured = depth[(depth > 0) & depth.isfinite()].double().cpu()
     values, counts = measured.unique(return_counts=True)
     if len(values) < RANGE_VALUES or len(measured) < REPEATED * len(values):
         return None
     spacings = _spacings(values, counts)
     return None if not len(spacings) else _fitted(spacings)
+
+
+def lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[Tensor, "c"]]:
+    """Return the numbers of the rows and columns that do not repeat the one before.
+
+    Depth of a lower resolution than its image was resampled to the nearest measurement: its repeated pixels are no
+    measurements of their own. All lines are returned where few repeat another, such as empty ones along a border, and where
+    hardly any would be left, as of an exact image of a wall.
+    """
+    found = []
+    for lines in (depth, depth.T):
+        new = torch.ones(len(lines), dtype=torch.bool, device=depth.device)
+        new[1:] = (lines[1:] != lines[:-1]).any(-1)
+        found.append(new.nonzero()[:, 0])
+    if any(
+        not LEAST_LINES <= len(some) <= MOST_LINES * size
+        for some, size in zip(found, depth.shape, strict=True)
+    ):
+        found = [torch.arange(size, device=depth.device) for size in depth.shape]
+    rows, columns = found
+    return rows, columns
 
 
 def _spacings(values: Float[Tensor, "v"], counts: Tensor) -> Float[Tensor, "b 2"]:

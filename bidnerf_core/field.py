@@ -76,6 +76,15 @@ def levels(field: RadianceField) -> tuple[RadianceField, ...]:
     return tuple(getattr(field, "levels", None) or (field,))
 
 
+def device_of(field: RadianceField) -> torch.device:
+    """Return the device of a field's parameters or buffers; the CPU for a field that has none."""
+    for kind in ("parameters", "buffers"):
+        first = next(iter(getattr(field, kind, tuple)()), None)
+        if isinstance(first, torch.Tensor):
+            return first.device
+    return torch.device("cpu")
+
+
 LARGEST_LENGTH = 1e15
 """Metres. Squares of larger lengths come close to the largest number of single precision."""
 

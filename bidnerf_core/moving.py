@@ -9,7 +9,24 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
+from bidnerf_core.errors import InputError
+
 _T = TypeVar("_T")
+
+
+def working_device(device: torch.device | str) -> torch.device:
+    """Return a device after computing on it: whether it works here does not follow from its name.
+
+    Raises ``InputError`` for one that does not.
+    """
+    try:
+        found = torch.device(device)
+        torch.ones((), device=found).item()
+    except (RuntimeError, AssertionError, TypeError) as error:  # torch's own builds differ in which
+        raise InputError(
+            f"no device {str(device)!r} to compute on here, expected one as cpu or cuda"
+        ) from error
+    return found
 
 
 def moved(value: _T, device: torch.device | str) -> _T:

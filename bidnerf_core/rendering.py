@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.constants import constant
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds, device_of
 from bidnerf_core.se3 import SE3
 from bidnerf_core.waiting import may_wait
 
@@ -145,7 +145,7 @@ def render_image(
     """Render a whole image from a pose, ``chunk`` rays at a time."""
     ray = intrinsics.unproject(intrinsics.pixel_centres()).reshape(-1, 3)
     length = torch.linalg.vector_norm(ray, dim=-1)
-    device = next((p.device for p in getattr(field, "parameters", lambda: iter(()))()), torch.device("cpu"))
+    device = device_of(field)
     T = T_world_camera.to(dtype=torch.float32, device=device)
     parts = []
     for directions in (ray / length[:, None]).to(device).split(chunk):

@@ -91,6 +91,7 @@ def converted(kind: Any, value: Any, where: str) -> Any:
     elif kind is int and type(value) is int:
         if abs(value) <= LARGEST_INTEGER:
             return value
+        raise InputError(f"{where}: found {_shown(value)}, expected an integer of at most 64 bits")
     elif type(value) is kind or (value is None and kind is type(None)):
         return value
     raise InputError(f"{where}: found {_shown(value)}, expected {_name(kind)}")

@@ -11,8 +11,9 @@ import dataclasses
 import functools
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Annotated, Any, TypeVar, cast
 
 from bidnerf_core.errors import InputError, spelling_hint
@@ -28,8 +29,11 @@ class Range:
     least: float
     most: float = math.inf
 
-    def __contains__(self, value: float) -> bool:
-        return abs(value) <= LARGEST_NUMBER and self.least <= value <= self.most
+    def __contains__(self, value: object) -> bool:
+        if not isinstance(value, Real):
+            return False
+        number = cast(float, value)
+        return abs(number) <= LARGEST_NUMBER and self.least <= number <= self.most
 
     def __str__(self) -> str:
         if self.most == math.inf:
@@ -41,7 +45,7 @@ class Range:
 class Above(Range):
     """The range of a setting that excludes its lower limit ``least`` and includes its upper limit ``most``."""
 
-    def __contains__(self, value: float) -> bool:
+    def __contains__(self, value: object) -> bool:
         return super().__contains__(value) and value != self.least
 
     def __str__(self) -> str:
@@ -61,8 +65,8 @@ class OneOf:
 
     table: Mapping[str, Any]
 
-    def __contains__(self, value: str) -> bool:
-        return value in self.table
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, Hashable) and value in self.table
 
     def __str__(self) -> str:
         return f"one of {', '.join(self.table)}"
@@ -87,23 +91,24 @@ class Settings:
     """
 
     def __post_init__(self) -> None:
-        for name, allowed in _allowed(type(self)).items():  # type: ignore[arg-type]
+        for name, (allowed, optional) in _allowed(type(self)).items():  # type: ignore[arg-type]
             value = getattr(self, name)
-            if value is not None and value not in allowed:
-                raise InputError(f"{name} is {value}, expected {allowed}")
+            if value not in allowed and not (optional and value is None):
+                raise InputError(f"{name} is {value!r}, expected {allowed}")
 
 
 @functools.cache
-def _allowed(kind: Any) -> dict[str, Any]:
-    """Return what is allowed for each field of ``kind`` that limits its values."""
-    found: dict[str, Any] = {}
+def _allowed(kind: Any) -> dict[str, tuple[Range | OneOf, bool]]:
+    """Return what is allowed for each field of ``kind`` that limits its values, and whether None is allowed besides."""
+    found: dict[str, tuple[Range | OneOf, bool]] = {}
     for name, hint in typing.get_type_hints(kind, include_extras=True).items():
+        optional = type(None) in typing.get_args(hint)
         for part in (hint, *typing.get_args(hint)):
             if typing.get_origin(part) is typing.Literal:
-                found[name] = OneOf(dict.fromkeys(typing.get_args(part)))
+                found[name] = OneOf(dict.fromkeys(typing.get_args(part))), optional
             for note in getattr(part, "__metadata__", ()):
                 if isinstance(note, Range | OneOf):
-                    found[name] = note
+                    found[name] = note, optional
     return found
 
 

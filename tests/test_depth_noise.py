@@ -90,7 +90,20 @@ def test_gross_errors_and_edges_do_not_count_as_noise(generator: Generator) -> N
     assert relative(estimated_depth_noise(depth, CAMERA), 2.0) == pytest.approx(0.005, rel=0.3)
 
 
+@pytest.mark.parametrize("size", [(960, 720), (720, 540)], ids=["threefold", "not a whole factor"])
+def test_depth_of_a_lower_resolution_than_its_image_has_the_noise_of_its_own_pixels(
+    size: tuple[int, int], generator: Generator
+) -> None:
+    own = noisy(corridor(), lambda z: 0.01 * z, generator)
+    rows, columns = ((torch.arange(n) + 0.5) * m / n for n, m in zip(size[::-1], own.shape, strict=True))
+    resampled = own[rows.long()][:, columns.long()]
+    found = estimated_depth_noise(resampled, Intrinsics.from_hfov(60.0, *size))
+    assert relative(found, 2.0) == pytest.approx(0.01, rel=0.2)
+    assert depth_steps(resampled) is None
+
+
 def test_images_with_little_depth_give_no_estimate() -> None:
+    assert estimated_depth_noise(torch.ones(4, 4), CAMERA.scaled(1 / 80)) is None
     depth = torch.zeros((240, 320))
     assert estimated_depth_noise(depth, CAMERA) is None
     depth[:24, :24] = 1.0

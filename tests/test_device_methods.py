@@ -145,7 +145,7 @@ def test_a_tracker_follows_depth_without_colours() -> None:
 def test_descriptors_are_compared_there_and_answers_returned(
     exhaustive: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(matching, "EXACT", 10**9 if exhaustive else 50)
+    monkeypatch.setattr(matching, "EXHAUSTIVE", 10**9 if exhaustive else 50)
     monkeypatch.setattr(matching, "COMPARISONS", 10**9 if exhaustive else 0)
     landmarks = ground().landmarks
     assert landmarks is not None

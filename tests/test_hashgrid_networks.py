@@ -12,7 +12,7 @@ from bidnerf_hashgrid.networks import log_density_and_rgb
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(networks, "CPU_CHUNK", 8)
+    monkeypatch.setattr(networks, "NETWORK_CHUNK", 8)
 
 
 def made(colour_layers: int = 2) -> tuple[nn.Sequential, nn.Sequential]:

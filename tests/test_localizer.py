@@ -22,6 +22,7 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.localization import METHODS, AutoConfig, pose_from_matrix, settings_of
 from bidnerf_core.pixels import depth_rays_of
 from bidnerf_core.se3 import SE3
+from bidnerf_core.testing.elsewhere import DEVICE, Elsewhere
 from bidnerf_hashgrid import backend as hashgrid
 from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap
@@ -222,12 +223,12 @@ def test_no_start_is_needed_where_the_map_has_a_surface() -> None:
 
 
 def test_a_device_that_is_another_one_gets_a_copy_of_the_field() -> None:
-    """The device "meta" stands for a GPU: it is another device, and one that every machine has."""
     field = hashgrid.build(tiny.config(), BOUNDS)
     own = FieldMap(field, BOUNDS)
     before = {name: value.clone() for name, value in field.state_dict().items()}
-    moved = Localizer(own, "bid", device="meta", warm_up=False)
-    assert {p.device.type for p in moved.map.field.parameters()} == {"meta"}  # type: ignore[attr-defined]
+    with Elsewhere():
+        moved = Localizer(own, "bid", device=DEVICE, warm_up=False)
+        assert {p.device for p in moved.map.field.parameters()} == {DEVICE}  # type: ignore[attr-defined]
     assert own.field is field
     assert moved.map is not own
     assert {p.device.type for p in field.parameters()} == {"cpu"}

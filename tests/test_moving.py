@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
@@ -147,3 +148,13 @@ def test_a_tensor_that_is_forgotten_is_named(part: str) -> None:
             holder = getattr(holder, step)
         object.__setattr__(holder, name, torch.zeros(3))
         assert elsewhere_of(there, DEVICE) == [f"map.{part}"]
+
+
+@pytest.mark.parametrize("device", ["mars", "cuda:99", "meta", ""])
+def test_a_device_that_does_not_work_is_named(device: str) -> None:
+    message = re.escape(f"no device {str(device)!r} to compute on here")
+    stored = whole_map("vanilla")
+    assert stored.surface is not None
+    for move in (stored.to, stored.surface.to, landmarks().to):
+        with pytest.raises(InputError, match=message):
+            move(device)

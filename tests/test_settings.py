@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -33,6 +34,7 @@ class Outer(Settings):
     name: Literal["a", "b"] = "a"
     entry: Annotated[str, OneOf(TABLE)] = "first"
     free: bool = False
+    some: Annotated[int, Range(0, 9)] | None = 3
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
@@ -70,16 +72,26 @@ def test_a_range_without_an_upper_end_is_finite() -> None:
 
 
 def test_names_are_those_of_a_literal_or_of_a_table_that_may_grow(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"^name is c, expected one of a, b$"):
+    with pytest.raises(InputError, match=r"^name is 'c', expected one of a, b$"):
         Outer(name="c")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"^entry is second, expected one of first$"):
+    with pytest.raises(InputError, match=r"^entry is 'second', expected one of first$"):
         Outer(entry="second")
     monkeypatch.setitem(TABLE, "second", 2)
     assert Outer(entry="second").entry == "second"
 
 
+@pytest.mark.parametrize(
+    "values",
+    [{"rays": "8"}, {"rays": None}, {"entry": None}, {"entry": ["first"]}, {"name": {}}, {"some": "3"}],
+)
+def test_values_of_another_type_are_refused(values: dict[str, Any]) -> None:
+    ((name, value),) = values.items()
+    with pytest.raises(InputError, match=rf"^{name} is {re.escape(repr(value))}, expected "):
+        Outer(**values)
+
+
 def test_nothing_is_a_value_where_it_is_declared() -> None:
-    assert Outer(level=None).level is None
+    assert Outer(level=None, some=None).level is None
     with pytest.raises(InputError, match="rays"):
         from_flat(Outer, {"rays": None}, "here")
 
@@ -89,6 +101,7 @@ def test_flat_names_set_what_is_nested() -> None:
     assert found == Outer(Inner(share=0.25), 3, -1, free=True)
     assert to_flat(found) == {
         "share": 0.25, "scale": 1.0, "any_size": 0.0, "rays": 3, "level": -1, "name": "a", "entry": "first", "free": True,
+        "some": 3,
     }  # fmt: skip
 
 
@@ -96,7 +109,7 @@ def test_flat_names_set_what_is_nested() -> None:
     ("values", "message"),
     [
         ({"shar": 0.1}, "^here: Outer has no setting 'shar', did you mean 'share'[?]$"),
-        ({"zzz": 0.1}, "^here: Outer has no setting 'zzz', expected some of share, scale, .*free$"),
+        ({"zzz": 0.1}, "^here: Outer has no setting 'zzz', expected some of share, scale, .*some$"),
         ({"inner": {}}, "^here: Outer has no setting 'inner'"),
         ({"share": 2.0}, "^here: share is 2.0, expected 0 to 1$"),
         ({"share": "much"}, "^here: share: found 'much', expected float$"),

@@ -19,7 +19,8 @@ from torch.autograd.function import once_differentiable
 
 from bidnerf_hashgrid.threads import concurrently, threads_for
 
-CPU_CHUNK = 4096
+NETWORK_CHUNK = 4096
+"""Number of points whose hidden units stay in the cache of a core."""
 
 Layers = list[tuple[Tensor, Tensor]]
 """Weight (out in) and bias (out) of linear layers with rectifiers between them."""
@@ -112,7 +113,7 @@ def _differentiate(
 
 
 def _chunks(count: int) -> list[slice]:
-    return [slice(start, min(start + CPU_CHUNK, count)) for start in range(0, count, CPU_CHUNK)]
+    return [slice(start, min(start + NETWORK_CHUNK, count)) for start in range(0, count, NETWORK_CHUNK)]
 
 
 class _Evaluate(torch.autograd.Function):

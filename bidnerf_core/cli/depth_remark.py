@@ -28,4 +28,4 @@ def depth_remark(frame: Frame, settings: Any) -> str | None:
     of_disparity = (
         "; its steps grow with the square of the distance" if steps is not None and steps.of_disparity else ""
     )
-    return f"depth noise at {z:.3g} m is about {estimated:.2%}, {expected:.2%} is usual of {sensor!r}{of_disparity}"
+    return f"depth noise at {z:.3g} m is about {estimated:.2%}; that of {sensor!r} is usually {expected:.2%}{of_disparity}"

@@ -56,7 +56,7 @@ T_COLOUR_DEPTH = SE3(
     ),
 ).normalized()
 """https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html, as used by ACE's ``setup_7scenes.py``."""
-KINECT = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
+SEVEN_SCENES_KINECT = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
 
 COLOUR = re.compile(r"(frame-\d+)\.color\.(?:png|jpe?g)", re.IGNORECASE)
 SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
@@ -92,7 +92,7 @@ class SceneFrame:
 class SevenScenesReader:
     """The reader of folders of 7-Scenes; poses and depth are moved from ``sensor`` to the colour camera, if there is one."""
 
-    sensor: DepthSensor | None = KINECT
+    sensor: DepthSensor | None = SEVEN_SCENES_KINECT
     camera: Intrinsics | Path | None = None
     expected = "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)"
 

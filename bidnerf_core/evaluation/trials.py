@@ -30,6 +30,7 @@ from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trial, TrialResult
 from bidnerf_core.frames import View
 from bidnerf_core.localization import Localization, Localizer, settings_of
+from bidnerf_core.moving import working_device
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.settings import to_flat
@@ -111,7 +112,7 @@ def one_thread() -> Iterator[None]:
 @lru_cache(maxsize=4)
 def opened(map_folder: str, data: str, device: str = "cpu") -> tuple[Map, Dataset]:
     """Return the map and the dataset of two folders or names of closed-form scenes, each read once a process."""
-    where = _device(device)
+    where = working_device(device)
     stored = closed_form_map(map_folder) if is_closed_form(map_folder) else load_map(Path(map_folder), where)
     if is_closed_form(data):
         return stored, closed_form_data(data)
@@ -164,16 +165,6 @@ def _result(
         "inputs": to_plain(digests),
     }
     return from_plain(TrialResult, plain | more, "result")
-
-
-def _device(name: str) -> torch.device:
-    """Return a device after computing on it: whether it works here does not follow from its name."""
-    try:
-        device = torch.device(name)
-        torch.ones((), device=device).item()
-    except (RuntimeError, AssertionError) as error:  # torch's own builds differ in which
-        raise InputError(f"no device {name!r} to compute on here, expected one as cpu or cuda") from error
-    return device
 
 
 def _scalars(error: PoseError) -> ScalarPoseError | None:

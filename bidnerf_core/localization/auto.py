@@ -54,8 +54,8 @@ FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
 """Reasons for which landmarks reject a pose that nothing else can put right: with wrong intrinsics, the surface is not found at
 the right place either.
 """
-VAGUE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
-"""Reasons for which landmarks reject a pose that they found, as opposed to one that they hardly tell."""
+UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
+"""Reasons for which a pose that landmarks determine is rejected: it is not accurate, or not probable, enough."""
 TRUSTED = 0.8
 """Confidence from which on a pose by landmarks is not compared with the surface."""
 FEWER = 0.05
@@ -123,7 +123,7 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     if matcher is None:
         return found
     found = _compared_with_landmarks(found, problem, matcher, config, seed, began)
-    if answer is not None and found.outcome is Outcome.TOO_FEW_MATCHES and answer.verdict.outcome in VAGUE:
+    if answer is not None and found.outcome is Outcome.TOO_FEW_MATCHES and answer.verdict.outcome in UNSURE:
         return localization_by_landmarks(problem, answer, began)
     return found
 

@@ -71,8 +71,8 @@ def tried_landmarks(
 ) -> LandmarkMap:
     """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on images that are held out.
 
-    The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks. Raises ``InputError`` if there
-    are no landmarks.
+    The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks. Raises
+    ``InputError`` if there are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
     held_out = _held_out(len(views))

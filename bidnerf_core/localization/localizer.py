@@ -13,11 +13,12 @@ from torch import Tensor
 from bidnerf_core.constants import constant
 from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel, find_depth_sensor
 from bidnerf_core.errors import InputError
+from bidnerf_core.field import device_of
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only, has_distances
 from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
-from bidnerf_core.localization.problem import SceneMap, device_of, on_device, rig
+from bidnerf_core.localization.problem import SceneMap, on_device, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.observations import Observations

@@ -12,11 +12,11 @@ from torch import nn
 
 from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.field import RadianceField, SceneBounds, device_of, levels
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.moving import moved
+from bidnerf_core.moving import moved, working_device
 from bidnerf_core.observations import Observations
 from bidnerf_core.se3 import SE3
 
@@ -38,19 +38,10 @@ class SceneMap(Protocol):
     def surface(self) -> SurfaceMap | None: ...
 
 
-def device_of(field: RadianceField) -> torch.device:
-    """Return the device of a field's parameters or buffers; the CPU for a field that has none."""
-    for kind in ("parameters", "buffers"):
-        first = next(iter(getattr(field, kind, tuple)()), None)
-        if isinstance(first, torch.Tensor):
-            return first.device
-    return torch.device("cpu")
-
-
 def on_device(scene: _Map, device: torch.device | str) -> _Map:
     """Return a map whose field, surface and landmarks lie on ``device``; the one given is left as it is.
 
-    Raises ``InputError`` where the field cannot be moved.
+    Raises ``InputError`` for a device that does not work here, and where the field cannot be moved.
     """
     field = scene.field
     if not isinstance(field, nn.Module):
@@ -58,7 +49,7 @@ def on_device(scene: _Map, device: torch.device | str) -> _Map:
             f"device {device}: the map's field is a {type(field).__name__}, expected an nn.Module"
         )
     parts = {name: getattr(scene, name, None) for name in ("field", "surface", "landmarks")}
-    there = moved(parts, device)
+    there = moved(parts, working_device(device))
     if there is parts:
         return scene
     found = copy.copy(scene)

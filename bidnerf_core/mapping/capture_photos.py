@@ -14,6 +14,7 @@ from torch import Tensor
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.view_pairs import likely_pairs
+from bidnerf_core.robust import MAD_TO_SIGMA
 
 LARGEST = 800
 """Pixels along the longer side to which photos are reduced: detail that is finer serves no map."""
@@ -69,7 +70,7 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
 
 def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
     """Return which values exceed both ``least`` and ``OUTLYING`` robust standard deviations of all about zero."""
-    return values > max(least, OUTLYING * 1.4826 * float(values.abs().median()))
+    return values > max(least, OUTLYING * MAD_TO_SIGMA * float(values.abs().median()))
 
 
 def _measured(frame: Frame) -> tuple[float, float, float, float]:

@@ -10,6 +10,7 @@ from bidnerf_core.depth_sensor import UNKNOWN
 from bidnerf_core.frames import Frame
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
+from bidnerf_core.robust import MAD_TO_SIGMA
 
 DEPTH_EDGE = 0.05
 """Largest relative change of the depth around a keypoint; more indicates a depth edge."""
@@ -55,7 +56,7 @@ def keypoint_depth_noise(
     if int(known.sum()) < ENOUGH_DEPTHS:
         return UNKNOWN.noise.linear
     off = depth[known] / sightings.in_camera(points)[known, 2] - 1
-    return max(1e-4, 1.4826 * float(off.abs().median()))
+    return max(1e-4, MAD_TO_SIGMA * float(off.abs().median()))
 
 
 def placed(

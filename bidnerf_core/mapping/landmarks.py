@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.moving import moved
+from bidnerf_core.moving import moved, working_device
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class LandmarkMap:
         Only descriptors are compared there. Keypoints, RANSAC and the resection of a pose are computed on the CPU, by OpenCV,
         poselib and scipy, for which ``LandmarkMatcher`` keeps a copy of the other tensors.
         """
-        return moved(self, device)
+        return moved(self, working_device(device))
 
     def correlation_of(self, matches: int) -> float:
         """Return the number of keypoints that count as one in an image with so many ``matches``.

@@ -16,6 +16,7 @@ from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, pose_updates
 from bidnerf_core.mapping.resection import LEAST_NOISE
 from bidnerf_core.mapping.triangulation import noise
+from bidnerf_core.robust import MAD_TO_SIGMA
 from bidnerf_core.se3 import SE3
 
 ROUNDS = 3
@@ -97,7 +98,7 @@ def _deviations(
 
 def _spread(values: Float[Tensor, "v 3"]) -> float:
     """Return a robust standard deviation about zero."""
-    return max(LEAST_DEVIATION, 1.4826 * float(values.abs().median()))
+    return max(LEAST_DEVIATION, MAD_TO_SIGMA * float(values.abs().median()))
 
 
 def _motion(

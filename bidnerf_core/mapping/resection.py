@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.robust import MAD_TO_SIGMA
 from bidnerf_core.rotations import rotation_of
 from bidnerf_core.se3 import SE3
 
@@ -258,7 +259,7 @@ class _Residuals:
 def _spread(residual: Array, unknowns: int) -> float:
     """Return a robust standard deviation along an axis, corrected for the number of unknowns that were fitted."""
     spare = max(1.0, residual.size - unknowns) / residual.size
-    return 1.4826 * _median(np.abs(residual).ravel()) / spare**0.5
+    return MAD_TO_SIGMA * _median(np.abs(residual).ravel()) / spare**0.5
 
 
 def _cross(a: Array, b: Array) -> Array:

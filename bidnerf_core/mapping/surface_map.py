@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.mapping.surfel_index import SurfelIndex
 from bidnerf_core.mapping.surfels import Surfels, surfel_bytes
-from bidnerf_core.moving import moved
+from bidnerf_core.moving import moved, working_device
 from bidnerf_core.voxel_grid import VoxelGrid
 
 REACH = 0.7
@@ -35,7 +35,7 @@ class SurfaceMap:
 
     def to(self, device: torch.device | str) -> SurfaceMap:
         """Return the surface on another device; the same one where it lies there already."""
-        return moved(self, device)
+        return moved(self, working_device(device))
 
     @property
     def grid(self) -> VoxelGrid:

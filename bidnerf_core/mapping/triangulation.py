@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.robust import MAD_TO_SIGMA
+
 TRIANGULATION_STEPS = 8
 """Number of Gauss-Newton steps; from the linear solution, four or five are enough."""
 DAMPING = 1e-6
@@ -117,7 +119,7 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
     seen = observations_per_point(sightings, len(points))
     spare = (1 - 1.5 / seen[sightings.point]).clamp(min=0.25)  # (2 m - 3) / 2 m for m observations
     residual = sightings.residuals(points) / spare.sqrt()[:, None]
-    return 1.4826 * float(residual.abs().median())
+    return MAD_TO_SIGMA * float(residual.abs().median())
 
 
 def _damped(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,8 +23,8 @@ Change: TypeAlias = Callable[[Frame, float, Generator], Frame]
 class WholeNumbers(Range):
     """The whole numbers from ``least`` to ``most``."""
 
-    def __contains__(self, value: float) -> bool:
-        return super().__contains__(value) and float(value).is_integer()
+    def __contains__(self, value: object) -> bool:
+        return super().__contains__(value) and float(cast(float, value)).is_integer()
 
     def __str__(self) -> str:
         return f"a whole number, {super().__str__()}"

@@ -13,7 +13,7 @@ from bidnerf_core.mapping.features import squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.moving import moved
 
-EXACT = 4_000
+EXHAUSTIVE = 4_000
 """The number of landmarks up to which the search is exhaustive, and no cells are built."""
 COMPARISONS = 4_000_000
 """The number of keypoint-landmark pairs up to which comparing all of them is faster than searching cells."""
@@ -32,7 +32,7 @@ ROWS = 256
 class LandmarkMatcher:
     """Finds the landmarks whose descriptors are nearest to those of keypoints.
 
-    Above ``EXACT`` landmarks it uses an inverted file: k-means divides the landmarks into about sqrt(n) cells, and only the
+    Above ``EXHAUSTIVE`` landmarks it uses an inverted file: k-means divides the landmarks into about sqrt(n) cells, and only the
     cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a matcher.
 
     Descriptors are compared where those of ``landmarks`` lie; everything else that is done with landmarks is done on the CPU.
@@ -42,7 +42,7 @@ class LandmarkMatcher:
         self.landmarks = landmarks.to("cpu")
         self._descriptors = landmarks.descriptors
         self._cells: _Cells | None = None
-        if len(landmarks) > EXACT:
+        if len(landmarks) > EXHAUSTIVE:
             self._cells = _Cells(landmarks.descriptors, seed)
 
     def nearest(

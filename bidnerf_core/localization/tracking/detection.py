@@ -24,7 +24,7 @@ from bidnerf_core.localization.search.landmark_evidence import (
 )
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery, pixel_threshold
-from bidnerf_core.localization.search.matching import EXACT, LandmarkMatcher
+from bidnerf_core.localization.search.matching import EXHAUSTIVE, LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import Miscalibration, TakenIntrinsics
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
@@ -34,7 +34,7 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import resect
 from bidnerf_core.se3 import SE3
 
-NEARBY = EXACT
+NEARBY = EXHAUSTIVE
 """Largest number of landmarks that are compared with an image: those that most images of the map saw."""
 WIDE = 2.0
 """Multiple of the radius of guided matching from which on keypoints are compared with all landmarks in view. Guided matching
