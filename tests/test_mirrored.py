@@ -84,3 +84,4 @@ def test_auto_rejects_a_mirror_image_and_accepts_the_photo() -> None:
     found = localizer(in_a_mirror().frame)
     assert not found.converged
     assert found.outcome in (Outcome.MIRRORED, Outcome.TOO_FEW_MATCHES, Outcome.RENDERING_MISMATCH)
+    assert found.confidence is None

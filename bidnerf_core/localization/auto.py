@@ -99,7 +99,7 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
     if answer is not None and matcher is not None:
         rejection = _mirror_rejection(problem, matcher, answer.found.log10_nfa, seed)
-        answer = answer if rejection is None else replace(answer, verdict=rejection)
+        answer = answer if rejection is None else replace(answer, verdict=rejection, confidence=None)
     has_points = _measured_points(problem) >= LEAST_POINTS
     doubtful = answer is not None and has_points and _is_doubtful(problem, answer)
     if answer is not None and not doubtful and _is_final(answer.verdict.outcome, has_points):
@@ -154,6 +154,11 @@ def _mirror_rejection(
     return mirror_evidence(matcher, problem.views, seed=seed).rejection(log10_nfa)
 
 
+def _rejected_by_mirror(found: Localization, twin: Verdict) -> Localization:
+    """Return a pose as rejected; its confidence, which follows from how well it fits, does not hold."""
+    return replace(found, outcome=twin.outcome, reason=f"{twin.reason}; {found.reason}", confidence=None)
+
+
 def _compared_with_landmarks(
     found: Localization,
     problem: Problem,
@@ -179,13 +184,13 @@ def _compared_with_landmarks(
         )
         outcome = Outcome.CONVERGED if supported else refined.outcome
         if twin is not None:
-            return replace(refined, outcome=twin.outcome, reason=f"{twin.reason}; {refined.reason}")
+            return _rejected_by_mirror(refined, twin)
         return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
     if found.converged and (twin := _mirror_rejection(problem, matcher, 0.0, seed)) is not None:
-        return replace(found, outcome=twin.outcome, reason=f"{twin.reason}; {found.reason}")
+        return _rejected_by_mirror(found, twin)
     return replace(found, seconds=time.perf_counter() - began)
 
 
