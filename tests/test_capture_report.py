@@ -23,6 +23,8 @@ from bidnerf_core.mapping.capture_report import CaptureReport, CoverageRecord, G
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
 from bidnerf_core.mapping.landmarks import HeldOutTrial
 from bidnerf_core.rendering import render_image
+from bidnerf_core.scenes.closed_form import views
+from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.serialization import from_plain, to_plain
 from landmark_scene import Points, looking_in, ring
@@ -229,3 +231,11 @@ def test_a_picture_is_drawn_of_cameras_gaps_and_landmarks(tmp_path: Path) -> Non
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
     with pytest.raises(InputError, match="cannot be written"):
         draw_capture(report, None, None, tmp_path)
+
+
+def test_exact_poses_of_small_images_are_not_called_wrong() -> None:
+    """A pose by twenty landmarks scatters more than the usual one by forty."""
+    small = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
+    images = views(demo_object(), small, orbit(3.5, 60, seed=0))
+    found = surveyed(tracked_views(images), images)
+    assert [photo.name for photo in found.photos if "badly posed" in photo.problems] == []

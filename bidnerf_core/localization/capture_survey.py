@@ -88,16 +88,22 @@ def _sound(views: Sequence[View], problems: Sequence[tuple[PhotoProblem, ...]]) 
 def _by_own_landmarks(
     seen: TrackedKeypoints, positions: Float[Tensor, "n 3"], views: Sequence[View]
 ) -> dict[int, Relocation]:
-    """Compare the poses that fit the photos' own landmarks with the given ones, by their scatter in this capture."""
+    """Compare the poses that fit the photos' own landmarks with the given ones, by their scatter in this capture.
+
+    Poses by fewer landmarks than usual scatter more: their variance is inversely proportional to the number.
+    """
     sightings = seen.sightings
     updates = pose_updates(seen, positions, noise(sightings, positions))
     if len(updates) < ENOUGH_IMAGES:
         return {}
     scatter = robust_covariance(torch.stack(list(updates.values())))
     depth, image = sightings.in_camera(positions)[:, 2], seen.image
+    count = torch.bincount(image, minlength=len(views))
+    usual = float(count[list(updates)].double().median())
     found = {}
     for number, update in updates.items():
-        deviations = float((update @ torch.linalg.solve(scatter, update)).clamp(min=0).sqrt())
+        own = scatter * max(1.0, usual / float(count[number]))
+        deviations = float((update @ torch.linalg.solve(own, update)).clamp(min=0).sqrt())
         distance = float(depth[image == number].median())
         found[number] = Relocation(update, deviations, image_motion(update, views[number], distance))
     return found
