@@ -125,6 +125,8 @@ def align_points_and_render(place: Place) -> list[Tensor]:
     return place.descended(Sum(tuple(term.scaled for term in terms)), about, T)
 
 
+GRADIENT = 2
+"""Place of the gradient in what ``Place.descended`` returns; the Hessian follows it."""
 STEPS = {
     "aligning points": align_points,
     "comparing images": compare_images,
@@ -140,10 +142,13 @@ def test_steps_stay_on_the_device_and_lead_where_those_of_the_cpu_do(name: str) 
         found = STEPS[name](Place(mode))
         assert {part.device for part in found} == {DEVICE}
         found = [part.cpu() for part in found]
-    for ours, theirs in zip(found, expected, strict=True):
-        # A field renders more samples where the host must not wait for their number.
-        close = 1e-4 if name == "aligning points and rendering" else 0.0
-        torch.testing.assert_close(ours, theirs, rtol=close, atol=close)
+    # A field renders more samples where the host must not wait for their number, which changes how sums are rounded: poses
+    # differ by some 1e-7, and the gradient by that times the Hessian.
+    rendered = name == "aligning points and rendering"
+    close, steepest = (1e-4 if rendered else 0.0), float(expected[3].abs().max())
+    for number, (ours, theirs) in enumerate(zip(found, expected, strict=True)):
+        apart = 1e-6 * steepest if rendered and number == GRADIENT else close
+        torch.testing.assert_close(ours, theirs, rtol=close, atol=apart)
 
 
 def copied(value: Tensor) -> Tensor:
