@@ -102,7 +102,7 @@ def run_case(case: Case, folder: Path) -> Outcome:
         defects += defects_of_files(folder, before)
     for cache in (opened, opened_points):
         cache.cache_clear()
-    return Outcome(ending, seconds, used, tuple(defects))
+    return Outcome(ending, seconds, used, tuple(defect.replace(str(folder), "{}") for defect in defects))
 
 
 def through(case: Case) -> str:

@@ -45,7 +45,7 @@ class Thumbnail:
 
     @cached_property
     def rotation(self) -> Float[Tensor, "3 3"]:
-        """From the camera's axes to the last camera's."""
+        """Rotation that takes the axes of the camera to those of the last camera."""
         return self.T_last_camera.rotation.to(self.flat)
 
     @cached_property
