@@ -3,12 +3,12 @@ r"""Learn the confidence of method ``auto`` from answers to images with and with
     python benchmarks/faults.py MAP:DATA ... --tuning-frames --name NAME
     python benchmarks/confidence.py benchmarks/results/NAME.rows.jsonl [...] [--write]
 
-Each row of ``benchmarks/faults.py`` that holds diagnostics is an example; it is right within 5 degrees and 0.05 units. A
-logistic regression with a small ridge is fitted, one for poses by landmarks and one for poses by the surface. Its quality is
-measured by leaving out one scene at a time: the model is fitted to the other scenes and tested on the one left out (expected
-calibration error in ten bins, wrong answers among the accepted, right ones among the rejected). A harder test leaves out one
-half of the faults as well, so that it meets kinds of failure that it never saw. ``--write`` fits to all examples and stores the
-weights in the package.
+Each row of ``benchmarks/faults.py`` that holds diagnostics is an example, unless the query's mirror image ruled it out; it is
+right within 5 degrees and 0.05 units. A logistic regression with a small ridge is fitted, one for poses by landmarks and one
+for poses by the surface. Its quality is measured by leaving out one scene at a time: the model is fitted to the other scenes
+and tested on the one left out (expected calibration error in ten bins, wrong answers among the accepted, right ones among the
+rejected). A harder test leaves out one half of the faults as well, so that it meets kinds of failure that it never saw.
+``--write`` fits to all examples and stores the weights in the package.
 """
 
 from __future__ import annotations
@@ -27,12 +27,15 @@ from scipy.special import expit
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.localization import confidence
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.result import Outcome
 
 RESULTS = Path(__file__).resolve().parent / "results"
 STORED = Path(confidence.__file__).with_suffix(".json")
 RIDGE = 0.005
 """Penalty of the squared weights of standardised features, relative to the mean log loss."""
 BINS = 10
+WITHOUT_CONFIDENCE = (Outcome.MIRRORED, Outcome.AMBIGUOUS)
+"""Outcomes of answers that a mirror image of the query rules out, however well they fit: they state no confidence."""
 FEWEST = 30
 """Least number of right and of wrong examples from which a model is learned."""
 
@@ -49,13 +52,13 @@ class Example:
 
 
 def examples(paths: Sequence[Path]) -> list[Example]:
-    """Read the rows that hold diagnostics; no answer to an image of another scene is right."""
+    """Read the rows whose answers state a confidence; none to an image of another scene is right."""
     found = []
     for path in paths:
         for text in path.read_text().splitlines():
             row = json.loads(text)
             row = row.get("row", row)
-            if row.get("diagnostics"):
+            if row.get("diagnostics") and row["outcome"] not in WITHOUT_CONFIDENCE:
                 found.append(example(row))
     return found
 

@@ -10,7 +10,14 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.depth_sensor import DepthSensorModel
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_diagnostics, landmark_verdict
+from bidnerf_core.localization.acceptance import (
+    LandmarkDiagnostics,
+    LandmarkThresholds,
+    alternative_motion,
+    landmark_diagnostics,
+    landmark_verdict,
+)
+from bidnerf_core.localization.camera_evidence import log_odds_by_rendering
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
@@ -27,12 +34,14 @@ from bidnerf_core.localization.method_settings import (
 from bidnerf_core.localization.normal_equations import Sum
 from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.result import Localization, Verdict
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.calibration import Calibration
 from bidnerf_core.se3 import SE3
 
 POINTS = 2000
@@ -45,6 +54,10 @@ DEPTH_SCALE_NOISE = 0.01
 """Relative standard deviation of the depth scale that a few landmarks give."""
 PRIOR_WIDTH = 2.0
 """Standard deviation of the prior of the depth scale over that of the sensor's scale, since single sensors are off by far more."""
+
+
+CONSIDERED = 0.02
+"""Probability of the intrinsics not taken, given or the map's, from which on renderings are asked as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +90,42 @@ def answer_by_landmarks(
     out.
     """
     found = propose(matcher, problem.views, seed=seed)
+    if found is not None and rays:
+        found = _with_camera_judged(problem, matcher, found, seed)
     return None if found is None else fused_answer(problem, found, landmark_verdict(found), rays, seed)
+
+
+def _with_camera_judged(
+    problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, seed: int
+) -> LandmarkPose:
+    """Return a pose again with what renderings say about the camera, where landmarks do not tell which intrinsics are right."""
+    evidence, limits = NO_EVIDENCE, LandmarkThresholds()
+    if landmark_verdict(found).outcome not in (Outcome.CONVERGED, Outcome.MISCALIBRATED):
+        return found
+    judged = found.miscalibration
+    if judged.alternative_probability > CONSIDERED and alternative_motion(found) > limits.alternative_motion:
+        taken = _log_odds_against(problem, found, judged.alternative, seed)
+        evidence = CameraEvidence(map_camera=taken if found.takes_map_camera else -taken)
+        found = propose(matcher, problem.views, seed=seed, evidence=evidence) or found
+    judged = found.miscalibration
+    if not found.estimates_calibration and judged.worst[1] > limits.miscalibration:
+        evidence = replace(evidence, mistaken=-_log_odds_against(problem, found, judged.apparent, seed))
+        found = propose(matcher, problem.views, seed=seed, evidence=evidence) or found
+    return found
+
+
+def _log_odds_against(
+    problem: Problem, found: LandmarkPose, correction: Float[Tensor, "4"], seed: int
+) -> float:
+    """Return the logarithm of the odds, by renderings, that the intrinsics taken are right and those with a correction wrong."""
+    taken, change = corrected(problem, found), Calibration(*correction.tolist())
+    views = tuple(
+        replace(view, frame=replace(view.frame, intrinsics=change.applied(view.frame.intrinsics)))
+        for view in taken.views
+    )
+    return log_odds_by_rendering(
+        taken, replace(taken, views=views, start=found.with_correction(correction)), seed
+    )
 
 
 def fused_answer(

@@ -57,7 +57,11 @@ class Residuals:
         The confidence weights the equations of a step, but not this cost. Otherwise a step could lower the cost by moving
         rays to where residuals are steep and their confidence is low.
         """
-        return 2 * (self.weights * self.objective.rho(self.value)).sum((-1, -2)).to(self.home)
+        return self.ray_costs().sum(-1)
+
+    def ray_costs(self) -> Float[Tensor, "h n"]:
+        """Return each ray's part of the cost."""
+        return 2 * (self.weights * self.objective.rho(self.value)).sum(-1).to(self.home)
 
     def normal_equations(self) -> NormalEquations:
         """Return the equations of iteratively reweighted least squares."""

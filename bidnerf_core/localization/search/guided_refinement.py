@@ -88,8 +88,9 @@ def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches,
     fit, found = _guided(query, query.prior, fit, found, most, RADII)
     correlation = query.landmarks.correlation_of(len(found))
     free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
-    taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate=query.prior.log_focal > 0)
-    wrong = Miscalibration.of(free, query.landmarks, taken)
+    evidence, approximate = query.evidence, query.prior.log_focal > 0
+    taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate, evidence.map_camera)
+    wrong = Miscalibration.of(free, query.landmarks, taken, evidence.mistaken)
     if wrong.worst[1] > CERTAIN and not query.prior.log_focal:
         taken = TakenIntrinsics()
         fit, found = _guided(query, NOMINAL, free, found, most, RADII[1:])

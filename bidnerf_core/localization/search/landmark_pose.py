@@ -79,6 +79,10 @@ class LandmarkPose:
         by_calibration = self.slope * deviations
         return self.covariance + by_calibration @ by_calibration.mT
 
+    def with_correction(self, correction: Float[Tensor, "4"]) -> SE3:
+        """Return the pose to which a correction of the intrinsics, in the order of ``Calibration``, would move it."""
+        return self.T_world_camera.retract(self.slope @ correction)
+
     @property
     def alternative_shift(self) -> Float[Tensor, "6"]:
         """The right update of the pose with those intrinsics, given or the map's, that were not taken."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
 from bidnerf_core.localization.search.map_camera import MapCamera, map_camera
+from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
 from bidnerf_core.mapping.calibration import CalibrationPrior
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
@@ -28,6 +29,7 @@ class LandmarkQuery:
     images: list[QueryImage]
     landmarks: LandmarkMap
     prior: CalibrationPrior
+    evidence: CameraEvidence = NO_EVIDENCE
 
     @property
     def threshold(self) -> float:

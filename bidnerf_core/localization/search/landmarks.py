@@ -13,6 +13,7 @@ from bidnerf_core.localization.search.landmark_evidence import described, log10_
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
 from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.localization.search.unguided import unguided_matches
@@ -40,18 +41,19 @@ def propose(
     features: Features = SIFT,
     seed: int = 0,
     prior: CalibrationPrior | None = None,
+    evidence: CameraEvidence = NO_EVIDENCE,
 ) -> LandmarkPose | None:
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
     ``prior`` says how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal
-    length is approximate. One correction is estimated for all views; those of different cameras are taken as given. Raises
+    length is approximate. ``evidence``: what else is known of the camera. One correction is estimated for all views; those of different cameras are taken as given. Raises
     ``InputError`` if there is no view.
     """
     if not views:
         raise InputError("nothing to localize: expected at least one view")
     prior = _calibration_prior(views) if prior is None else prior
     clock = Stopwatch()
-    query = LandmarkQuery(query_images(views, features), matcher.landmarks, prior)
+    query = LandmarkQuery(query_images(views, features), matcher.landmarks, prior, evidence)
     clock.lap("descriptors")
     matches, first = _first_pose(query, matcher, seed, clock)
     if first is None:

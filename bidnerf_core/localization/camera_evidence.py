@@ -1,0 +1,53 @@
+"""Which of two cameras took an image, judged by what the field renders with the pose that suits each best.
+
+A wrong focal length can nearly be made up for by moving the camera, so that a few hundred keypoints hardly tell. Thousands of
+rendered rays cover the whole image and tell more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.localization.costs.rendered import RenderedCostSettings
+from bidnerf_core.localization.method_settings import ColourSettings, RefinementSettings, RefinementStage
+from bidnerf_core.localization.pivots import pivot
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.refinement import take_few_steps
+
+COMPARED_RAYS = 8192
+"""Number of rays on which two cameras are compared."""
+FITTED = RefinementStage(steps=2, rays=1024)
+"""The steps to the pose that suits a camera best, on other rays than those of the comparison."""
+LOG_ODDS_PER_DEVIATION = 0.5
+"""Logarithm of the odds by which a standard error of the difference counts.
+
+Independent rays would give more. Those of a field err together, and on frames held out for tuning 0.7 explained best in how
+many of 64 comparisons the right camera won.
+"""
+
+
+def log_odds_by_rendering(one: Problem, other: Problem, seed: int) -> float:
+    """Return the logarithm of the odds, by rendered colours alone, that the cameras of ``one`` took its images.
+
+    Both problems hold the same images, with different intrinsics and each with the pose found for these as its start.
+    """
+    difference = _ray_costs(other, seed) - _ray_costs(one, seed)
+    error = float(difference.std()) * len(difference) ** 0.5
+    return LOG_ODDS_PER_DEVIATION * float(difference.sum()) / max(error, 1e-12)
+
+
+def _ray_costs(problem: Problem, seed: int) -> Float[Tensor, "n"]:
+    """Return the cost of each ray from the pose near the start that suits the problem's intrinsics best."""
+    problem = problem.without_depth()
+    assert problem.start is not None
+    settings = RenderedCostSettings(
+        ColourSettings(), None, RefinementSettings(exposure=problem.exposure_varies)
+    )
+    generator = Generator().manual_seed(seed)
+    T = take_few_steps(problem, problem.start, FITTED, settings, generator).poses[-1]
+    stage = replace(FITTED, rays=COMPARED_RAYS)
+    cost = settings.drawn(problem.on_device(), stage, pivot("scene", problem).to(problem.device), generator)
+    return cost.residuals(T[None], derivatives=False).ray_costs()[0]
