@@ -16,6 +16,7 @@ from torch import Generator
 
 from bidnerf_core.depth_sensor import find_depth_sensor
 from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
 from bidnerf_core.localization.acceptance import (
     LandmarkThresholds,
     SurfaceThresholds,
@@ -39,13 +40,19 @@ from bidnerf_core.localization.by_landmarks import (
     localization_by_landmarks,
 )
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.by_images import ImageSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
-from bidnerf_core.localization.search.landmarks import confirm
+from bidnerf_core.localization.search.landmarks import confirm, propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence, unguided_log10_nfa
+from bidnerf_core.localization.search.mirrored import (
+    SUSPICIOUS,
+    mirror_evidence,
+    mirror_image,
+    unguided_log10_nfa,
+)
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
@@ -66,6 +73,8 @@ MANY_LANDMARKS = 500
 """The number of landmarks from which on a scene is textured."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
+TOLD_FROM_MIRROR = 3.0
+"""Logarithm of the odds by renderings from which on an image is not taken for a mirror image."""
 SUPPORTED = 0.45
 """Least confidence of landmarks in a pose that the surface accepts on its own grounds."""
 
@@ -98,7 +107,8 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     if matcher is not None:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
     if answer is not None and matcher is not None:
-        rejection = _mirror_rejection(problem, matcher, answer.found.log10_nfa, seed)
+        here = corrected(problem, answer.found)
+        rejection = _mirror_rejection(here, matcher, answer.found.log10_nfa, config, seed)
         answer = answer if rejection is None else replace(answer, verdict=rejection, confidence=None)
     has_points = _measured_points(problem) >= LEAST_POINTS
     doubtful = answer is not None and has_points and _is_doubtful(problem, answer)
@@ -146,12 +156,24 @@ def _is_final(outcome: Outcome, has_points: bool) -> bool:
 
 
 def _mirror_rejection(
-    problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, seed: int
+    problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, config: AutoConfig, seed: int
 ) -> Verdict | None:
-    """Return why a pose with this evidence is rejected if the mirror image of the query fits better, else None."""
+    """Return why a pose with this evidence, the start of ``problem``, is rejected if the query's mirror image fits better.
+
+    Where landmarks recognise the mirror image, renderings of both have the last word. None if the pose is not rejected.
+    """
     if log10_nfa < SUSPICIOUS:
         return None
-    return mirror_evidence(matcher, problem.views, seed=seed).rejection(log10_nfa)
+    rejection = mirror_evidence(matcher, problem.views, seed=seed).rejection(log10_nfa)
+    if rejection is None or not config.fused_rays:
+        return rejection
+    last = View(mirror_image(problem.views[-1].frame), SE3.identity())
+    twin = propose(matcher, [last], seed=seed)
+    if twin is None:
+        return rejection
+    image, mirror = replace(problem, views=problem.views[-1:]), replace(problem, views=(last,))
+    odds = log_odds_by_rendering(image, corrected(mirror, twin), seed)
+    return None if odds > TOLD_FROM_MIRROR else rejection
 
 
 def _rejected_by_mirror(found: Localization, twin: Verdict) -> Localization:
@@ -175,7 +197,7 @@ def _compared_with_landmarks(
             return replace(found, seconds=time.perf_counter() - began)
         refined = localization_by_landmarks(problem, answer, began)
         evidence = unguided_log10_nfa(matcher, problem.views, near.pose.T_world_camera)
-        twin = _mirror_rejection(problem, matcher, evidence, seed)
+        twin = _mirror_rejection(corrected(problem, near.pose), matcher, evidence, config, seed)
         supported = (
             twin is None
             and found.converged
@@ -189,7 +211,8 @@ def _compared_with_landmarks(
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
-    if found.converged and (twin := _mirror_rejection(problem, matcher, 0.0, seed)) is not None:
+    here = replace(problem, start=found.T_world_camera)
+    if found.converged and (twin := _mirror_rejection(here, matcher, 0.0, config, seed)) is not None:
         return _rejected_by_mirror(found, twin)
     return replace(found, seconds=time.perf_counter() - began)
 

@@ -17,7 +17,6 @@ from bidnerf_core.localization.acceptance import (
     landmark_diagnostics,
     landmark_verdict,
 )
-from bidnerf_core.localization.camera_evidence import log_odds_by_rendering
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
@@ -34,6 +33,7 @@ from bidnerf_core.localization.method_settings import (
 from bidnerf_core.localization.normal_equations import Sum
 from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose

@@ -1,7 +1,7 @@
-"""Which of two cameras took an image, judged by what the field renders with the pose that suits each best.
+"""Which of two explanations of an image is right, judged by what the field renders from the pose that suits each best.
 
-A wrong focal length can nearly be made up for by moving the camera, so that a few hundred keypoints hardly tell. Thousands of
-rendered rays cover the whole image and tell more.
+Keypoints are few and in a few places. A wrong focal length can nearly be made up for by moving the camera, and symmetric things
+resemble their mirror images, so that keypoints hardly tell. Thousands of rendered rays cover the whole image and tell more.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
 
 COMPARED_RAYS = 8192
-"""Number of rays on which two cameras are compared."""
+"""Number of rays on which two explanations are compared."""
 FITTED = RefinementStage(steps=2, rays=1024)
-"""The steps to the pose that suits a camera best, on other rays than those of the comparison."""
+"""The steps to the pose that suits an explanation best, on other rays than those of the comparison."""
 LOG_ODDS_PER_DEVIATION = 0.5
 """Logarithm of the odds by which a standard error of the difference counts.
 
@@ -30,9 +30,9 @@ many of 64 comparisons the right camera won.
 
 
 def log_odds_by_rendering(one: Problem, other: Problem, seed: int) -> float:
-    """Return the logarithm of the odds, by rendered colours alone, that the cameras of ``one`` took its images.
+    """Return the logarithm of the odds, by rendered colours alone, that ``one`` is right and not ``other``.
 
-    Both problems hold the same images, with different intrinsics and each with the pose found for these as its start.
+    Both hold images of the same size with intrinsics, and the pose found with them as the start.
     """
     difference = _ray_costs(other, seed) - _ray_costs(one, seed)
     error = float(difference.std()) * len(difference) ** 0.5
@@ -40,7 +40,7 @@ def log_odds_by_rendering(one: Problem, other: Problem, seed: int) -> float:
 
 
 def _ray_costs(problem: Problem, seed: int) -> Float[Tensor, "n"]:
-    """Return the cost of each ray from the pose near the start that suits the problem's intrinsics best."""
+    """Return the cost of each ray from the pose near the start that suits the images best."""
     problem = problem.without_depth()
     assert problem.start is not None
     settings = RenderedCostSettings(
