@@ -20,6 +20,7 @@ from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.map_camera import correction_between, map_camera
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import (
+    CameraEvidence,
     probability_beside_approximate,
     probability_of_map_camera,
 )
@@ -223,6 +224,35 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
     torch.testing.assert_close(added, expected)
     indifferent = LandmarkThresholds(alternative_motion=1.0)
     assert landmark_verdict(found, indifferent).outcome is not Outcome.MISCALIBRATED
+
+
+@pytest.mark.parametrize("odds", [-20.0, 20.0])
+def test_what_else_is_known_of_the_camera_decides_where_the_image_does_not(
+    odds: float, landmarks: LandmarkMap
+) -> None:
+    scatter = landmarks.calibration_scatter.clone()
+    scatter[0] = 0.1
+    vague, points = replace(landmarks, calibration_scatter=scatter), Points(noise=NOISE)
+    view = points.view(TRUE)
+    stated = replace(view, frame=replace(view.frame, intrinsics=with_focal(1.05)))
+    found = propose(LandmarkMatcher(vague), [stated], points, evidence=CameraEvidence(map_camera=odds))
+    assert found is not None
+    assert found.takes_map_camera is (odds > 0)
+    assert landmark_verdict(found).accepted
+
+
+def test_evidence_against_the_intrinsics_taken_has_them_estimated(landmarks: LandmarkMap) -> None:
+    points = Points(noise=NOISE)
+    view, strange = points.view(TRUE), replace(landmarks, cameras=())
+    stated = replace(view, frame=replace(view.frame, intrinsics=with_focal(1.02)))
+    kept, estimated = (
+        propose(LandmarkMatcher(strange), [stated], points, evidence=CameraEvidence(mistaken=odds))
+        for odds in (-50.0, 50.0)
+    )
+    assert kept is not None
+    assert estimated is not None
+    assert not kept.estimates_calibration
+    assert estimated.focal_factor == pytest.approx(1 / 1.02, rel=0.005)
 
 
 def test_the_farther_off_a_pose_may_be_the_less_probable_that_has_to_be(landmarks: LandmarkMap) -> None:

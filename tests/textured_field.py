@@ -74,8 +74,13 @@ def ground(seed: int = 0) -> TexturedGround:
 
 def view(T: SE3, name: str = "", seed: int = 0) -> View:
     """Return an image of the ground with its depth."""
-    image = render_image(ground(seed), CAMERA, T, BOUNDS)
-    return View(Frame(name, image.rgb, CAMERA, torch.where(image.opacity > 0.95, image.depth, 0)), T)
+    return seen(T, CAMERA, name, seed)
+
+
+def seen(T: SE3, camera: Intrinsics, name: str = "", seed: int = 0) -> View:
+    """Return an image of the ground by any camera, with its depth."""
+    image = render_image(ground(seed), camera, T, BOUNDS)
+    return View(Frame(name, image.rgb, camera, torch.where(image.opacity > 0.95, image.depth, 0)), T)
 
 
 @functools.cache

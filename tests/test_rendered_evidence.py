@@ -1,0 +1,109 @@
+"""Evidence by renderings: which of two cameras took an image, and whether it is mirrored, where keypoints do not tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bidnerf_core import Intrinsics, Localizer, Outcome, View
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.localization.auto_config import AutoConfig
+from bidnerf_core.localization.by_landmarks import LandmarkAnswer, answer_by_landmarks
+from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
+from bidnerf_core.localization.result import Verdict
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.mirrored import MirrorEvidence, mirror_image
+from bidnerf_core.se3 import SE3
+from textured_field import CAMERA, seen, textured_map, unseen
+
+
+def stated(factor: float) -> Intrinsics:
+    return replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
+
+
+def problem(camera: Intrinsics = CAMERA, mirrored: bool = False) -> Problem:
+    """An image of the ground as seen with a camera, from about the pose that suits it best."""
+    view = unseen()
+    frame = replace(view.frame, intrinsics=camera)
+    distance = float(view.T_ref_camera.translation.norm())
+    nearer = torch.tensor([0, 0, distance * (1 - camera.fx / CAMERA.fx), 0, 0, 0], dtype=torch.float64)
+    start = view.T_ref_camera.retract(nearer)
+    return rig(
+        textured_map(), [View(mirror_image(frame) if mirrored else frame, SE3.identity())], start
+    ).without_depth()
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.03])
+def test_the_camera_that_took_the_image_is_told_from_another(factor: float) -> None:
+    assert log_odds_by_rendering(problem(), problem(stated(factor)), seed=0) > 3
+
+
+def test_the_odds_of_one_are_those_against_the_other() -> None:
+    a, b = problem(), problem(stated(1.01))
+    assert log_odds_by_rendering(a, b, seed=0) == pytest.approx(-log_odds_by_rendering(b, a, seed=0))
+    assert log_odds_by_rendering(a, a, seed=0) == 0
+
+
+def test_an_image_is_told_from_its_mirror_image() -> None:
+    assert log_odds_by_rendering(problem(), problem(mirrored=True), seed=0) > 5
+
+
+def test_exposure_does_not_change_what_an_image_tells() -> None:
+    def darker(given: Problem) -> Problem:
+        return replace(
+            given,
+            views=tuple(replace(v, frame=replace(v.frame, rgb=0.7 * v.frame.rgb)) for v in given.views),
+        )
+
+    assert log_odds_by_rendering(darker(problem()), darker(problem(stated(1.03))), seed=0) > 3
+
+
+def answered(view: View, rays: int) -> LandmarkAnswer:
+    """Localize with a map whose own images hardly tell which focal length is right."""
+    landmarks = textured_map().landmarks
+    assert landmarks is not None
+    scatter = torch.full((4,), 0.01, dtype=torch.float64)
+    matcher = LandmarkMatcher(
+        replace(landmarks, calibration_scatter=scatter, correlation=1.0, cameras=(CAMERA,))
+    )
+    photo = replace(view, frame=replace(view.frame, depth=None))
+    found = answer_by_landmarks(rig(textured_map(), [photo], None, matcher=matcher), matcher, rays, seed=0)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("factor", [1.02, 1.03])
+def test_renderings_recognise_the_maps_camera_where_keypoints_do_not(factor: float) -> None:
+    view = unseen()
+    misstated = replace(view, frame=replace(view.frame, intrinsics=stated(factor)))
+    assert answered(misstated, rays=0).verdict.outcome is Outcome.MISCALIBRATED
+    found = answered(misstated, rays=1024)
+    assert found.verdict.accepted
+    assert found.found.takes_map_camera
+    assert float(pose_error(found.T, view.T_ref_camera).translation) < 0.005
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.03])
+def test_renderings_recognise_another_camera_that_is_stated_rightly(factor: float) -> None:
+    other = seen(unseen().T_ref_camera, stated(factor))
+    found = answered(other, rays=1024)
+    assert found.verdict.accepted
+    assert not found.found.takes_map_camera
+    assert float(pose_error(found.T, other.T_ref_camera).translation) < 0.005
+
+
+def keep_open(self: MirrorEvidence, log10_nfa: float) -> Verdict:
+    return Verdict(Outcome.AMBIGUOUS, "both match as well")
+
+
+@pytest.mark.parametrize(("rays", "expected"), [(1024, Outcome.CONVERGED), (0, Outcome.AMBIGUOUS)])
+def test_renderings_decide_where_keypoints_do_not_tell_an_image_from_its_mirror_image(
+    rays: int, expected: Outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MirrorEvidence, "rejection", keep_open)
+    monkeypatch.setattr("bidnerf_core.localization.auto.SUSPICIOUS", -1e6)
+    localizer = Localizer(textured_map(surface=True), "auto", AutoConfig(fused_rays=rays))
+    assert localizer(replace(unseen().frame, depth=None)).outcome is expected
