@@ -142,8 +142,6 @@ def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
     """Whether few landmarks gave a pose from which the measured points are off the surface."""
     if problem.surface is None or not answer.verdict.accepted or (answer.confidence or 0.0) >= TRUSTED:
         return False
-    if not _partly_hidden(problem):
-        return False
     there = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
     return there < SurfaceThresholds().on_surface
 
@@ -219,7 +217,9 @@ def _compared_with_landmarks(
 
 def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:
     """Whether landmarks would move a pose found on the surface to where fewer of the measured points lie on it."""
-    if problem.surface is None or not _partly_hidden(problem) or _measured_points(problem) < LEAST_POINTS:
+    if problem.surface is None or _measured_points(problem) < LEAST_POINTS:
+        return False
+    if not _partly_hidden(problem) and (answer.confidence or 0.0) >= TRUSTED:
         return False
     before = share_on_surface(problem, problem.surface, found.T_world_camera)
     after = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)

@@ -74,7 +74,7 @@ class FewSteps:
     """The result of ``take_few_steps``."""
 
     poses: SE3  # (s + 1)
-    inliers: float  # share of the rays that render what was measured from the last of them
+    inliers: float  # share of the rays, those with depth if there are many, that render what was measured from the last pose
 
 
 def take_few_steps(
@@ -95,7 +95,7 @@ def take_few_steps(
     poses, inliers, lower = [start], list[Tensor](), list[Tensor]()
     with without_waiting():
         here = cost.residuals(poses[0][None])
-        inliers.append(here.inliers()[0])
+        inliers.append(here.inliers_by_depth()[0])
         rendered = rendered_term(cost, float(here.cost()[0]), views).weight
         beside = None if surface is None else surface_term(surface, start, views).scaled
         aligned = None if beside is None else beside(start[None])
@@ -110,7 +110,7 @@ def take_few_steps(
             if may_wait(device) and not bool(lower[-1]):
                 break
             poses.append(trial[0])
-            inliers.append(here.inliers()[0])
+            inliers.append(here.inliers_by_depth()[0])
     # Where the host must not wait, steps were taken beyond the first that did not lower the cost: they are left out here.
     count = 1 + int(torch.stack(lower).cpu().cumprod(0).sum() if lower else 0)
     return FewSteps(SE3.stack(poses[:count]).to("cpu"), float(inliers[count - 1]))

@@ -29,6 +29,8 @@ from bidnerf_core.se3 import SE3
 
 MISS_SCALES = 3.0
 """Depth residual of a ray that meets nothing, in depth scales: that of an outlier, but less than the whole distance."""
+FEWEST_WITH_DEPTH = 50
+"""Least number of rays with depth for these to stand for all."""
 EXPOSURE_ROUNDS = 3
 """Rounds of robust reweighting in which the exposure is fitted."""
 EXPOSURE_PRIOR = 0.001
@@ -78,10 +80,22 @@ class Residuals:
 
     def inliers(self) -> Float[Tensor, "h"]:
         """Return the share of rays none of whose residuals exceeds three times the scale at which outliers begin."""
+        return self._agreeing.double().mean(-1).to(self.home)
+
+    def inliers_by_depth(self) -> Float[Tensor, "h"]:
+        """Return the same share of the rays that have depth; of all, where hardly any has.
+
+        Something nearer than a sensor measures, or too dark or too clear for it, hides the scene and has no depth.
+        """
+        measured = (self.weights[:, 3:] > 0).any(-1).double()
+        count = measured.sum()
+        share = (self._agreeing * measured).sum(-1) / count.clamp(min=1)
+        return torch.where(count >= FEWEST_WITH_DEPTH, share.to(self.home), self.inliers())
+
+    @property
+    def _agreeing(self) -> Bool[Tensor, "h n"]:
         limits = constant(tuple(self.objective.scales), self.value)
-        off = (self.value.abs() > 3 * limits) & (self.weights > 0)
-        agreeing: Bool[Tensor, "h n"] = ~off.any(-1)
-        return agreeing.double().mean(-1).to(self.home)
+        return ~((self.value.abs() > 3 * limits) & (self.weights > 0)).any(-1)
 
 
 @dataclass(frozen=True, eq=False)
