@@ -216,19 +216,21 @@ def partly_hidden(depth: float = 1.0) -> View:
     return replace(unseen(), frame=replace(unseen().frame, depth=depth * measured, hidden=hidden))
 
 
-def test_measured_points_judge_doubtful_landmarks_where_something_hides_the_scene() -> None:
+def test_measured_points_judge_doubtful_landmarks() -> None:
     scene = textured_map(surface=True)
     right = answer(partly_hidden(), map=scene)
     off = right.T.retract(torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64))
     wrong = replace(right, T=off, confidence=0.6)
     there = replace(localized(unseen(), scene), T_world_camera=right.T)
     hidden, clean = (rig(scene, [view], None) for view in (partly_hidden(), unseen()))
-    assert auto_module._is_doubtful(hidden, wrong)
-    assert not auto_module._is_doubtful(hidden, replace(wrong, confidence=0.9))
-    assert not auto_module._is_doubtful(clean, wrong)
-    assert auto_module._leaves_surface(hidden, there, wrong)
-    assert not auto_module._leaves_surface(hidden, there, right)
-    assert not auto_module._leaves_surface(clean, there, wrong)
+    sure = replace(wrong, confidence=0.9)
+    for problem in (hidden, clean):
+        assert auto_module._is_doubtful(problem, wrong)
+        assert not auto_module._is_doubtful(problem, sure)
+        assert auto_module._leaves_surface(problem, there, wrong)
+        assert not auto_module._leaves_surface(problem, there, right)
+    assert auto_module._leaves_surface(hidden, there, sure)  # few landmarks are left there
+    assert not auto_module._leaves_surface(clean, there, sure)
 
 
 def test_landmarks_keep_the_scale_that_they_give_a_depth_sensor() -> None:
