@@ -35,7 +35,7 @@ LOOSE = 1.3
 """Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
 """Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
-CERTAIN = 0.999
+CERTAIN = 0.98
 """Probability that the given intrinsics are wrong above which the estimated ones are taken."""
 MOST_DISTANCE = (0.5 * NORM) ** 2
 """Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
