@@ -1,4 +1,4 @@
-"""The steps in which a sensor measures depth, told from the distinct values of one depth image."""
+"""The steps in which a sensor measures depth, estimated from the distinct values of one depth image."""
 
 from __future__ import annotations
 

@@ -13,7 +13,6 @@ Pure torch, laid out for the cores of a CPU and equally usable on a GPU:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -26,7 +25,7 @@ from torch.autograd.function import once_differentiable
 from bidnerf_core.constants import constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.settings import Range, Settings
-from bidnerf_hashgrid.threads import concurrently, threads_for
+from bidnerf_hashgrid.threads import concurrently, slices, threads_for
 
 # The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
@@ -154,10 +153,9 @@ def _spread(gradient: Float[Tensor, " w"], weights: Float[Tensor, "3 w"]) -> Flo
     return gradient
 
 
-def _chunks(points: Float[Tensor, "3 n"]) -> Iterator[slice]:
+def _chunks(points: Float[Tensor, "3 n"]) -> list[slice]:
     count = points.shape[1]
-    size = CPU_CHUNK if points.device.type == "cpu" else max(count, 1)
-    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+    return slices(count, CPU_CHUNK if points.device.type == "cpu" else max(count, 1))
 
 
 def _encode_level(

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from bidnerf_hashgrid.threads import concurrently, threads_for
+from bidnerf_hashgrid.threads import concurrently, slices, threads_for
 
 NETWORK_CHUNK = 4096
 """Number of points whose hidden units stay in the cache of a core."""
@@ -112,17 +112,13 @@ def _differentiate(
     return to_encoded, gradient[:, passed:]
 
 
-def _chunks(count: int) -> list[slice]:
-    return [slice(start, min(start + NETWORK_CHUNK, count)) for start in range(0, count, NETWORK_CHUNK)]
-
-
 class _Evaluate(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, differentiable: bool, geometry_layers: int, encoded: Float[Tensor, "n e"], harmonics: Float[Tensor, "n h"],
         *flat: Tensor,
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:  # fmt: skip
-        networks, chunks = _networks(flat, geometry_layers), _chunks(len(encoded))
+        networks, chunks = _networks(flat, geometry_layers), slices(len(encoded), NETWORK_CHUNK)
         log_density, rgb = encoded.new_empty(len(encoded)), encoded.new_empty(len(encoded), 3)
         kept: list[list[Tensor]] = [[] for _ in chunks]
 
@@ -146,7 +142,7 @@ class _Evaluate(torch.autograd.Function):
         _, _, wants_encoded, wants_harmonics, *wanted = ctx.needs_input_grad
         encoded, rgb, *rest = ctx.saved_tensors
         flat, inputs = rest[: len(wanted)], rest[len(wanted) :]
-        networks, chunks = _networks(flat, ctx.geometry_layers), _chunks(len(encoded))
+        networks, chunks = _networks(flat, ctx.geometry_layers), slices(len(encoded), NETWORK_CHUNK)
         each = len(inputs) // max(len(chunks), 1)
         width = networks.colour[0][0].shape[1] - len(networks.geometry[-1][1]) + 1
         to_encoded = torch.empty_like(encoded) if wants_encoded else None

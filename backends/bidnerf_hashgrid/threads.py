@@ -21,6 +21,11 @@ def threads_for(points: int, device: torch.device) -> int:
     return torch.get_num_threads() if worth else 1
 
 
+def slices(count: int, size: int) -> list[slice]:
+    """Return slices of up to ``size`` items that cover ``count`` of them: the parts of work that tasks share."""
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
 def concurrently(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     """Run independent tasks of torch, none of which records gradients, on CPU threads, each of which uses one core.
 

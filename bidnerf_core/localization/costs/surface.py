@@ -123,7 +123,7 @@ class SurfaceCost:
     between the surfel's colour and the measured one; w is ``colour_weight``.
 
     Its normal equations are those of iteratively reweighted least squares: the gradient is exact, the Hessian positive
-    semidefinite. All is computed where the surface lies, and returned on the device of the poses.
+    semidefinite. They are computed on the device of the surface and returned on that of the poses.
     """
 
     surface: SurfaceMap
