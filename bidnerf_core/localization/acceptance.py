@@ -178,14 +178,10 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
 
 def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> bool:
     """Return whether the intrinsics that were not taken, the given or the map's, may be right and would move the pose far."""
-    motion, most = alternative_motion(found), thresholds.alternative_motion
+    motion = float(torch.linalg.vector_norm(found.alternative_shift[:3])) / found.distance
     probability = float(found.miscalibration.alternative_probability)
+    most = thresholds.alternative_motion
     return motion > most and (probability > thresholds.alternative or probability * motion > most)
-
-
-def alternative_motion(found: LandmarkPose) -> float:
-    """Return how far the intrinsics that were not taken would move the camera, as a share of the landmarks' distance."""
-    return float(torch.linalg.vector_norm(found.alternative_shift[:3])) / found.distance
 
 
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:

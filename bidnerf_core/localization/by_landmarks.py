@@ -13,7 +13,7 @@ from bidnerf_core.depth_sensor import DepthSensorModel
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
     LandmarkThresholds,
-    alternative_motion,
+    doubtful_intrinsics,
     landmark_diagnostics,
     landmark_verdict,
 )
@@ -56,10 +56,6 @@ PRIOR_WIDTH = 2.0
 """Standard deviation of the prior of the depth scale over that of the sensor's scale, since single sensors are off by far more."""
 
 
-CONSIDERED = 0.02
-"""Probability of the intrinsics not taken, given or the map's, from which on renderings are asked as well."""
-
-
 @dataclass(frozen=True, eq=False)
 class LandmarkAnswer:
     """A pose by landmarks, the pose after fusing it with the other measurements, and whether to accept it."""
@@ -99,17 +95,16 @@ def _with_camera_judged(
     problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, seed: int
 ) -> LandmarkPose:
     """Return a pose again with what renderings say about the camera, where landmarks do not tell which intrinsics are right."""
-    evidence, limits = NO_EVIDENCE, LandmarkThresholds()
-    if landmark_verdict(found).outcome not in (Outcome.CONVERGED, Outcome.MISCALIBRATED):
+    if landmark_verdict(found).outcome is not Outcome.MISCALIBRATED:
         return found
-    judged = found.miscalibration
-    if judged.alternative_probability > CONSIDERED and alternative_motion(found) > limits.alternative_motion:
-        taken = _log_odds_against(problem, found, judged.alternative, seed)
+    evidence, limits = NO_EVIDENCE, LandmarkThresholds()
+    if doubtful_intrinsics(found, limits):
+        taken = _log_odds_against(problem, found, found.miscalibration.alternative, seed)
         evidence = CameraEvidence(map_camera=taken if found.takes_map_camera else -taken)
         found = propose(matcher, problem.views, seed=seed, evidence=evidence) or found
-    judged = found.miscalibration
-    if not found.estimates_calibration and judged.worst[1] > limits.miscalibration:
-        evidence = replace(evidence, mistaken=-_log_odds_against(problem, found, judged.apparent, seed))
+    if not found.estimates_calibration and found.miscalibration.worst[1] > limits.miscalibration:
+        wrong = -_log_odds_against(problem, found, found.miscalibration.apparent, seed)
+        evidence = replace(evidence, mistaken=wrong)
         found = propose(matcher, problem.views, seed=seed, evidence=evidence) or found
     return found
 
