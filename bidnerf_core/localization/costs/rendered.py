@@ -29,7 +29,7 @@ from bidnerf_core.se3 import SE3
 
 MISS_SCALES = 3.0
 """Depth residual of a ray that meets nothing, in depth scales: that of an outlier, but less than the whole distance."""
-FEWEST_WITH_DEPTH = 50
+FEWEST_WITH_DEPTH = 20
 """Least number of rays with depth for these to stand for all."""
 EXPOSURE_ROUNDS = 3
 """Rounds of robust reweighting in which the exposure is fitted."""
