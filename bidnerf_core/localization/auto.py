@@ -187,7 +187,10 @@ def _compared_with_landmarks(
     seed: int,
     began: float,
 ) -> Localization:
-    """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not."""
+    """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not.
+
+    Landmarks that are not trusted confirm a pose by measured points, but do not move it.
+    """
     near = confirm(matcher, problem.views, found.T_world_camera)
     if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
@@ -202,9 +205,11 @@ def _compared_with_landmarks(
             and answer.confidence is not None
             and answer.confidence >= SUPPORTED
         )
-        outcome = Outcome.CONVERGED if supported else refined.outcome
         if twin is not None:
             return _rejected_by_mirror(refined, twin)
+        if supported and (answer.confidence or 0.0) < TRUSTED and _measured_points(problem) >= LEAST_POINTS:
+            return replace(found, seconds=time.perf_counter() - began)
+        outcome = Outcome.CONVERGED if supported else refined.outcome
         return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
