@@ -75,7 +75,7 @@ WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
 TOLD_FROM_MIRROR = 3.0
 """Logarithm of the odds by renderings from which on an image is not taken for a mirror image."""
-SUPPORTED = 0.45
+SUPPORTED = 0.5
 """Least confidence of landmarks in a pose that the surface accepts on its own grounds."""
 
 
@@ -199,15 +199,11 @@ def _compared_with_landmarks(
         refined = localization_by_landmarks(problem, answer, began)
         evidence = unguided_log10_nfa(matcher, problem.views, near.pose.T_world_camera)
         twin = _mirror_rejection(corrected(problem, near.pose), matcher, evidence, config, seed)
-        supported = (
-            twin is None
-            and found.converged
-            and answer.confidence is not None
-            and answer.confidence >= SUPPORTED
-        )
         if twin is not None:
             return _rejected_by_mirror(refined, twin)
-        if supported and (answer.confidence or 0.0) < TRUSTED and _measured_points(problem) >= LEAST_POINTS:
+        confidence = answer.confidence or 0.0
+        supported = found.converged and confidence >= SUPPORTED
+        if supported and confidence < TRUSTED and _measured_points(problem) >= LEAST_POINTS:
             return replace(found, seconds=time.perf_counter() - began)
         outcome = Outcome.CONVERGED if supported else refined.outcome
         return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")

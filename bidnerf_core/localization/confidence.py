@@ -15,7 +15,7 @@ from importlib.resources import files
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
 from bidnerf_core.localization.result import Outcome, Verdict
 
-ACCEPTED = 0.55
+ACCEPTED = 0.6
 """Least confidence with which a pose is accepted."""
 
 
