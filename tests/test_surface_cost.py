@@ -15,7 +15,7 @@ from bidnerf_core.localization.costs.surface import PointCloud, PointScales, Sur
 from bidnerf_core.mapping import SurfaceMap, Surfels
 from bidnerf_core.mapping.surfel_index import SurfelIndex
 from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import depth_rays_of
+from bidnerf_core.pixels import depth_rays_of, measured_middle
 from bidnerf_core.se3 import SE3
 from bidnerf_core.voxel_grid import VoxelGrid
 
@@ -201,6 +201,28 @@ def test_without_depth_there_are_no_points() -> None:
     assert len(baked.cloud(with_depth(view, None))) == 0
     assert len(baked.cloud(with_depth(view, torch.zeros_like(view.frame.rgb[..., 0])))) == 0
     assert len(baked.cloud(with_depth(view, None), view, count=100)) == 50
+
+
+def test_of_a_large_image_some_pixels_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer pixels are drawn from and averaged; those of a few measured ones are all kept."""
+    view = View(baked.unseen()[0].frame, SE3.identity())
+    middle, count = measured_middle([view]), len(depth_rays_of([view]))
+    assert middle is not None
+    monkeypatch.setattr("bidnerf_core.localization.costs.surface.MOST_DRAWN_FROM", count // 3)
+    monkeypatch.setattr("bidnerf_core.pixels.MOST_FOR_MIDDLE", count // 12)
+    cloud = PointCloud.measured((view,), None, count, torch.Generator().manual_seed(0))
+    assert count // 4 < len(cloud) <= count // 3 + 1
+    thinned = measured_middle([view])
+    assert thinned is not None
+    spread = cloud.points.double().std(0)
+    assert bool(((thinned - middle).abs() < 0.2 * spread).all())
+    assert view.frame.depth is not None
+    few = torch.zeros_like(view.frame.depth)
+    few[::9, ::7] = view.frame.depth[::9, ::7]
+    sparse = with_depth(view, few)
+    assert len(PointCloud.measured((sparse,), None, count, torch.Generator().manual_seed(0))) == int(
+        (few > 0).sum()
+    )
 
 
 def test_points_of_depth_rays_take_their_colours_from_the_views_that_see_them() -> None:

@@ -111,8 +111,8 @@ def paired_squared_distances(
 
 
 def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
-    clean = rgb.detach().cpu().float().nan_to_num(0.0).clamp(0, 1)
-    return cv2.cvtColor((clean * 255).round().to(torch.uint8).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
+    clean = rgb.detach().cpu().float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_()
+    return cv2.cvtColor(clean.to(torch.uint8).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
 
 
 def _reduced(grey: np.ndarray, largest: int) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,8 @@ from bidnerf_core.se3 import SE3, skew
 
 SURFEL_RADIUS = 1.5
 """Radius of a surfel's disc, in cells of the surface's grid."""
+MOST_DRAWN_FROM = 1_000_000
+"""Number of measured pixels of a view, above which points are drawn from every so many of them."""
 MOST_COLOUR_CHANGE = 0.2
 """Largest change of a surfel's colour along its plane to which its gradient is extrapolated."""
 
@@ -222,6 +224,7 @@ class SurfaceCost:
 def _cloud_of(view: View, count: int, generator: Generator) -> PointCloud:
     depth = torch.zeros((0, 0)) if view.frame.depth is None else view.frame.depth.cpu()
     measured = ((depth > 0) & depth.isfinite()).nonzero()
+    measured = measured[:: max(1, len(measured) // MOST_DRAWN_FROM)]
     rows, columns = measured[torch.randperm(len(measured), generator=generator)[:count]].unbind(-1)
     seen = observe(view, torch.stack([columns, rows], dim=-1), device="cpu")
     return PointCloud(seen.points, seen.rgb, seen.origins, seen.coloured)
