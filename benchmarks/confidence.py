@@ -33,6 +33,12 @@ RESULTS = Path(__file__).resolve().parent / "results"
 STORED = Path(confidence.__file__).with_suffix(".json")
 RIDGE = 0.005
 """Penalty of the squared weights of standardised features, relative to the mean log loss."""
+GOOD = (
+    "inliers", "above_chance", "recall", "agreement", "spread", "on_surface", "colour_inliers", "runner_up_margin",
+    "rendered_inliers",
+)  # fmt: skip
+BAD = ("noise_ratio", "precision", "miscalibration", "free_space_violations")
+"""Features of which more can only raise, or only lower, the confidence: examples are too few to show it for each."""
 BINS = 10
 WITHOUT_CONFIDENCE = (Outcome.MIRRORED, Outcome.AMBIGUOUS)
 """Outcomes of answers that a mirror image of the query rules out, however well they fit: they state no confidence."""
@@ -74,7 +80,10 @@ def example(row: dict[str, Any]) -> Example:
 
 
 def fitted(given: Sequence[Example], ridge: float = RIDGE) -> confidence.LogisticModel:
-    """Fit a logistic regression; features are standardised for the ridge, and the weights are those of the raw ones."""
+    """Fit a logistic regression whose weights have the right signs.
+
+    Features are standardised for the ridge, and the weights are those of the raw ones.
+    """
     names = tuple(given[0].features)
     x = np.array([[e.features[name] for name in names] for e in given])
     y = np.array([e.right for e in given], dtype=float)
@@ -87,7 +96,9 @@ def fitted(given: Sequence[Example], ridge: float = RIDGE) -> confidence.Logisti
         slope = np.append((x - mean).T / deviation[:, None] @ off + 2 * ridge * parameters[:-1], off.sum())
         return float(value), slope
 
-    best = minimize(loss, np.zeros(len(names) + 1), jac=True, method="L-BFGS-B").x
+    bounds = [(0, None) if name in GOOD else (None, 0) if name in BAD else (None, None) for name in names]
+    start = np.zeros(len(names) + 1)
+    best = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[*bounds, (None, None)]).x
     weights = best[:-1] / deviation
     return confidence.LogisticModel(names, tuple(weights.tolist()), float(best[-1] - weights @ mean))
 

@@ -89,3 +89,13 @@ def test_the_fit_recovers_probabilities(learning: ModuleType) -> None:
         assert found.probability(values) == pytest.approx(true.probability(values), abs=0.06)
     said = learning.cross_validated(given, by_fault=True)["all"]
     assert said["expected_calibration_error"] < 0.1
+
+
+def test_no_feature_counts_against_its_meaning() -> None:
+    """Fitted without bounds, the weights of related features had either sign, and more inliers lowered the confidence."""
+    model = confidence.models()["landmarks"]
+    weight = dict(zip(model.features, model.weights, strict=True))
+    for name in ("inliers", "above_chance", "recall", "agreement", "spread", "on_surface", "colour_inliers"):
+        assert weight[name] >= 0
+    for name in ("noise_ratio", "precision", "miscalibration"):
+        assert weight[name] <= 0

@@ -7,7 +7,7 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization.costs.rendered import FEWEST_WITH_DEPTH, RenderedCost, Residuals, _residuals
+from bidnerf_core.localization.costs.rendered import LEAST_WITH_DEPTH, RenderedCost, Residuals, _residuals
 from bidnerf_core.localization.method_settings import RefinementSettings, RefinementStage
 from bidnerf_core.rendering import render
 from bidnerf_core.residuals import Objective, colour_term, depth_term
@@ -64,17 +64,18 @@ def test_inliers_are_rays_none_of_whose_residuals_is_far_off() -> None:
     assert found.inliers().tolist() == [0.5]
 
 
-def test_rays_without_depth_do_not_speak_against_a_pose_by_depth() -> None:
+def test_rays_without_depth_are_left_out_of_the_inliers_by_depth() -> None:
     """Something too near for the sensor hides half of the image: all rays with depth agree, those without do not."""
     objective = Objective((colour_term(Robust("huber", 0.1)), depth_term(Robust("huber", 0.1), 1.0)))
-    value = torch.zeros((1, 2 * FEWEST_WITH_DEPTH, 4), dtype=torch.float64)
-    value[:, FEWEST_WITH_DEPTH:, 0] = 1.0
+    value = torch.zeros((1, 100, 4), dtype=torch.float64)
+    value[:, 50:, 0] = 1.0
     weights = torch.ones(value.shape[1:], dtype=torch.float64)
-    weights[FEWEST_WITH_DEPTH:, 3] = 0
+    fewest = round(100 * LEAST_WITH_DEPTH)
+    weights[fewest:, 3] = 0
     found = Residuals(value, torch.zeros((*value.shape, 6)), weights, torch.ones_like(value), objective)
     assert found.inliers().tolist() == [0.5]
     assert found.inliers_by_depth().tolist() == [1.0]
-    weights[FEWEST_WITH_DEPTH - 1, 3] = 0  # one fewer, and all rays count again
+    weights[fewest - 1, 3] = 0  # one fewer, and all rays count again
     assert found.inliers_by_depth().tolist() == [0.5]
 
 

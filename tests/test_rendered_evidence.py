@@ -9,6 +9,7 @@ import torch
 
 from bidnerf_core import Intrinsics, Localizer, Outcome, View
 from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.field import FieldValues
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.by_landmarks import LandmarkAnswer, answer_by_landmarks
 from bidnerf_core.localization.problem import Problem, rig
@@ -17,7 +18,7 @@ from bidnerf_core.localization.result import Verdict
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import MirrorEvidence, mirror_image
 from bidnerf_core.se3 import SE3
-from textured_field import CAMERA, seen, textured_map, unseen
+from textured_field import CAMERA, TexturedGround, seen, textured_map, unseen
 
 
 def stated(factor: float) -> Intrinsics:
@@ -45,6 +46,33 @@ def test_the_odds_of_one_are_those_against_the_other() -> None:
     a, b = problem(), problem(stated(1.01))
     assert log_odds_by_rendering(a, b, seed=0) == pytest.approx(-log_odds_by_rendering(b, a, seed=0))
     assert log_odds_by_rendering(a, a, seed=0) == 0
+
+
+def test_more_rays_than_pixels_tell_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    enough = log_odds_by_rendering(problem(), problem(stated(1.03)), seed=0)
+    rows = torch.ones((CAMERA.height, CAMERA.width), dtype=torch.bool)
+    rows[:8] = False  # a twelfth of the image is left
+
+    def hidden(given: Problem) -> Problem:
+        (view,) = given.views
+        return replace(given, views=(replace(view, frame=replace(view.frame, hidden=rows)),))
+
+    few = [hidden(problem()), hidden(problem(stated(1.03)))]
+    told = log_odds_by_rendering(*few, seed=0)
+    monkeypatch.setattr("bidnerf_core.localization.rendered_evidence.COMPARED_RAYS", 100_000)
+    assert log_odds_by_rendering(*few, seed=0) == told
+    assert told < 0.6 * enough
+
+
+class NotFinite(TexturedGround):
+    def query(self, positions: torch.Tensor, directions: torch.Tensor) -> FieldValues:
+        values = super().query(positions, directions)
+        return replace(values, rgb=values.rgb * torch.nan)
+
+
+def test_a_field_that_renders_what_is_not_finite_tells_nothing() -> None:
+    a, b = (replace(given, field=NotFinite()) for given in (problem(), problem(stated(1.03))))
+    assert log_odds_by_rendering(a, b, seed=0) == 0
 
 
 def test_an_image_is_told_from_its_mirror_image() -> None:
@@ -104,6 +132,6 @@ def test_renderings_decide_where_keypoints_do_not_tell_an_image_from_its_mirror_
     rays: int, expected: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(MirrorEvidence, "rejection", keep_open)
-    monkeypatch.setattr("bidnerf_core.localization.auto.SUSPICIOUS", -1e6)
+    monkeypatch.setattr("bidnerf_core.localization.mirror_rejection.SUSPICIOUS", -1e6)
     localizer = Localizer(textured_map(surface=True), "auto", AutoConfig(fused_rays=rays))
     assert localizer(replace(unseen().frame, depth=None)).outcome is expected

@@ -40,7 +40,7 @@ class SurfaceThresholds:
     colour_inliers: float = 0.42  # share that lies there and has its colour, at least
     free_space_violations: float = 0.15  # share of lines of sight that pass through the surface, at most
     runner_up_margin: float = 0.15  # by how much the next best answer must be worse
-    # share of rendered rays (those with depth, if there are some) that agree with what was measured, at least
+    # share of rendered rays, those with depth if 5 % of them have it, that agree with what was measured, at least
     rendered_inliers: float = 0.8
 
 

@@ -8,6 +8,7 @@ from which ``auto`` descends as ``bid`` does.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
@@ -16,8 +17,8 @@ from torch import Generator
 
 from bidnerf_core.depth_sensor import find_depth_sensor
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
 from bidnerf_core.localization.acceptance import (
+    LandmarkDiagnostics,
     LandmarkThresholds,
     SurfaceThresholds,
     landmark_verdict,
@@ -39,20 +40,16 @@ from bidnerf_core.localization.by_landmarks import (
     is_sharp,
     localization_by_landmarks,
 )
+from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.by_images import ImageSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
-from bidnerf_core.localization.search.landmarks import confirm, propose
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.mirrored import (
-    SUSPICIOUS,
-    mirror_evidence,
-    mirror_image,
-    unguided_log10_nfa,
-)
+from bidnerf_core.localization.search.mirrored import unguided_log10_nfa
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
@@ -63,8 +60,14 @@ the right place either.
 """
 UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
 """Reasons for which a pose that landmarks determine is rejected: it is not accurate, or not probable, enough."""
-TRUSTED = 0.8
-"""Confidence from which on a pose by landmarks is not compared with the surface."""
+TRUSTED, MOSTLY = 0.95, 0.5
+"""Confidence from which on a pose by landmarks is not compared with measured points, and the least share of these on the surface
+with which it is not taken for that of a partly hidden scene.
+"""
+OFF_COLOUR = (Outcome.COLOUR_MISMATCH, Outcome.RENDERING_MISMATCH)
+"""Reasons to reject a pose by depth that do not count where landmarks recognise the place."""
+NEARBY, TURNED = 0.1, math.radians(10)
+"""Distance, as a share of that of the landmarks, and angle up to which two poses show the same place."""
 FEWER = 0.05
 """Share of the measured points by which landmarks may take a pose off the surface."""
 IN_FRONT = 0.9
@@ -73,8 +76,6 @@ MANY_LANDMARKS = 500
 """The number of landmarks from which on a scene is textured."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
-TOLD_FROM_MIRROR = 3.0
-"""Logarithm of the odds by renderings from which on an image is not taken for a mirror image."""
 SUPPORTED = 0.5
 """Least confidence of landmarks in a pose that the surface accepts on its own grounds."""
 
@@ -82,15 +83,17 @@ SUPPORTED = 0.5
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     """Find the pose by landmarks, else by depth on the surface, else by colour on it, else by descent from a start.
 
-    An image whose pose is not accepted is tried once more without the nearest thing that was measured, which may hide the
-    scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
+    An image whose pose is not accepted, or doubtful with something in front, is tried once more without the nearest thing that
+    was measured, which may hide the scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
     """
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
     found = _found(problem, config, seed)
-    if found.converged or found.outcome in FINAL or problem.surface is None:
+    if _is_settled(found) or found.outcome in FINAL or problem.surface is None:
         return found
     occluder = nearest_piece(problem)
     if occluder is None:
+        return found
+    if found.converged and occluder.share_in_front(problem.surface, found.T_world_camera) < IN_FRONT:
         return found
     rest = _found(occluder.rest, config, seed)
     seconds = found.seconds + rest.seconds
@@ -108,7 +111,7 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
     if answer is not None and matcher is not None:
         here = corrected(problem, answer.found)
-        rejection = _mirror_rejection(here, matcher, answer.found.log10_nfa, config, seed)
+        rejection = mirror_rejection(here, matcher, answer.found.log10_nfa, config.fused_rays, seed)
         answer = answer if rejection is None else replace(answer, verdict=rejection, confidence=None)
     has_points = _measured_points(problem) >= LEAST_POINTS
     doubtful = answer is not None and has_points and _is_doubtful(problem, answer)
@@ -120,12 +123,10 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
     if has_points:
         found = localized_by_depth(problem, problem.surface, config, seed)
-        if (
-            answer is not None
-            and answer.verdict.accepted
-            and not (found.converged and _leaves_surface(problem, found, answer))
-        ):
-            return localization_by_landmarks(problem, answer, began)
+        if answer is not None and answer.verdict.accepted:
+            found = _recognised(found, answer)
+            if not (found.converged and _leaves_surface(problem, found, answer)):
+                return localization_by_landmarks(problem, answer, began)
     else:
         found = _by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
@@ -138,9 +139,29 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     return found
 
 
+def _is_settled(found: Localization) -> bool:
+    """Whether a pose is accepted and nothing suggests that something in front hides part of the scene."""
+    said = found.diagnostics
+    if not found.converged or not isinstance(said, LandmarkDiagnostics) or said.on_surface is None:
+        return found.converged
+    return (found.confidence or 0.0) >= TRUSTED and said.on_surface >= MOSTLY
+
+
+def _recognised(found: Localization, answer: LandmarkAnswer) -> Localization:
+    """Return a pose by depth as accepted if landmarks place the camera nearby and only its colours were against it."""
+    between = found.T_world_camera.inverse() @ answer.T
+    apart, turned = (float(part.norm()) for part in (between.translation, between.log()[3:]))
+    if found.outcome not in OFF_COLOUR or apart > NEARBY * answer.found.distance or turned > TURNED:
+        return found
+    why = f"{answer.found.inliers} landmarks agree nearby"
+    return replace(found, outcome=Outcome.CONVERGED, reason=f"{why}; {found.reason}")
+
+
 def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
-    """Whether few landmarks gave a pose from which the measured points are off the surface."""
+    """Whether landmarks that are not trusted gave a pose from which the measured points are off the surface."""
     if problem.surface is None or not answer.verdict.accepted or (answer.confidence or 0.0) >= TRUSTED:
+        return False
+    if not _keeps_points(problem, answer.found):
         return False
     there = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
     return there < SurfaceThresholds().on_surface
@@ -151,27 +172,6 @@ def _is_final(outcome: Outcome, has_points: bool) -> bool:
     if outcome is Outcome.UNCERTAIN:
         return not has_points
     return outcome is Outcome.CONVERGED or outcome in FINAL
-
-
-def _mirror_rejection(
-    problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, config: AutoConfig, seed: int
-) -> Verdict | None:
-    """Return why a pose with this evidence, the start of ``problem``, is rejected if the query's mirror image fits better.
-
-    Where landmarks recognise the mirror image, renderings of both have the last word. None if the pose is not rejected.
-    """
-    if log10_nfa < SUSPICIOUS:
-        return None
-    rejection = mirror_evidence(matcher, problem.views, seed=seed).rejection(log10_nfa)
-    if rejection is None or not config.fused_rays:
-        return rejection
-    last = View(mirror_image(problem.views[-1].frame), SE3.identity())
-    twin = propose(matcher, [last], seed=seed)
-    if twin is None:
-        return rejection
-    image, mirror = replace(problem, views=problem.views[-1:]), replace(problem, views=(last,))
-    odds = log_odds_by_rendering(image, corrected(mirror, twin), seed)
-    return None if odds > TOLD_FROM_MIRROR else rejection
 
 
 def _rejected_by_mirror(found: Localization, twin: Verdict) -> Localization:
@@ -189,21 +189,21 @@ def _compared_with_landmarks(
 ) -> Localization:
     """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not.
 
-    Landmarks that are not trusted confirm a pose by measured points, but do not move it.
+    Landmarks that are not trusted confirm an accepted pose by measured points, but do not move it.
     """
     near = confirm(matcher, problem.views, found.T_world_camera)
     if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
-        if found.converged and _leaves_surface(problem, found, answer):
-            return replace(found, seconds=time.perf_counter() - began)
         refined = localization_by_landmarks(problem, answer, began)
         evidence = unguided_log10_nfa(matcher, problem.views, near.pose.T_world_camera)
-        twin = _mirror_rejection(corrected(problem, near.pose), matcher, evidence, config, seed)
+        twin = mirror_rejection(corrected(problem, near.pose), matcher, evidence, config.fused_rays, seed)
         if twin is not None:
             return _rejected_by_mirror(refined, twin)
         confidence = answer.confidence or 0.0
         supported = found.converged and confidence >= SUPPORTED
-        if supported and confidence < TRUSTED and _measured_points(problem) >= LEAST_POINTS:
+        if found.converged and _partly_hidden(problem) and _leaves_surface(problem, found, answer):
+            return replace(found, seconds=time.perf_counter() - began)
+        if supported and confidence < TRUSTED and _keeps_points(problem, near.pose):
             return replace(found, seconds=time.perf_counter() - began)
         outcome = Outcome.CONVERGED if supported else refined.outcome
         return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
@@ -211,7 +211,10 @@ def _compared_with_landmarks(
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
     here = replace(problem, start=found.T_world_camera)
-    if found.converged and (twin := _mirror_rejection(here, matcher, 0.0, config, seed)) is not None:
+    if (
+        found.converged
+        and (twin := mirror_rejection(here, matcher, 0.0, config.fused_rays, seed)) is not None
+    ):
         return _rejected_by_mirror(found, twin)
     return replace(found, seconds=time.perf_counter() - began)
 
@@ -227,11 +230,14 @@ def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswe
     return after < before - FEWER
 
 
-def _partly_hidden(problem: Problem) -> bool:
-    """Whether something hides part of the scene, so that few landmarks are left and measured points tell more.
+def _keeps_points(problem: Problem, found: LandmarkPose) -> bool:
+    """Whether there are measured points, and landmarks do not correct the intrinsics by which these are placed."""
+    kept = found.intrinsics_of(problem.views[-1].frame.intrinsics) is None
+    return kept and _measured_points(problem) >= LEAST_POINTS
 
-    Elsewhere landmarks are trusted more than the scale of a depth sensor.
-    """
+
+def _partly_hidden(problem: Problem) -> bool:
+    """Whether something hides part of the scene, so that few landmarks are left and measured points tell more."""
     return any(view.frame.hidden is not None for view in problem.views)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.depth_sensor import DepthSensorModel
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
@@ -37,6 +39,7 @@ from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
@@ -83,7 +86,7 @@ def answer_by_landmarks(
     """Find the pose by landmarks and, if it is accepted, refine it on all terms at once.
 
     Returns None if too few features match. ``rays`` is the number of rays rendered for the refinement; 0 leaves rendering
-    out.
+    out, also where it would tell which intrinsics are right.
     """
     found = propose(matcher, problem.views, seed=seed)
     if found is not None and rays:
@@ -99,28 +102,43 @@ def _with_camera_judged(
         return found
     evidence, limits = NO_EVIDENCE, LandmarkThresholds()
     if doubtful_intrinsics(found, limits):
-        taken = _log_odds_against(problem, found, found.miscalibration.alternative, seed)
-        evidence = CameraEvidence(map_camera=taken if found.takes_map_camera else -taken)
+        other, correction = _other_camera(problem, matcher, found), found.miscalibration.alternative
+        odds = _log_odds_of(problem, found, correction, lambda _: other, seed)
+        evidence = CameraEvidence(map_camera=-odds if found.takes_map_camera else odds)
         found = propose(matcher, problem.views, seed=seed, evidence=evidence) or found
     if not found.estimates_calibration and found.miscalibration.worst[1] > limits.miscalibration:
-        wrong = -_log_odds_against(problem, found, found.miscalibration.apparent, seed)
-        evidence = replace(evidence, mistaken=wrong)
+        correction = found.miscalibration.apparent
+        change = Calibration(*correction.tolist())
+        evidence = replace(evidence, mistaken=_log_odds_of(problem, found, correction, change.applied, seed))
         found = propose(matcher, problem.views, seed=seed, evidence=evidence) or found
     return found
 
 
-def _log_odds_against(
-    problem: Problem, found: LandmarkPose, correction: Float[Tensor, "4"], seed: int
+def _other_camera(problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose) -> Intrinsics:
+    """Return those of the given intrinsics and the map's that were not taken."""
+    given = problem.views[-1].frame.intrinsics
+    camera = None if found.takes_map_camera else map_camera(given, matcher.landmarks.cameras)
+    return given if camera is None else camera.intrinsics
+
+
+def _log_odds_of(
+    problem: Problem,
+    found: LandmarkPose,
+    correction: Float[Tensor, "4"],
+    corrected_camera: Callable[[Intrinsics], Intrinsics],
+    seed: int,
 ) -> float:
-    """Return the logarithm of the odds, by renderings, that the intrinsics taken are right and those with a correction wrong."""
-    taken, change = corrected(problem, found), Calibration(*correction.tolist())
+    """Return the logarithm of the odds, by renderings, that a correction of the intrinsics taken is right and not these.
+
+    ``correction`` tells how far the pose moves with it.
+    """
+    taken = corrected(problem, found)
     views = tuple(
-        replace(view, frame=replace(view.frame, intrinsics=change.applied(view.frame.intrinsics)))
+        replace(view, frame=replace(view.frame, intrinsics=corrected_camera(view.frame.intrinsics)))
         for view in taken.views
     )
-    return log_odds_by_rendering(
-        taken, replace(taken, views=views, start=found.with_correction(correction)), seed
-    )
+    other = replace(taken, views=views, start=found.with_correction(correction))
+    return log_odds_by_rendering(other, taken, seed)
 
 
 def fused_answer(

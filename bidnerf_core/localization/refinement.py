@@ -74,7 +74,7 @@ class FewSteps:
     """The result of ``take_few_steps``."""
 
     poses: SE3  # (s + 1)
-    inliers: float  # share of the rays, those with depth if there are many, that render what was measured from the last pose
+    inliers: float  # share of the rays, those with depth if 5 % of them have it, that render what was measured from there
 
 
 def take_few_steps(

@@ -6,6 +6,7 @@ resemble their mirror images, so that keypoints hardly tell. Thousands of render
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from jaxtyping import Float
@@ -18,9 +19,9 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
 
 COMPARED_RAYS = 8192
-"""Number of rays on which two explanations are compared."""
+"""Number of rays on which two explanations are compared, at most that of the pixels that are not hidden."""
 FITTED = RefinementStage(steps=2, rays=1024)
-"""The steps to the pose that suits an explanation best, on other rays than those of the comparison."""
+"""The steps to the pose that suits an explanation best. The comparison draws other rays."""
 LOG_ODDS_PER_DEVIATION = 0.5
 """Logarithm of the odds by which a standard error of the difference counts.
 
@@ -32,11 +33,13 @@ many of 64 comparisons the right camera won.
 def log_odds_by_rendering(one: Problem, other: Problem, seed: int) -> float:
     """Return the logarithm of the odds, by rendered colours alone, that ``one`` is right and not ``other``.
 
-    Both hold images of the same size with intrinsics, and the pose found with them as the start.
+    Both hold images of the same size with intrinsics, and the pose found with them as the start. 0 where the field renders what
+    is not finite.
     """
     difference = _ray_costs(other, seed) - _ray_costs(one, seed)
     error = float(difference.std()) * len(difference) ** 0.5
-    return LOG_ODDS_PER_DEVIATION * float(difference.sum()) / max(error, 1e-12)
+    odds = LOG_ODDS_PER_DEVIATION * float(difference.sum()) / max(error, 1e-12)
+    return odds if math.isfinite(odds) else 0.0
 
 
 def _ray_costs(problem: Problem, seed: int) -> Float[Tensor, "n"]:
@@ -48,6 +51,12 @@ def _ray_costs(problem: Problem, seed: int) -> Float[Tensor, "n"]:
     )
     generator = Generator().manual_seed(seed)
     T = take_few_steps(problem, problem.start, FITTED, settings, generator).poses[-1]
-    stage = replace(FITTED, rays=COMPARED_RAYS)
+    stage = replace(FITTED, rays=min(COMPARED_RAYS, _visible_pixels(problem)))
     cost = settings.drawn(problem.on_device(), stage, pivot("scene", problem).to(problem.device), generator)
     return cost.residuals(T[None], derivatives=False).ray_costs()[0]
+
+
+def _visible_pixels(problem: Problem) -> int:
+    sizes = [view.frame.intrinsics.width * view.frame.intrinsics.height for view in problem.views]
+    hidden = [0 if view.frame.hidden is None else int(view.frame.hidden.sum()) for view in problem.views]
+    return max(1, sum(sizes) - sum(hidden))

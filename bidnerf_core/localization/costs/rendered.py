@@ -29,8 +29,8 @@ from bidnerf_core.se3 import SE3
 
 MISS_SCALES = 3.0
 """Depth residual of a ray that meets nothing, in depth scales: that of an outlier, but less than the whole distance."""
-FEWEST_WITH_DEPTH = 20
-"""Least number of rays with depth for these to stand for all."""
+LEAST_WITH_DEPTH = 0.05
+"""Least share of the rays that must have depth for these to stand for all."""
 EXPOSURE_ROUNDS = 3
 """Rounds of robust reweighting in which the exposure is fitted."""
 EXPOSURE_PRIOR = 0.001
@@ -83,14 +83,15 @@ class Residuals:
         return self._agreeing.double().mean(-1).to(self.home)
 
     def inliers_by_depth(self) -> Float[Tensor, "h"]:
-        """Return the same share of the rays that have depth; of all, where hardly any has.
+        """Return the same share of the rays that have depth; of all rays, if fewer than ``LEAST_WITH_DEPTH`` of them have.
 
         Something nearer than a sensor measures, or too dark or too clear for it, hides the scene and has no depth.
         """
         measured = (self.weights[:, 3:] > 0).any(-1).double()
-        count = measured.sum()
-        share = (self._agreeing * measured).sum(-1) / count.clamp(min=1)
-        return torch.where(count >= FEWEST_WITH_DEPTH, share.to(self.home), self.inliers())
+        agreeing = self._agreeing.double()
+        share = (agreeing * measured).sum(-1) / measured.sum().clamp(min=1)
+        some = measured.mean() >= LEAST_WITH_DEPTH
+        return torch.where(some, share, agreeing.mean(-1)).to(self.home)
 
     @property
     def _agreeing(self) -> Bool[Tensor, "h n"]:

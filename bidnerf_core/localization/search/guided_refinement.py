@@ -17,7 +17,12 @@ from bidnerf_core.localization.search.guided import (
     projected_landmarks,
 )
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.miscalibration import Miscalibration, TakenIntrinsics, taken_intrinsics
+from bidnerf_core.localization.search.miscalibration import (
+    NO_EVIDENCE,
+    Miscalibration,
+    TakenIntrinsics,
+    taken_intrinsics,
+)
 from bidnerf_core.localization.search.ransac import Hypothesis
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.features import NORM
@@ -35,8 +40,10 @@ LOOSE = 1.3
 """Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
 """Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
-CERTAIN = 0.98
-"""Probability that the given intrinsics are wrong above which the estimated ones are taken."""
+CERTAIN, CERTAIN_BY_OTHERS = 0.999, 0.98
+"""Probability that the given intrinsics are wrong above which the estimated ones are taken, by keypoints alone and where other
+measurements support it.
+"""
 MOST_DISTANCE = (0.5 * NORM) ** 2
 """Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
 LEAST_GUIDED_MATCHES = 6
@@ -91,7 +98,8 @@ def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches,
     evidence, approximate = query.evidence, query.prior.log_focal > 0
     taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate, evidence.map_camera)
     wrong = Miscalibration.of(free, query.landmarks, taken, evidence.mistaken)
-    if wrong.worst[1] > CERTAIN and not query.prior.log_focal:
+    certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_BY_OTHERS
+    if wrong.worst[1] > certain and not query.prior.log_focal:
         taken = TakenIntrinsics()
         fit, found = _guided(query, NOMINAL, free, found, most, RADII[1:])
     elif taken.camera is not None:

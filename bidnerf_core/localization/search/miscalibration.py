@@ -82,17 +82,17 @@ class Miscalibration:
 
     @staticmethod
     def of(
-        free: ReprojectionFit, landmarks: LandmarkMap, taken: TakenIntrinsics, beside: float = 0.0
+        free: ReprojectionFit, landmarks: LandmarkMap, taken: TakenIntrinsics, other_log_odds: float = 0.0
     ) -> Miscalibration:
         """Judge the intrinsics ``taken`` by a fit in which they were free.
 
-        ``beside``: logarithm of the odds that they are wrong, by other measurements.
+        ``other_log_odds``: logarithm of the odds that they are wrong, by other measurements; it counts for each parameter.
         """
         value, noise = _estimate(free, landmarks)
         value = value - _as_tensor(taken.calibration)
         right, wrong = (noise + prior.deviations.square() for prior in (CALIBRATED, MISTAKEN))
         log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
-        log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES)) + beside
+        log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES)) + other_log_odds
         return Miscalibration(
             value, free.calibration_deviations, log_odds.sigmoid(), unresolved_deviations(value, noise),
             _as_tensor(taken.alternative), value.new_tensor(taken.probability),
@@ -115,12 +115,12 @@ def taken_intrinsics(
     landmarks: LandmarkMap,
     camera: MapCamera | None,
     approximate: bool,
-    beside: float = 0.0,
+    other_log_odds: float = 0.0,
 ) -> TakenIntrinsics:
     """Return the more probable of the given intrinsics and those of the map's ``camera``, by a fit in which they were free.
 
     ``approximate`` says that the given focal length is; the given intrinsics then leave the calibration to be estimated.
-    ``beside``: logarithm of the odds that the map's camera is right, by other measurements.
+    ``other_log_odds``: logarithm of the odds that the map's camera is right, by other measurements.
     """
     if camera is None:
         return TakenIntrinsics()
@@ -129,23 +129,23 @@ def taken_intrinsics(
         return TakenIntrinsics(camera.calibration, camera) if likely else TakenIntrinsics()
     if not bool(camera.differs.any()) or not camera.is_near(OTHER_CAMERA):
         return TakenIntrinsics()
-    probability, there = probability_of_map_camera(free, landmarks, camera, beside), camera.correction
+    probability, there = probability_of_map_camera(free, landmarks, camera, other_log_odds), camera.correction
     if probability > 0.5:
         return TakenIntrinsics(camera.calibration, camera, Calibration(*(-there).tolist()), 1 - probability)
     return TakenIntrinsics(alternative=camera.calibration, probability=probability)
 
 
 def probability_of_map_camera(
-    free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera, beside: float = 0.0
+    free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera, other_log_odds: float = 0.0
 ) -> float:
     """Return the probability that an image was taken by the map's ``camera`` and not by one with the given intrinsics.
 
-    The image is represented by a fit in which the intrinsics were free. ``beside``: logarithm of the odds by other measurements.
+    The image is represented by a fit in which the intrinsics were free. ``other_log_odds``: logarithm of the odds by other measurements.
     """
     value, noise = _estimate(free, landmarks)
     by_given = (_log_densities(value, noise)[:, camera.differs].sum(1) + LOG_SHARES).logsumexp(0)
     evidence = float(_log_density_by(camera, value, noise)[camera.differs].sum() - by_given)
-    return float(torch.tensor(evidence + camera.log_odds + beside, dtype=torch.float64).sigmoid())
+    return float(torch.tensor(evidence + camera.log_odds + other_log_odds, dtype=torch.float64).sigmoid())
 
 
 def probability_beside_approximate(free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera) -> float:

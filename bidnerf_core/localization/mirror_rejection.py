@@ -1,0 +1,40 @@
+"""Rejection of mirrored images: landmarks and, where these recognise the mirror image, renderings decide."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from bidnerf_core.frames import View
+from bidnerf_core.localization.by_landmarks import corrected
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
+from bidnerf_core.localization.result import Verdict
+from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence, mirror_image
+from bidnerf_core.se3 import SE3
+
+TOLD_FROM_MIRROR = 3.0
+"""Least logarithm of the odds by renderings with which an image that resembles its mirror image is not rejected."""
+
+
+def mirror_rejection(
+    problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, rays: int, seed: int
+) -> Verdict | None:
+    """Return why the pose that is the start of ``problem`` is rejected because the mirror image fits as well or better, or None.
+
+    ``log10_nfa``: logarithm of the number of false alarms of the pose. Where landmarks recognise the mirror image, renderings of
+    both decide, unless ``rays`` is 0.
+    """
+    if log10_nfa < SUSPICIOUS:
+        return None
+    rejection = mirror_evidence(matcher, problem.views, seed=seed).rejection(log10_nfa)
+    if rejection is None or not rays:
+        return rejection
+    last = View(mirror_image(problem.views[-1].frame), SE3.identity())
+    twin = propose(matcher, [last], seed=seed)
+    if twin is None:
+        return rejection
+    image, mirror = replace(problem, views=problem.views[-1:]), replace(problem, views=(last,))
+    odds = log_odds_by_rendering(image, corrected(mirror, twin), seed)
+    return None if odds > TOLD_FROM_MIRROR else rejection
