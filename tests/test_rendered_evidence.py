@@ -12,6 +12,7 @@ from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.field import FieldValues
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.by_landmarks import LandmarkAnswer, answer_by_landmarks
+from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Verdict
@@ -89,13 +90,13 @@ def test_exposure_does_not_change_what_an_image_tells() -> None:
     assert log_odds_by_rendering(darker(problem()), darker(problem(stated(1.03))), seed=0) > 3
 
 
-def answered(view: View, rays: int) -> LandmarkAnswer:
+def answered(view: View, rays: int, cameras: tuple[Intrinsics, ...] = (CAMERA,)) -> LandmarkAnswer:
     """Localize with a map whose own images hardly tell which focal length is right."""
     landmarks = textured_map().landmarks
     assert landmarks is not None
     scatter = torch.full((4,), 0.01, dtype=torch.float64)
     matcher = LandmarkMatcher(
-        replace(landmarks, calibration_scatter=scatter, correlation=1.0, cameras=(CAMERA,))
+        replace(landmarks, calibration_scatter=scatter, correlation=1.0, cameras=cameras)
     )
     photo = replace(view, frame=replace(view.frame, depth=None))
     found = answer_by_landmarks(rig(textured_map(), [photo], None, matcher=matcher), matcher, rays, seed=0)
@@ -114,13 +115,35 @@ def test_renderings_recognise_the_maps_camera_where_keypoints_do_not(factor: flo
     assert float(pose_error(found.T, view.T_ref_camera).translation) < 0.005
 
 
-@pytest.mark.parametrize("factor", [0.97, 1.03])
+@pytest.mark.parametrize("factor", [0.96, 0.97, 1.015])
 def test_renderings_recognise_another_camera_that_is_stated_rightly(factor: float) -> None:
     other = seen(unseen().T_ref_camera, stated(factor))
+    assert answered(other, rays=0).verdict.outcome is Outcome.MISCALIBRATED
     found = answered(other, rays=1024)
     assert found.verdict.accepted
     assert not found.found.takes_map_camera
     assert float(pose_error(found.T, other.T_ref_camera).translation) < 0.005
+
+
+def test_intrinsics_that_renderings_contradict_are_estimated() -> None:
+    """The map does not say which cameras took its images, so that there is no other hypothesis."""
+    view = unseen()
+    misstated = replace(view, frame=replace(view.frame, intrinsics=stated(1.08)))
+    assert answered(misstated, rays=0, cameras=()).verdict.outcome is Outcome.MISCALIBRATED
+    found = answered(misstated, rays=1024, cameras=())
+    assert found.verdict.accepted
+    assert found.found.estimates_calibration
+    assert found.found.focal_factor == pytest.approx(1 / 1.08, rel=0.03)
+
+
+def test_a_mirrored_image_stays_rejected_where_renderings_are_compared() -> None:
+    frame = replace(unseen().frame, depth=None)
+    problem = rig(textured_map(), [View(mirror_image(frame), SE3.identity())], unseen().T_ref_camera)
+    landmarks = textured_map().landmarks
+    assert landmarks is not None
+    rejection = mirror_rejection(problem, LandmarkMatcher(landmarks), log10_nfa=0.0, rays=1024, seed=0)
+    assert rejection is not None
+    assert rejection.outcome is Outcome.MIRRORED
 
 
 def keep_open(self: MirrorEvidence, log10_nfa: float) -> Verdict:

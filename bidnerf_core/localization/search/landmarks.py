@@ -46,8 +46,8 @@ def propose(
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
     ``prior`` says how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal
-    length is approximate. ``evidence``: what else is known of the camera. One correction is estimated for all views; those of different cameras are taken as given. Raises
-    ``InputError`` if there is no view.
+    length is approximate. One correction is estimated for all views; those of different cameras are taken as given.
+    ``evidence``: what else is known of the camera. Raises ``InputError`` if there is no view.
     """
     if not views:
         raise InputError("nothing to localize: expected at least one view")

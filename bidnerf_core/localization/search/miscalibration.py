@@ -33,12 +33,10 @@ LIKELY = 0.8
 
 @dataclass(frozen=True)
 class CameraEvidence:
-    """What other measurements than the positions of keypoints say about the camera of an image: logarithms of odds."""
+    """Logarithms of odds about the camera of an image, by other measurements than the positions of its keypoints."""
 
     map_camera: float = 0.0  # that the map's intrinsics are right and not the given ones
-    mistaken: float = (
-        0.0  # that the intrinsics taken are wrong and those that fit the keypoints best are right
-    )
+    mistaken: float = 0.0  # that those that fit the keypoints best are right and not the ones taken
 
 
 NO_EVIDENCE = CameraEvidence()
