@@ -203,7 +203,7 @@ def test_without_depth_there_are_no_points() -> None:
     assert len(baked.cloud(with_depth(view, None), view, count=100)) == 50
 
 
-def test_of_a_large_image_some_pixels_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_are_drawn_from_some_pixels_of_a_large_image(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer pixels are drawn from and averaged; those of a few measured ones are all kept."""
     view = View(baked.unseen()[0].frame, SE3.identity())
     middle, count = measured_middle([view]), len(depth_rays_of([view]))
