@@ -8,7 +8,6 @@ from which ``auto`` descends as ``bid`` does.
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import replace
 
@@ -60,14 +59,10 @@ the right place either.
 """
 UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
 """Reasons for which a pose that landmarks determine is rejected: it is not accurate, or not probable, enough."""
-TRUSTED, MOSTLY = 0.95, 0.5
-"""Confidence from which on a pose by landmarks is not compared with measured points, and the least share of these on the surface
-with which it is not taken for that of a partly hidden scene.
-"""
-OFF_COLOUR = (Outcome.COLOUR_MISMATCH, Outcome.RENDERING_MISMATCH)
-"""Reasons to reject a pose by depth that do not count where landmarks recognise the place."""
-NEARBY, TURNED = 0.1, math.radians(10)
-"""Distance, as a share of that of the landmarks, and angle up to which two poses show the same place."""
+TRUSTED = 0.95
+"""Confidence from which on landmarks are not compared with measured points."""
+MOSTLY = 0.5
+"""Least share of the measured points on the surface with which a scene is not taken to be partly hidden."""
 FEWER = 0.05
 """Share of the measured points by which landmarks may take a pose off the surface."""
 IN_FRONT = 0.9
@@ -76,8 +71,8 @@ MANY_LANDMARKS = 500
 """The number of landmarks from which on a scene is textured."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
-SUPPORTED = 0.5
-"""Least confidence of landmarks in a pose that the surface accepts on its own grounds."""
+SUPPORTED, MOVING = 0.5, 0.8
+"""Least confidence of landmarks in a pose that the surface accepts on its own grounds, and with which they move one by depth."""
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
@@ -123,10 +118,12 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
     if has_points:
         found = localized_by_depth(problem, problem.surface, config, seed)
-        if answer is not None and answer.verdict.accepted:
-            found = _recognised(found, answer)
-            if not (found.converged and _leaves_surface(problem, found, answer)):
-                return localization_by_landmarks(problem, answer, began)
+        if (
+            answer is not None
+            and answer.verdict.accepted
+            and not (found.converged and _leaves_surface(problem, found, answer))
+        ):
+            return localization_by_landmarks(problem, answer, began)
     else:
         found = _by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
@@ -147,21 +144,11 @@ def _is_settled(found: Localization) -> bool:
     return (found.confidence or 0.0) >= TRUSTED and said.on_surface >= MOSTLY
 
 
-def _recognised(found: Localization, answer: LandmarkAnswer) -> Localization:
-    """Return a pose by depth as accepted if landmarks place the camera nearby and only its colours were against it."""
-    between = found.T_world_camera.inverse() @ answer.T
-    apart, turned = (float(part.norm()) for part in (between.translation, between.log()[3:]))
-    if found.outcome not in OFF_COLOUR or apart > NEARBY * answer.found.distance or turned > TURNED:
-        return found
-    why = f"{answer.found.inliers} landmarks agree nearby"
-    return replace(found, outcome=Outcome.CONVERGED, reason=f"{why}; {found.reason}")
-
-
 def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
-    """Whether landmarks that are not trusted gave a pose from which the measured points are off the surface."""
+    """Whether landmarks in a partly hidden scene gave a pose from which the measured points are off the surface."""
     if problem.surface is None or not answer.verdict.accepted or (answer.confidence or 0.0) >= TRUSTED:
         return False
-    if not _keeps_points(problem, answer.found):
+    if not _partly_hidden(problem) or not _keeps_points(problem, answer.found):
         return False
     there = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
     return there < SurfaceThresholds().on_surface
@@ -189,7 +176,7 @@ def _compared_with_landmarks(
 ) -> Localization:
     """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not.
 
-    Landmarks that are not trusted confirm an accepted pose by measured points, but do not move it.
+    Landmarks with less confidence than ``MOVING`` confirm an accepted pose by measured points, but do not move it.
     """
     near = confirm(matcher, problem.views, found.T_world_camera)
     if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
@@ -201,9 +188,9 @@ def _compared_with_landmarks(
             return _rejected_by_mirror(refined, twin)
         confidence = answer.confidence or 0.0
         supported = found.converged and confidence >= SUPPORTED
-        if found.converged and _partly_hidden(problem) and _leaves_surface(problem, found, answer):
+        if found.converged and _leaves_surface(problem, found, answer):
             return replace(found, seconds=time.perf_counter() - began)
-        if supported and confidence < TRUSTED and _keeps_points(problem, near.pose):
+        if supported and confidence < MOVING and _keeps_points(problem, near.pose):
             return replace(found, seconds=time.perf_counter() - began)
         outcome = Outcome.CONVERGED if supported else refined.outcome
         return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
@@ -221,9 +208,7 @@ def _compared_with_landmarks(
 
 def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:
     """Whether landmarks would move a pose found on the surface to where fewer of the measured points lie on it."""
-    if problem.surface is None or _measured_points(problem) < LEAST_POINTS:
-        return False
-    if not _partly_hidden(problem) and (answer.confidence or 0.0) >= TRUSTED:
+    if problem.surface is None or not _partly_hidden(problem) or _measured_points(problem) < LEAST_POINTS:
         return False
     before = share_on_surface(problem, problem.surface, found.T_world_camera)
     after = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
@@ -237,7 +222,10 @@ def _keeps_points(problem: Problem, found: LandmarkPose) -> bool:
 
 
 def _partly_hidden(problem: Problem) -> bool:
-    """Whether something hides part of the scene, so that few landmarks are left and measured points tell more."""
+    """Whether something hides part of the scene, so that few landmarks are left and measured points tell more.
+
+    Elsewhere landmarks are trusted more than the scale of a depth sensor.
+    """
     return any(view.frame.hidden is not None for view in problem.views)
 
 

@@ -8,14 +8,16 @@ from bidnerf_core.frames import View
 from bidnerf_core.localization.by_landmarks import corrected
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
-from bidnerf_core.localization.result import Verdict
+from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence, mirror_image
 from bidnerf_core.se3 import SE3
 
 TOLD_FROM_MIRROR = 3.0
-"""Least logarithm of the odds by renderings with which an image that resembles its mirror image is not rejected."""
+"""Logarithm of the odds from which on renderings decide between an image and its mirror image."""
+WEAK = -60.0
+"""Logarithm of the number of false alarms above which renderings are compared even if the mirror image is not recognised."""
 
 
 def mirror_rejection(
@@ -23,13 +25,13 @@ def mirror_rejection(
 ) -> Verdict | None:
     """Return why the pose that is the start of ``problem`` is rejected because the mirror image fits as well or better, or None.
 
-    ``log10_nfa``: logarithm of the number of false alarms of the pose. Where landmarks recognise the mirror image, renderings of
-    both decide, unless ``rays`` is 0.
+    ``log10_nfa``: logarithm of the number of false alarms of the pose. Where landmarks recognise the mirror image, or the image
+    hardly, renderings of both decide, unless ``rays`` is 0.
     """
     if log10_nfa < SUSPICIOUS:
         return None
     rejection = mirror_evidence(matcher, problem.views, seed=seed).rejection(log10_nfa)
-    if rejection is None or not rays:
+    if not rays or (rejection is None and log10_nfa < WEAK):
         return rejection
     last = View(mirror_image(problem.views[-1].frame), SE3.identity())
     twin = propose(matcher, [last], seed=seed)
@@ -37,4 +39,8 @@ def mirror_rejection(
         return rejection
     image, mirror = replace(problem, views=problem.views[-1:]), replace(problem, views=(last,))
     odds = log_odds_by_rendering(image, corrected(mirror, twin), seed)
-    return None if odds > TOLD_FROM_MIRROR else rejection
+    if odds > TOLD_FROM_MIRROR:
+        return None
+    if odds < -TOLD_FROM_MIRROR and rejection is None:
+        return Verdict(Outcome.MIRRORED, "renderings agree better with the mirror image")
+    return rejection
