@@ -39,6 +39,7 @@ from bidnerf_core.localization.by_landmarks import (
     is_sharp,
     localization_by_landmarks,
 )
+from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -176,7 +177,8 @@ def _compared_with_landmarks(
 ) -> Localization:
     """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not.
 
-    Landmarks with less confidence than ``MOVING`` confirm an accepted pose by measured points, but do not move it.
+    Landmarks with less confidence than ``MOVING`` confirm an accepted pose by measured points, but do not move it if the points
+    determine it better.
     """
     near = confirm(matcher, problem.views, found.T_world_camera)
     if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
@@ -190,7 +192,12 @@ def _compared_with_landmarks(
         supported = found.converged and confidence >= SUPPORTED
         if found.converged and _leaves_surface(problem, found, answer):
             return replace(found, seconds=time.perf_counter() - began)
-        if supported and confidence < MOVING and _keeps_points(problem, near.pose):
+        if (
+            supported
+            and confidence < MOVING
+            and _is_surer(found, answer)
+            and _keeps_points(problem, near.pose)
+        ):
             return replace(found, seconds=time.perf_counter() - began)
         outcome = Outcome.CONVERGED if supported else refined.outcome
         return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
@@ -213,6 +220,13 @@ def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswe
     before = share_on_surface(problem, problem.surface, found.T_world_camera)
     after = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
     return after < before - FEWER
+
+
+def _is_surer(found: Localization, answer: LandmarkAnswer) -> bool:
+    """Whether the position of a pose by depth is more certain than by landmarks."""
+    if found.covariance is None:
+        return False
+    return position_deviation(found.covariance) < position_deviation(answer.full_covariance)
 
 
 def _keeps_points(problem: Problem, found: LandmarkPose) -> bool:
