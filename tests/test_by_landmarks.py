@@ -243,6 +243,14 @@ def test_landmarks_that_correct_the_intrinsics_are_not_compared_with_points_plac
     assert not auto_module._is_doubtful(problem, replace(off, found=replace(off.found, intrinsics=other)))
 
 
+def test_the_more_certain_pose_is_kept() -> None:
+    landmarks, found = answer(unseen()), localized(unseen(), textured_map(surface=True))
+    for factor, surer in ((0.5, True), (2.0, False)):
+        judged = replace(found, covariance=factor * landmarks.full_covariance)
+        assert auto_module._is_surer(judged, landmarks) is surer
+    assert not auto_module._is_surer(replace(found, covariance=None), landmarks)
+
+
 def test_an_accepted_pose_is_settled_unless_landmarks_are_doubtful_beside_measured_points() -> None:
     found = localized(unseen(), textured_map(surface=True))
     assert found.converged
