@@ -73,14 +73,15 @@ MANY_LANDMARKS = 500
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
 SUPPORTED, MOVING = 0.5, 0.8
-"""Least confidence of landmarks in a pose that the surface accepts on its own grounds, and with which they move one by depth."""
+"""Least confidence of landmarks in a pose that the surface accepts, and with which they may move one by depth."""
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     """Find the pose by landmarks, else by depth on the surface, else by colour on it, else by descent from a start.
 
     An image whose pose is not accepted, or doubtful with something in front, is tried once more without the nearest thing that
-    was measured, which may hide the scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all, and there is no start.
+    was measured, which may hide the scene. Raises ``InputError`` if the map has no baked surface, landmarks give no pose at all,
+    and there is no start.
     """
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
     found = _found(problem, config, seed)

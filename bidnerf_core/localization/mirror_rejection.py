@@ -23,7 +23,7 @@ WEAK = -60.0
 def mirror_rejection(
     problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, rays: int, seed: int
 ) -> Verdict | None:
-    """Return why the pose that is the start of ``problem`` is rejected because the mirror image fits as well or better, or None.
+    """Return why the start of ``problem`` is rejected, because the mirror image fits as well or better, or None.
 
     ``log10_nfa``: logarithm of the number of false alarms of the pose. Where landmarks recognise the mirror image, or the image
     hardly, renderings of both decide, unless ``rays`` is 0.

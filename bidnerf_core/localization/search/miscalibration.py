@@ -138,7 +138,8 @@ def probability_of_map_camera(
 ) -> float:
     """Return the probability that an image was taken by the map's ``camera`` and not by one with the given intrinsics.
 
-    The image is represented by a fit in which the intrinsics were free. ``other_log_odds``: logarithm of the odds by other measurements.
+    The image is represented by a fit in which the intrinsics were free. ``other_log_odds``: logarithm of the odds by other
+    measurements.
     """
     value, noise = _estimate(free, landmarks)
     by_given = (_log_densities(value, noise)[:, camera.differs].sum(1) + LOG_SHARES).logsumexp(0)
