@@ -16,7 +16,7 @@ from bidnerf_core.se3 import SE3
 
 TOLD_FROM_MIRROR = 3.0
 """Logarithm of the odds from which on renderings decide between an image and its mirror image."""
-WEAK = -60.0
+HARDLY_MATCHED = -60.0
 """Logarithm of the number of false alarms above which renderings are compared even if the mirror image is not recognised."""
 
 
@@ -31,7 +31,7 @@ def mirror_rejection(
     if log10_nfa < SUSPICIOUS:
         return None
     rejection = mirror_evidence(matcher, problem.views, seed=seed).rejection(log10_nfa)
-    if not rays or (rejection is None and log10_nfa < WEAK):
+    if not rays or (rejection is None and log10_nfa < HARDLY_MATCHED):
         return rejection
     last = View(mirror_image(problem.views[-1].frame), SE3.identity())
     twin = propose(matcher, [last], seed=seed)
