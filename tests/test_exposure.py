@@ -7,9 +7,7 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.localization.costs.rendered import _robust_exposure
-from bidnerf_core.localization.exposure import Exposure, fit_exposure
-from bidnerf_core.residuals import Objective, colour_term
+from bidnerf_core.localization.exposure import fit_exposure, robust_exposure
 from bidnerf_core.robust import Robust
 
 
@@ -61,12 +59,8 @@ def test_exposure_is_found_beside_outliers() -> None:
     measured = gain * rendered[0] + bias
     measured[:50] = 1.0  # outliers
     weights = torch.full((500, 3), 1 / 500, dtype=torch.float64)
-    found = robust(rendered[:1], measured, weights, Robust("geman-mcclure", 0.05))
+    found = robust_exposure(rendered[:1], measured, weights, Robust("geman-mcclure", 0.05))
     assert float((found.gain - gain).abs().max()) < 0.12  # the prior about a gain of 1 has some weight
     assert float((found.applied(rendered[:1].mT).mT[0] - measured)[50:].abs().mean()) < 0.03
-    plain = robust(torch.full((1, 500, 3), 0.5).double(), measured, weights, Robust("huber", 0.1))
+    plain = robust_exposure(torch.full((1, 500, 3), 0.5).double(), measured, weights, Robust("huber", 0.1))
     assert bool(plain.gain.isfinite().all())
-
-
-def robust(rendered: torch.Tensor, measured: torch.Tensor, weights: torch.Tensor, loss: Robust) -> Exposure:
-    return _robust_exposure(rendered, measured, weights, Objective((colour_term(loss),)))

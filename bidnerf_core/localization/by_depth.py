@@ -22,6 +22,7 @@ from bidnerf_core.localization.method_settings import (
     RefinementStage,
     rendered_depth_scale,
 )
+from bidnerf_core.localization.point_exposure import cloud_with_exposure_of_map
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Localization
@@ -45,7 +46,7 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
         surface, PointCloud.measured(problem.views, problem.depth_rays, config.points, generator)
     )
     with torch.no_grad():
-        found = _searched(problem, search, config, generator)
+        found, search = _searched(problem, search, config, generator)
     inliers = 1.0
     if config.refine_steps:
         found, inliers = _refined(problem, search, found, config, generator)
@@ -73,14 +74,15 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
 
 def _searched(
     problem: Problem, search: PointSearch, config: AutoConfig, generator: Generator
-) -> SearchResult:
-    """Search in rounds until an answer is acceptable, and return the best one."""
+) -> tuple[SearchResult, PointSearch]:
+    """Search in rounds until an answer is acceptable; return the best one, and the search with the image's exposure there."""
     answers: list[SearchResult] = []
     while True:
         answers.append(search(problem.start, config.hypotheses, generator))
         best = min(answers, key=lambda found: float(found.scores[0]))
-        if len(answers) == config.rounds or _diagnostics(search, best).rejection() is None:
-            return best
+        exposed = replace(search, cloud=cloud_with_exposure_of_map(search.judge(), best.T[0]))
+        if len(answers) == config.rounds or _diagnostics(exposed, best).rejection() is None:
+            return replace(best, scores=exposed.score(best.T)), exposed
 
 
 def _diagnostics(search: PointSearch, found: SearchResult) -> SurfaceDiagnostics:
@@ -99,7 +101,7 @@ def _refined(
     stage = RefinementStage(
         config.refine_steps, config.refine_rays, depth_scale=scale, surface_sigma=scale / 12
     )
-    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
+    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings(exposure=True))
     finest = finest_cost(search.surface, search.cloud)
     steps = take_few_steps(problem, found.T[0], stage, settings, generator, finest)
     with torch.no_grad():

@@ -49,7 +49,7 @@ from bidnerf_core.se3 import SE3
 
 POINTS = 2000
 """Largest number of measured points that are fused."""
-FUSION_STEPS = 2
+FUSION_STEPS = 4
 """Number of second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
@@ -211,9 +211,7 @@ def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generat
     """Return the term that compares rendered rays with the images."""
     stage = RefinementStage(FUSION_STEPS, rays, depth_scale=rendered_depth_scale(problem.bounds))
     depth = DepthSettings() if problem.has_depth else None
-    settings = RenderedCostSettings(
-        ColourSettings(), depth, RefinementSettings(exposure=problem.exposure_varies)
-    )
+    settings = RenderedCostSettings(ColourSettings(), depth, RefinementSettings(exposure=True))
     cost = settings.drawn(problem, stage, about, generator)
     assert problem.start is not None
     return rendered_term(cost, float(cost.cost(problem.start[None])[0]), len(problem.views))

@@ -5,8 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+
+from bidnerf_core.robust import Robust
+
+EXPOSURE_ROUNDS = 3
+"""Rounds of robust reweighting in which the exposure is fitted."""
+EXPOSURE_PRIOR = 0.001
+"""Precision of the gain's prior, relative to all weights. It matters only if everything in view has one colour."""
+NEARLY_CLIPPED = 0.01
+"""Distance from black and from white, in [0, 1], within which an image's colours may be clipped and do not tell its exposure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,3 +49,20 @@ def fit_exposure(
     determinant = (total * square - mean**2).clamp(min=torch.finfo(rendered.dtype).tiny)
     gain = 1 + (total * grow - mean * shift) / determinant
     return Exposure(gain, (square * shift - mean * grow) / determinant)
+
+
+def robust_exposure(
+    rendered: Float[Tensor, "h n c"], measured: Float[Tensor, "n c"], weights: Float[Tensor, "n c"], robust: Robust
+) -> Exposure:  # fmt: skip
+    """Fit the exposure of each pose by iteratively reweighted least squares."""
+    x, y, w = rendered.mT, measured.mT[None], weights.mT
+    exposure = Exposure(torch.ones_like(x[..., 0]), torch.zeros_like(x[..., 0]))
+    for _ in range(EXPOSURE_ROUNDS):
+        factors = w * robust.weight(exposure.applied(x) - y)
+        exposure = fit_exposure(x, y, factors, EXPOSURE_PRIOR * factors.sum(-1))
+    return exposure
+
+
+def unclipped(measured: Float[Tensor, "*p"]) -> Bool[Tensor, "*p"]:
+    """Return which colours are neither black nor white, so that the camera cannot have clipped them."""
+    return (measured - 0.5).abs() < 0.5 - NEARLY_CLIPPED

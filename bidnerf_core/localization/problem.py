@@ -109,11 +109,6 @@ class Problem:
             raise InputError(f"level is {number}, expected 0 (coarsest) to {len(offered) - 1}")
         return offered[number]
 
-    @property
-    def exposure_varies(self) -> bool:
-        """Whether the images may have another exposure than the map: photos may, images with an alpha channel do not."""
-        return all(view.frame.alpha is None for view in self.views)
-
     def on_device(self) -> Problem:
         """Return the problem with images, poses and depth rays where the field computes."""
         device = self.device

@@ -45,9 +45,7 @@ def _ray_costs(problem: Problem, seed: int) -> Float[Tensor, "n"]:
     """Return the cost of each ray from the pose near the start that suits the images best."""
     problem = problem.without_depth()
     assert problem.start is not None
-    settings = RenderedCostSettings(
-        ColourSettings(), None, RefinementSettings(exposure=problem.exposure_varies)
-    )
+    settings = RenderedCostSettings(ColourSettings(), None, RefinementSettings(exposure=True))
     generator = Generator().manual_seed(seed)
     T = take_few_steps(problem, problem.start, FITTED, settings, generator).poses[-1]
     stage = replace(FITTED, rays=min(COMPARED_RAYS, _visible_pixels(problem)))

@@ -12,7 +12,7 @@ from bidnerf_core.constants import constant
 from bidnerf_core.field import RadianceField, Rays
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.costs.weighted_rays import RayCounts, WeightedRays, draw_weighted_rays
-from bidnerf_core.localization.exposure import Exposure, fit_exposure
+from bidnerf_core.localization.exposure import Exposure, robust_exposure, unclipped
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
@@ -31,10 +31,6 @@ MISS_SCALES = 3.0
 """Depth residual of a ray that meets nothing, in depth scales: that of an outlier, but less than the whole distance."""
 LEAST_WITH_DEPTH = 0.05
 """Least share of the rays that must have depth for these to stand for all."""
-EXPOSURE_ROUNDS = 3
-"""Rounds of robust reweighting in which the exposure is fitted."""
-EXPOSURE_PRIOR = 0.001
-"""Precision of the gain's prior, relative to all weights. It matters only if everything in view has one colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,42 +166,33 @@ def _residuals(
 ) -> Residuals:
     """Turn a linearization into weighted residuals; with ``exposure``, the rendering is first corrected to the image's.
 
+    The correction clips colours at black and at white, as cameras do; where it does, a residual does not depend on the pose.
     ``surface_sigma`` (metres) is the uncertainty of the map's surfaces. It adds the variance (slope x sigma)^2 to that of
     each residual, so steep residuals receive less weight.
     """
     value, jacobian, weights = found.residuals.double(), found.jacobian.double(), rays.weights.double()
     if exposure:
         rendered, measured = found.rgb.double(), rays.observed.rgb.double()
-        fitted = _robust_exposure(rendered, measured, weights[:, :3], objective)
-        value = torch.cat([fitted.applied(rendered.mT).mT - measured, value[..., 3:]], -1)
-        jacobian = _without_exposure(rendered, jacobian, weights, fitted)
+        telling = weights[:, :3] * unclipped(measured)
+        fitted = robust_exposure(rendered, measured, telling, objective.terms[0].robust)
+        seen = fitted.applied(rendered.mT).mT
+        inside = ((seen - 0.5).abs() < 0.5)[..., None]
+        value = torch.cat([seen.clamp(0, 1) - measured, value[..., 3:]], -1)
+        by_colour = inside * _without_exposure(rendered, inside * jacobian[..., :3, :], telling, fitted)
+        jacobian = torch.cat([by_colour, jacobian[..., 3:, :]], -2)
     confidence = (
         1 + (surface_sigma / constant(tuple(objective.scales), value) * found.steepness.double()) ** 2
     ).rsqrt()
     return Residuals(torch.where(weights > 0, value, 0), jacobian, weights, confidence, objective)
 
 
-def _robust_exposure(
-    rendered: Float[Tensor, "h n 3"], measured: Float[Tensor, "n 3"], weights: Float[Tensor, "n 3"], objective: Objective
-) -> Exposure:  # fmt: skip
-    """Fit the exposure of each pose by iteratively reweighted least squares."""
-    robust = objective.terms[0].robust
-    x, y, w = rendered.mT, measured.mT[None], weights.mT
-    exposure = Exposure(torch.ones_like(x[..., 0]), torch.zeros_like(x[..., 0]))
-    for _ in range(EXPOSURE_ROUNDS):
-        factors = w * robust.weight(exposure.applied(x) - y)
-        exposure = fit_exposure(x, y, factors, EXPOSURE_PRIOR * factors.sum(-1))
-    return exposure
-
-
 def _without_exposure(
-    rendered: Float[Tensor, "h n 3"], jacobian: Float[Tensor, "h n c 6"], weights: Float[Tensor, "n c"], fitted: Exposure
-) -> Float[Tensor, "h n c 6"]:  # fmt: skip
-    """Return the Jacobian with the exposure eliminated: gain and bias are projected out (variable projection)."""
-    by_pose = fitted.gain[:, None, :, None] * jacobian[..., :3, :]
-    share = weights[:, :3] / weights[:, :3].sum(0).clamp(min=torch.finfo(weights.dtype).tiny)
+    rendered: Float[Tensor, "h n 3"], jacobian: Float[Tensor, "h n 3 6"], weights: Float[Tensor, "n 3"], fitted: Exposure
+) -> Float[Tensor, "h n 3 6"]:  # fmt: skip
+    """Return the colours' Jacobian with the exposure eliminated: gain and bias are projected out (variable projection)."""
+    by_pose = fitted.gain[:, None, :, None] * jacobian
+    share = weights / weights.sum(0).clamp(min=torch.finfo(weights.dtype).tiny)
     basis = rendered - (share * rendered).sum(1, keepdim=True)
     basis = basis * (share * basis**2).sum(1, keepdim=True).clamp(min=1e-12).rsqrt()
     by_pose = by_pose - torch.einsum("nc,hnci->hci", share, by_pose)[:, None]
-    by_pose = by_pose - basis[..., None] * torch.einsum("nc,hnc,hnci->hci", share, basis, by_pose)[:, None]
-    return torch.cat([by_pose, jacobian[..., 3:, :]], -2)
+    return by_pose - basis[..., None] * torch.einsum("nc,hnc,hnci->hci", share, basis, by_pose)[:, None]
