@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.localization.exposure import fit_exposure, robust_exposure
+from bidnerf_core.localization.exposure import fit_exposure, robust_exposure, unclipped
 from bidnerf_core.robust import Robust
 
 
@@ -64,3 +64,8 @@ def test_exposure_is_found_beside_outliers() -> None:
     assert float((found.applied(rendered[:1].mT).mT[0] - measured)[50:].abs().mean()) < 0.03
     plain = robust_exposure(torch.full((1, 500, 3), 0.5).double(), measured, weights, Robust("huber", 0.1))
     assert bool(plain.gain.isfinite().all())
+
+
+def test_colours_near_black_and_white_may_be_clipped() -> None:
+    measured = torch.tensor([0.0, 0.005, 0.02, 0.5, 0.98, 0.995, 1.0])
+    assert unclipped(measured).tolist() == [False, False, True, True, True, False, False]

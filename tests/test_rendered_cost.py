@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -33,6 +35,19 @@ def test_the_gradient_of_the_cost_is_the_numerical_one(exposure: bool) -> None:
         )
         allowed = 0.1 * float(exact.abs().max()) if exposure else 1e-8
         torch.testing.assert_close(exact[:, k], (ahead - behind) / (4 * step), rtol=1e-4, atol=allowed)
+
+
+def test_clipped_colours_are_explained_and_do_not_steer() -> None:
+    """What a camera renders white, of whatever brightness, agrees with a field that is that bright or brighter."""
+    found = seen(POSES, PIVOTS["scene"])
+    bright = 1.15 * found.rgb[0]
+    clipped = bright > 1
+    assert 0.02 < float(clipped.double().mean()) < 0.5
+    overexposed = replace(RAYS, observed=replace(RAYS.observed, rgb=bright.clamp(max=1)))
+    corrected = _residuals(found, overexposed, OBJECTIVE, True, 0.0)
+    colours = corrected.value[0, :, :3]
+    assert float(colours.abs().max()) < 0.02
+    assert not bool(corrected.jacobian[0, :, :3][clipped & (colours == 0)].any())
 
 
 def test_the_cost_is_twice_the_loss_of_the_objective() -> None:

@@ -23,7 +23,7 @@ from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
-from bidnerf_core.localization.covariance import INDEPENDENT
+from bidnerf_core.localization.covariance import INDEPENDENT, position_deviation
 from bidnerf_core.localization.fusion import FusedTerm, finest_cost, rendered_term, surface_term
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
@@ -166,8 +166,12 @@ def fused_answer(
 
 def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
     """Return the answer with its confidence, which can turn its verdict into a rejection."""
-    judgement = judged(answer.verdict, answer.diagnostics)
-    return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
+    precision = position_deviation(answer.full_covariance) / answer.found.distance
+    diagnostics = replace(answer.diagnostics, final_precision=precision)
+    judgement = judged(answer.verdict, diagnostics)
+    return replace(
+        answer, verdict=judgement.verdict, confidence=judgement.confidence, diagnostics=diagnostics
+    )
 
 
 def corrected(problem: Problem, found: LandmarkPose) -> Problem:

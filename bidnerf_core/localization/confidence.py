@@ -81,7 +81,8 @@ def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
         "noise_ratio": math.log10(max(found.noise_ratio, 0.1)),
         "agreement": found.agreeing / max(found.matches, 1),
         "spread": found.spread,
-        "precision": math.log10(min(max(found.precision, 1e-4), 1.0)),
+        "precision": _logarithm_of_precision(found.precision),
+        "final_precision": _logarithm_of_precision(found.stated_precision),
         "miscalibration": found.miscalibration,
         "estimated_calibration": float(found.estimated_calibration),
         "confirmed_only": 0.0 if found.searched else 1.0,
@@ -89,6 +90,10 @@ def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
         "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,
         "colour_inliers": 0.0 if found.colour_inliers is None else found.colour_inliers - 0.25,
     }
+
+
+def _logarithm_of_precision(precision: float) -> float:
+    return math.log10(min(max(precision, 1e-4), 1.0))
 
 
 def surface_features(found: SurfaceDiagnostics) -> dict[str, float]:
