@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
@@ -102,7 +103,7 @@ class LandmarkPose:
     @property
     def position_deviation(self) -> float:
         """The standard deviation of the position along its least certain direction, metres."""
-        return float(torch.linalg.eigvalsh(self.full_covariance[:3, :3])[-1].clamp(min=0).sqrt())
+        return position_deviation(self.full_covariance)
 
     @property
     def inliers(self) -> int:
