@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.localization.exposure import fit_exposure, robust_exposure, unclipped
+from bidnerf_core.localization.exposure import fit_exposure, robust_exposure
 from bidnerf_core.robust import Robust
 
 
@@ -66,6 +66,22 @@ def test_exposure_is_found_beside_outliers() -> None:
     assert bool(plain.gain.isfinite().all())
 
 
-def test_colours_near_black_and_white_may_be_clipped() -> None:
-    measured = torch.tensor([0.0, 0.005, 0.02, 0.5, 0.98, 0.995, 1.0])
-    assert unclipped(measured).tolist() == [False, False, True, True, True, False, False]
+def test_clipped_colours_do_not_bend_the_exposure() -> None:
+    """Half of the colours are clipped at white by a gain of 2; a fit to all of them would find far less."""
+    rendered = torch.rand((1, 500, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    measured = (2 * rendered[0]).clamp(max=1)
+    weights = torch.full((500, 3), 1 / 500, dtype=torch.float64)
+    found = robust_exposure(rendered, measured, weights, Robust("huber", 0.1))
+    assert float((found.gain - 2).abs().max()) < 0.1
+    clipped = found.clips(rendered.mT, measured.mT[None])
+    assert float(clipped.double().mean()) == pytest.approx(0.5, abs=0.1)
+
+
+def test_white_that_is_white_determines_the_exposure() -> None:
+    """A white background that both show keeps the exposure of a grey object, of which little is seen, near 1."""
+    rendered = torch.ones((1, 500, 3), dtype=torch.float64)
+    rendered[0, :50] = 0.5
+    measured = rendered[0].clone()
+    measured[:50] += 0.04 * torch.randn((50, 3), generator=torch.Generator().manual_seed(0)).double()
+    found = robust_exposure(rendered, measured, torch.full((500, 3), 1 / 500).double(), Robust("huber", 0.1))
+    assert float((found.applied(rendered.mT) - rendered.mT).abs().max()) < 0.01

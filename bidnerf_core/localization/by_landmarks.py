@@ -49,7 +49,7 @@ from bidnerf_core.se3 import SE3
 
 POINTS = 2000
 """Largest number of measured points that are fused."""
-FUSION_STEPS = 4
+FUSION_STEPS = 2
 """Number of second-order steps on the sum of all terms."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from bidnerf_core.robust import Robust
 
-EXPOSURE_ROUNDS = 3
+EXPOSURE_ROUNDS = 6
 """Rounds of robust reweighting in which the exposure is fitted."""
 EXPOSURE_PRIOR = 0.001
 """Precision of the gain's prior, relative to all weights. It matters only if everything in view has one colour."""
 NEARLY_CLIPPED = 0.01
-"""Distance from black and from white, in [0, 1], within which an image's colours may be clipped and do not tell its exposure."""
+"""Distance from black and from white, in [0, 1], within which an image's colours may be clipped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,16 @@ class Exposure:
 
     def applied(self, rendered: Float[Tensor, "h c n"]) -> Float[Tensor, "h c n"]:
         return self.gain[..., None] * rendered + self.bias[..., None]
+
+    def clips(
+        self, rendered: Float[Tensor, "h c n"], measured: Float[Tensor, "#h c n"]
+    ) -> Bool[Tensor, "h c n"]:
+        """Return which colours are black or white in the image and would be darker or brighter still without an end of the range.
+
+        They agree with the exposure, whatever their difference from ``applied``, but do not determine it.
+        """
+        seen = self.applied(rendered)
+        return ((measured > 1 - NEARLY_CLIPPED) & (seen >= 1)) | ((measured < NEARLY_CLIPPED) & (seen <= 0))
 
 
 def fit_exposure(
@@ -54,15 +64,10 @@ def fit_exposure(
 def robust_exposure(
     rendered: Float[Tensor, "h n c"], measured: Float[Tensor, "n c"], weights: Float[Tensor, "n c"], robust: Robust
 ) -> Exposure:  # fmt: skip
-    """Fit the exposure of each pose by iteratively reweighted least squares."""
+    """Fit the exposure of each pose by iteratively reweighted least squares; colours that it clips have no weight."""
     x, y, w = rendered.mT, measured.mT[None], weights.mT
     exposure = Exposure(torch.ones_like(x[..., 0]), torch.zeros_like(x[..., 0]))
     for _ in range(EXPOSURE_ROUNDS):
-        factors = w * robust.weight(exposure.applied(x) - y)
+        factors = w * robust.weight(exposure.applied(x) - y) * ~exposure.clips(x, y)
         exposure = fit_exposure(x, y, factors, EXPOSURE_PRIOR * factors.sum(-1))
     return exposure
-
-
-def unclipped(measured: Float[Tensor, "*p"]) -> Bool[Tensor, "*p"]:
-    """Return which colours are neither black nor white, so that the camera cannot have clipped them."""
-    return (measured - 0.5).abs() < 0.5 - NEARLY_CLIPPED

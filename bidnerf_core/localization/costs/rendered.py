@@ -12,7 +12,7 @@ from bidnerf_core.constants import constant
 from bidnerf_core.field import RadianceField, Rays
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.costs.weighted_rays import RayCounts, WeightedRays, draw_weighted_rays
-from bidnerf_core.localization.exposure import Exposure, robust_exposure, unclipped
+from bidnerf_core.localization.exposure import Exposure, robust_exposure
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
@@ -173,11 +173,11 @@ def _residuals(
     value, jacobian, weights = found.residuals.double(), found.jacobian.double(), rays.weights.double()
     if exposure:
         rendered, measured = found.rgb.double(), rays.observed.rgb.double()
-        telling = weights[:, :3] * unclipped(measured)
-        fitted = robust_exposure(rendered, measured, telling, objective.terms[0].robust)
+        fitted = robust_exposure(rendered, measured, weights[:, :3], objective.terms[0].robust)
         seen = fitted.applied(rendered.mT).mT
         inside = ((seen - 0.5).abs() < 0.5)[..., None]
         value = torch.cat([seen.clamp(0, 1) - measured, value[..., 3:]], -1)
+        telling = weights[:, :3] * ~fitted.clips(rendered.mT, measured.mT[None]).mT
         by_colour = inside * _without_exposure(rendered, inside * jacobian[..., :3, :], telling, fitted)
         jacobian = torch.cat([by_colour, jacobian[..., 3:, :]], -2)
     confidence = (
@@ -187,12 +187,12 @@ def _residuals(
 
 
 def _without_exposure(
-    rendered: Float[Tensor, "h n 3"], jacobian: Float[Tensor, "h n 3 6"], weights: Float[Tensor, "n 3"], fitted: Exposure
+    rendered: Float[Tensor, "h n 3"], jacobian: Float[Tensor, "h n 3 6"], weights: Float[Tensor, "h n 3"], fitted: Exposure
 ) -> Float[Tensor, "h n 3 6"]:  # fmt: skip
     """Return the colours' Jacobian with the exposure eliminated: gain and bias are projected out (variable projection)."""
     by_pose = fitted.gain[:, None, :, None] * jacobian
-    share = weights / weights.sum(0).clamp(min=torch.finfo(weights.dtype).tiny)
+    share = weights / weights.sum(1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
     basis = rendered - (share * rendered).sum(1, keepdim=True)
     basis = basis * (share * basis**2).sum(1, keepdim=True).clamp(min=1e-12).rsqrt()
-    by_pose = by_pose - torch.einsum("nc,hnci->hci", share, by_pose)[:, None]
-    return by_pose - basis[..., None] * torch.einsum("nc,hnc,hnci->hci", share, basis, by_pose)[:, None]
+    by_pose = by_pose - torch.einsum("hnc,hnci->hci", share, by_pose)[:, None]
+    return by_pose - basis[..., None] * torch.einsum("hnc,hnc,hnci->hci", share, basis, by_pose)[:, None]
