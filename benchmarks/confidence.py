@@ -37,7 +37,7 @@ GOOD = (
     "inliers", "above_chance", "recall", "agreement", "spread", "on_surface", "colour_inliers", "runner_up_margin",
     "rendered_inliers",
 )  # fmt: skip
-BAD = ("noise_ratio", "precision", "final_precision", "miscalibration", "free_space_violations")
+BAD = ("noise_ratio", "precision", "miscalibration", "free_space_violations")
 """Features of which more can only raise, or only lower, the confidence: examples are too few to show it for each."""
 BINS = 10
 WITHOUT_CONFIDENCE = (Outcome.MIRRORED, Outcome.AMBIGUOUS)

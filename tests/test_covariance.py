@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -13,6 +14,7 @@ from bidnerf_core.depth_sensor import EXACT
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import (
     INDEPENDENT,
+    position_deviation,
     sandwich_covariance,
     surface_covariance,
     without_direction,
@@ -134,3 +136,11 @@ def test_too_few_rays_or_a_blind_direction_make_the_sandwich_infinite(generator:
     found = sandwich_covariance(many, blind)
     assert bool(found[0].isfinite().all())
     assert bool(found[1].isinf().all())
+
+
+def test_the_deviation_of_a_position_is_that_of_its_least_certain_direction() -> None:
+    covariance = torch.diag(torch.tensor([1.0, 9.0, 4.0, 100.0, 1.0, 1.0], dtype=torch.float64))
+    assert position_deviation(covariance) == pytest.approx(3.0)
+    for unknown in (math.inf, math.nan):
+        covariance[0, 0] = unknown
+        assert position_deviation(covariance) == math.inf

@@ -105,18 +105,11 @@ class LandmarkDiagnostics:
     spread: float  # share of the image's cells that hold a correspondence
     noise_ratio: float  # reprojection noise over that of the map's own images
     miscalibration: float  # probability that the given intrinsics are wrong
-    precision: float  # standard deviation of the position by landmarks alone over their distance
+    precision: float  # standard deviation of the position by landmarks alone, over their distance
     estimated_calibration: bool  # whether the intrinsics were estimated along with the pose
     searched: bool  # whether landmarks found the pose, or only confirm one that was found on the surface
     on_surface: float | None = None  # share of the measured points that lie on the surface
     colour_inliers: float | None = None  # share that lies there and has its colour
-    # standard deviation over that distance of the position that is answered: fused, with the intrinsics' errors
-    final_precision: float | None = None
-
-    @property
-    def stated_precision(self) -> float:
-        """The precision of the position that is answered."""
-        return self.precision if self.final_precision is None else self.final_precision
 
 
 def landmark_diagnostics(

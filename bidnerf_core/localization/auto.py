@@ -39,6 +39,7 @@ from bidnerf_core.localization.by_landmarks import (
     is_sharp,
     localization_by_landmarks,
 )
+from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
@@ -60,8 +61,6 @@ the right place either.
 """
 UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
 """Reasons for which a pose that landmarks determine is rejected: it is not accurate, or not probable, enough."""
-TRUSTED = 0.95
-"""Confidence from which on landmarks are not compared with measured points."""
 MOSTLY = 0.5
 """Least share of the measured points on the surface with which a scene is not taken to be partly hidden."""
 FEWER = 0.05

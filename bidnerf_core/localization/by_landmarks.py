@@ -19,11 +19,11 @@ from bidnerf_core.localization.acceptance import (
     landmark_diagnostics,
     landmark_verdict,
 )
-from bidnerf_core.localization.confidence import judged
+from bidnerf_core.localization.confidence import TRUSTED, judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
-from bidnerf_core.localization.covariance import INDEPENDENT, position_deviation
+from bidnerf_core.localization.covariance import INDEPENDENT
 from bidnerf_core.localization.fusion import FusedTerm, finest_cost, rendered_term, surface_term
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
@@ -51,6 +51,8 @@ POINTS = 2000
 """Largest number of measured points that are fused."""
 FUSION_STEPS = 2
 """Number of second-order steps on the sum of all terms."""
+THOROUGHLY = 2
+"""How many times as many rays and steps, with the square of it as much weight, are spent on poses that landmarks leave doubtful."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
 DEPTH_SCALE_NOISE = 0.01
@@ -159,19 +161,18 @@ def fused_answer(
         terms["depth"], judge = _surface_term(problem, problem.surface, generator)
         diagnostics = landmark_diagnostics(found, searched, judge, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
+    answer = _judged(answer)
     if rays and is_sharp(problem):
-        terms["rendering"] = _rendered_term(problem, rays, about, generator)
-    return _judged(_fused(answer, terms, about) if terms else answer)
+        effort = 1 if (answer.confidence or 0.0) >= TRUSTED else THOROUGHLY
+        terms["rendering"] = _rendered_term(problem, rays, about, generator, effort)
+        return _fused(answer, terms, about, effort * FUSION_STEPS)
+    return _fused(answer, terms, about, FUSION_STEPS) if terms else answer
 
 
 def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
     """Return the answer with its confidence, which can turn its verdict into a rejection."""
-    precision = position_deviation(answer.full_covariance) / answer.found.distance
-    diagnostics = replace(answer.diagnostics, final_precision=precision)
-    judgement = judged(answer.verdict, diagnostics)
-    return replace(
-        answer, verdict=judgement.verdict, confidence=judgement.confidence, diagnostics=diagnostics
-    )
+    judgement = judged(answer.verdict, answer.diagnostics)
+    return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
 
 
 def corrected(problem: Problem, found: LandmarkPose) -> Problem:
@@ -211,17 +212,19 @@ def _surface_term(
     return surface_term(cost, problem.start, len(problem.views)), cost
 
 
-def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator) -> FusedTerm:
-    """Return the term that compares rendered rays with the images."""
-    stage = RefinementStage(FUSION_STEPS, rays, depth_scale=rendered_depth_scale(problem.bounds))
+def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator, effort: int) -> FusedTerm:
+    """Return the term that compares rendered rays with the images; the loss of colours leaves out what hides the scene."""
+    stage = RefinementStage(FUSION_STEPS, effort * rays, depth_scale=rendered_depth_scale(problem.bounds))
     depth = DepthSettings() if problem.has_depth else None
-    settings = RenderedCostSettings(ColourSettings(), depth, RefinementSettings(exposure=True))
+    colour = ColourSettings(colour_loss="geman-mcclure")
+    settings = RenderedCostSettings(colour, depth, RefinementSettings(exposure=True))
     cost = settings.drawn(problem, stage, about, generator)
     assert problem.start is not None
-    return rendered_term(cost, float(cost.cost(problem.start[None])[0]), len(problem.views))
+    term = rendered_term(cost, float(cost.cost(problem.start[None])[0]), len(problem.views))
+    return replace(term, measurements=effort**2 * term.measurements)
 
 
-def _fused(answer: LandmarkAnswer, terms: dict[str, FusedTerm], about: Pivot) -> LandmarkAnswer:
+def _fused(answer: LandmarkAnswer, terms: dict[str, FusedTerm], about: Pivot, steps: int) -> LandmarkAnswer:
     """Minimize the sum of the landmarks' Gaussian prior and the other terms, and return the fused pose.
 
     The covariance counts each additional term as only ``INDEPENDENT`` measurements, because its errors are correlated over
@@ -229,7 +232,7 @@ def _fused(answer: LandmarkAnswer, terms: dict[str, FusedTerm], about: Pivot) ->
     """
     prior = GaussianPrior(answer.T, answer.covariance, about)
     cost = Sum((prior, *(term.scaled for term in terms.values())))
-    done = descend(cost, answer.T[None], FUSION_STEPS, about.moved)
+    done = descend(cost, answer.T[None], steps, about.moved)
     T = done.T[0].normalized()
     information = prior(T[None]).hessian[0]
     for term in terms.values():

@@ -17,6 +17,8 @@ from bidnerf_core.localization.result import Outcome, Verdict
 
 ACCEPTED = 0.6
 """Least confidence with which a pose is accepted."""
+TRUSTED = 0.95
+"""Confidence from which on landmarks are not compared with measured points, and few rendered rays are added to them."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,7 @@ def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
         "noise_ratio": math.log10(max(found.noise_ratio, 0.1)),
         "agreement": found.agreeing / max(found.matches, 1),
         "spread": found.spread,
-        "precision": _logarithm_of_precision(found.precision),
-        "final_precision": _logarithm_of_precision(found.stated_precision),
+        "precision": math.log10(min(max(found.precision, 1e-4), 1.0)),
         "miscalibration": found.miscalibration,
         "estimated_calibration": float(found.estimated_calibration),
         "confirmed_only": 0.0 if found.searched else 1.0,
@@ -90,10 +91,6 @@ def landmark_features(found: LandmarkDiagnostics) -> dict[str, float]:
         "on_surface": 0.0 if found.on_surface is None else found.on_surface - 0.5,
         "colour_inliers": 0.0 if found.colour_inliers is None else found.colour_inliers - 0.25,
     }
-
-
-def _logarithm_of_precision(precision: float) -> float:
-    return math.log10(min(max(precision, 1e-4), 1.0))
 
 
 def surface_features(found: SurfaceDiagnostics) -> dict[str, float]:
