@@ -78,10 +78,25 @@ def test_clipped_colours_do_not_bend_the_exposure() -> None:
 
 
 def test_white_that_is_white_determines_the_exposure() -> None:
-    """A white background that both show keeps the exposure of a grey object, of which little is seen, near 1."""
+    """A white background keeps white what an object, of which little is seen, would make grey if it alone counted."""
     rendered = torch.ones((1, 500, 3), dtype=torch.float64)
-    rendered[0, :50] = 0.5
+    rendered[0, :50] = torch.linspace(0.3, 0.7, 50, dtype=torch.float64)[:, None]
     measured = rendered[0].clone()
-    measured[:50] += 0.04 * torch.randn((50, 3), generator=torch.Generator().manual_seed(0)).double()
+    measured[:50] = 0.5 * rendered[0, :50] + 0.2
     found = robust_exposure(rendered, measured, torch.full((500, 3), 1 / 500).double(), Robust("huber", 0.1))
-    assert float((found.applied(rendered.mT) - rendered.mT).abs().max()) < 0.01
+    white = found.gain + found.bias
+    assert float((white - 1).abs().max()) < 0.05
+    object_alone = torch.cat([torch.ones(50), torch.zeros(450)])[:, None].expand(500, 3).double()
+    alone = robust_exposure(rendered, measured, object_alone, Robust("huber", 0.1))
+    assert float((alone.gain + alone.bias).max()) < 0.8
+
+
+def test_rays_without_weight_do_not_matter() -> None:
+    rendered = torch.rand((1, 50, 3), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = torch.ones((50, 3), dtype=torch.float64)
+    weights[7] = 0
+    measured = 0.8 * rendered[0]
+    expected = robust_exposure(rendered, measured, weights, Robust("huber", 0.1))
+    rendered[0, 7] = torch.nan
+    found = robust_exposure(rendered, measured, weights, Robust("huber", 0.1))
+    torch.testing.assert_close(found.gain, expected.gain)

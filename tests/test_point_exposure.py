@@ -34,15 +34,44 @@ def test_the_exposure_is_taken_back(gain: float) -> None:
 
 def test_points_that_were_clipped_have_no_colour() -> None:
     measured = 1.4 * RGB
-    clipped = (measured > 1).any(-1)
+    clipped = (measured > 1.1).any(-1)
     assert bool(clipped.any())
     assert not bool(brought(measured.clamp(max=1)).coloured[clipped].any())
     assert bool(brought(RGB).coloured.all()), "white things are not clipped without a gain"
 
 
-def test_a_gain_of_more_than_two_stops_is_not_believed() -> None:
+def test_a_gain_of_more_than_two_stops_is_left_alone() -> None:
     dark = RGB / (2 * STRONGEST) + 0.02
     torch.testing.assert_close(brought(dark).rgb, dark.to(brought(dark).rgb))
+
+
+@pytest.mark.parametrize("channels", [slice(0, 3), slice(0, 1)], ids=["white", "red"])
+def test_something_white_in_front_is_not_taken_for_clipped(channels: slice) -> None:
+    """Half of the points show something white, or red, that the map does not have: their colours still contradict it."""
+    measured = 1.15 * RGB - 0.03
+    measured[::2, channels] = 1
+    found = brought(measured.clamp(0, 1))
+    wrong = (RGB[::2, channels] < 0.7).all(-1)
+    assert float(wrong.double().mean()) > 0.2
+    assert bool(found.coloured[::2][wrong].all())
+    assert float((found.rgb - RGB)[::2][wrong].abs().amax(-1).min()) > 0.1
+
+
+def test_a_channel_that_is_clipped_everywhere_is_not_explained() -> None:
+    measured = 0.6 * RGB
+    measured[:, 0] = 1
+    torch.testing.assert_close(brought(measured).rgb, measured)
+
+
+def test_low_contrast_alone_is_not_taken_for_an_exposure() -> None:
+    """Blur pulls colours towards their mean; to stretch them again would only enlarge what it changed."""
+    blurred = 0.95 * RGB + 0.05 * RGB.mean(0)
+    torch.testing.assert_close(brought(blurred).rgb, blurred)
+
+
+def test_an_image_that_is_white_everywhere_stays_so() -> None:
+    white = torch.ones_like(RGB)
+    torch.testing.assert_close(brought(white).rgb, white)
 
 
 def test_colours_of_another_place_are_not_explained() -> None:

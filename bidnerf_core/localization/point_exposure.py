@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
-from bidnerf_core.localization.exposure import NEARLY_CLIPPED, robust_exposure
+from bidnerf_core.localization.exposure import robust_exposure
 from bidnerf_core.robust import Robust
 from bidnerf_core.se3 import SE3
 
-STRONGEST = 4.0
-"""Gain up to which, and down to whose inverse, an exposure is believed; it is some two stops."""
-BRIGHTER = 1.1
-"""Gain from which on points in which the camera clipped a colour count as uncoloured: they were brighter than they show."""
+STRONGEST, MOST_BIAS = 4.0, 0.25
+"""Gain up to which, and down to whose inverse, and bias up to which an exposure is accepted: two stops, a quarter of the range."""
+LEAST_COLOURED = 0.2
+"""Least share of the points whose colours the camera did not clip."""
 CLEARLY_MORE = 0.05
 """Share of the points that have to agree in colour in addition for an exposure to be taken.
 
@@ -23,8 +23,10 @@ Blur also lowers contrast, but to restore that only enlarges the differences.
 def cloud_with_exposure_of_map(cost: SurfaceCost, T: SE3) -> PointCloud:
     """Return the points of ``cost`` with the colours that they would have with the map's exposure.
 
-    The exposure, one gain and bias for each channel, is fitted to the points that lie on the surface from pose T. The points
-    are returned as they are where it is not believable, or hardly any more of them have the surface's colour with it.
+    The exposure, one gain and bias for each channel, is fitted to the points that lie on the surface from pose T. Points in which
+    the camera clipped a colour that the surface and the exposure carry beyond black or white count as uncoloured. The points are
+    returned as they are where the exposure is too far from the map's, too few keep their colour, or hardly any more of them have
+    the surface's colour with it.
     """
     found, cloud = cost.correspondences(T[None]), cost.cloud
     near, alike = cost.inliers(found)
@@ -34,11 +36,12 @@ def cloud_with_exposure_of_map(cost: SurfaceCost, T: SE3) -> PointCloud:
     surface = difference.double() + measured
     fitted = robust_exposure(surface, measured, weights, Robust("geman-mcclure", cost.scales.colour))
     gain, bias = fitted.gain[0], fitted.bias[0]
-    if not bool(((gain > 1 / STRONGEST) & (gain < STRONGEST)).all()):
+    clipped = fitted.clips(surface.mT, measured.mT[None])[0].any(0)
+    kept = cloud.coloured & ~clipped
+    moderate = (gain > 1 / STRONGEST) & (gain < STRONGEST) & (bias.abs() < MOST_BIAS)
+    if not bool(moderate.all()) or float(kept.double().mean()) < LEAST_COLOURED:
         return cloud
-    brighter = (gain > BRIGHTER) & (measured > 1 - NEARLY_CLIPPED)
-    rgb = ((measured - bias) / gain).clamp(0, 1).to(cloud.rgb)
-    exposed = replace(cloud, rgb=rgb, coloured=cloud.coloured & ~brighter.any(-1))
+    exposed = replace(cloud, rgb=((measured - bias) / gain).clamp(0, 1).to(cloud.rgb), coloured=kept)
     _, then_alike = replace(cost, cloud=exposed).inliers(found)
-    gained = float((near * (then_alike - alike)).mean())
+    gained = float((near * (then_alike - alike))[0, kept].sum()) / len(cloud)
     return exposed if gained > CLEARLY_MORE else cloud
