@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 import bidnerf_core.localization.auto as auto_module
+import bidnerf_core.localization.by_landmarks as by_landmarks_module
 import textured_field
 from bidnerf_core import Localization, Localizer, Outcome, View
 from bidnerf_core.depth_sensor import find_depth_sensor
@@ -18,13 +20,17 @@ from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 from bidnerf_core.localization.by_depth import share_on_surface
 from bidnerf_core.localization.by_landmarks import (
+    FUSION_STEPS,
     SHARPEST,
+    THOROUGHLY,
     LandmarkAnswer,
     answer_by_landmarks,
     corrected,
     localization_by_landmarks,
     shrunk_depth_scale,
 )
+from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
+from bidnerf_core.localization.method_settings import RefinementStage
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.search.landmarks import Confirmation
 from bidnerf_core.localization.search.matching import LandmarkMatcher
@@ -107,6 +113,32 @@ def test_more_terms_make_the_covariance_smaller() -> None:
 def test_rendering_brings_a_pose_by_blurred_keypoints_to_that_of_the_field() -> None:
     """The image is what the field renders, so that rendered rays alone have no error."""
     assert_within(answer(without_depth(unseen()), rays=RAYS).T, 0.002, 0.05)
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.6])
+def test_another_exposure_does_not_mislead_rendering(gain: float) -> None:
+    """Half of the exposure, or one at which bright colours are clipped."""
+    view = without_depth(unseen())
+    exposed = replace(view, frame=replace(view.frame, rgb=(gain * view.frame.rgb).clamp(max=1)))
+    found = answer(exposed, rays=RAYS)
+    assert found.terms == ("rendering",)
+    assert_within(found.T, 0.004, 0.1)
+
+
+@pytest.mark.parametrize(("trusted", "effort"), [(0.0, 1), (1.1, THOROUGHLY)], ids=["trusted", "doubtful"])
+def test_doubtful_poses_are_refined_on_more_rays(
+    trusted: float, effort: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stages, drawn = list[RefinementStage](), RenderedCostSettings.drawn
+
+    def noted(settings: RenderedCostSettings, *given: Any) -> RenderedCost:
+        stages.append(given[1])
+        return drawn(settings, *given)
+
+    monkeypatch.setattr(RenderedCostSettings, "drawn", noted)
+    monkeypatch.setattr(by_landmarks_module, "TRUSTED", trusted)
+    answer(without_depth(unseen()), rays=100)
+    assert [(stage.rays, stage.steps) for stage in stages] == [(100 * effort, FUSION_STEPS * effort)]
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def align_points_and_render(place: Place) -> list[Tensor]:
     problem, T = rig(FieldMap(field, baked.BOUNDS, there), [view], None), near(view, 1)
     generator = Generator().manual_seed(0)
     points = finest_cost(there, PointCloud.measured(problem.views, None, 400, generator))
-    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings())
+    settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings(exposure=True))
     about = points.cloud.pivot
     rays = settings.drawn(problem.on_device(), RefinementStage(2, 64), about.to(place.device), generator)
     terms = (rendered_term(rays, float(rays.cost(T)[0]), 1), surface_term(points, T[0], 1))

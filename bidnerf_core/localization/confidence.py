@@ -18,7 +18,7 @@ from bidnerf_core.localization.result import Outcome, Verdict
 ACCEPTED = 0.6
 """Least confidence with which a pose is accepted."""
 TRUSTED = 0.95
-"""Confidence from which on landmarks are not compared with measured points, and few rendered rays are added to them."""
+"""Confidence from which on a pose by landmarks needs no further measurements to be trusted."""
 
 
 @dataclass(frozen=True)
