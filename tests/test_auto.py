@@ -58,6 +58,15 @@ def test_no_start_is_needed(number: int) -> None:
     assert xi @ torch.linalg.solve(found.covariance, xi) < 16.8  # 99 % of chi^2 with 6 degrees of freedom
 
 
+@pytest.mark.parametrize("gain", [0.4, 1.5])
+def test_another_exposure_is_accepted_by_depth(gain: float) -> None:
+    view = baked.unseen()[0]
+    exposed = replace(view, frame=replace(view.frame, rgb=(gain * view.frame.rgb).clamp(max=1)))
+    found = found_for(baked.problem(exposed))
+    assert_right(found, view.T_ref_camera)
+    assert found.converged, found.reason
+
+
 def test_a_start_helps_where_the_map_has_no_view_alike() -> None:
     view = baked.unseen()[0]
     aside = replace(baked.toy(), keyframes=torch.eye(4, dtype=torch.float64)[None])

@@ -26,7 +26,7 @@ from bidnerf_core.localization.point_exposure import cloud_with_exposure_of_map
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Localization
-from bidnerf_core.localization.search.by_points import PointSearch
+from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
@@ -79,10 +79,20 @@ def _searched(
     answers: list[SearchResult] = []
     while True:
         answers.append(search(problem.start, config.hypotheses, generator))
-        best = min(answers, key=lambda found: float(found.scores[0]))
-        exposed = replace(search, cloud=cloud_with_exposure_of_map(search.judge(), best.T[0]))
+        best, exposed = _with_exposure(search, min(answers, key=lambda found: float(found.scores[0])))
         if len(answers) == config.rounds or _diagnostics(exposed, best).rejection() is None:
-            return replace(best, scores=exposed.score(best.T)), exposed
+            return best, exposed
+
+
+def _with_exposure(search: PointSearch, found: SearchResult) -> tuple[SearchResult, PointSearch]:
+    """Return an answer aligned once more, and the search, with the points' colours as the map's exposure would show them."""
+    cloud = cloud_with_exposure_of_map(search.judge(), found.T[0])
+    if cloud is search.cloud:
+        return found, search
+    exposed = replace(search, cloud=cloud)
+    again = exposed.from_poses(found.T, POINT_STAGES[-1:])
+    path = SE3.cat([found.path, again.path[1:]])
+    return replace(found, T=again.T, scores=again.scores, path=path), exposed
 
 
 def _diagnostics(search: PointSearch, found: SearchResult) -> SurfaceDiagnostics:
