@@ -14,7 +14,7 @@ from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.by_landmarks import LandmarkAnswer, answer_by_landmarks
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem, rig
-from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
+from bidnerf_core.localization.rendered_evidence import NOISIEST, log_odds_by_rendering
 from bidnerf_core.localization.result import Verdict
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import MirrorEvidence, mirror_image
@@ -74,6 +74,13 @@ class NotFinite(TexturedGround):
 def test_a_field_that_renders_what_is_not_finite_tells_nothing() -> None:
     a, b = (replace(given, field=NotFinite()) for given in (problem(), problem(stated(1.03))))
     assert log_odds_by_rendering(a, b, seed=0) == 0
+
+
+def test_a_field_that_has_hardly_been_trained_tells_nothing() -> None:
+    a, b = (replace(given, colour_noise=1.01 * NOISIEST) for given in (problem(), problem(stated(1.03))))
+    assert log_odds_by_rendering(a, b, seed=0) == 0
+    c, d = (replace(given, colour_noise=0.99 * NOISIEST) for given in (a, b))
+    assert log_odds_by_rendering(c, d, seed=0) > 1
 
 
 def test_an_image_is_told_from_its_mirror_image() -> None:

@@ -27,14 +27,18 @@ LOG_ODDS_PER_DEVIATION = 0.5
 
 With independent rays it would be more, but the rays of a field err together. Chosen on frames that were held out for tuning.
 """
+NOISIEST = 0.15
+"""Colour noise of a field on its own training images above which it does not tell explanations apart: it has hardly been trained."""
 
 
 def log_odds_by_rendering(one: Problem, other: Problem, seed: int) -> float:
     """Return the logarithm of the odds, by rendered colours alone, that ``one`` is right and not ``other``.
 
-    Both hold images of the same size with intrinsics, and the pose found with them as the start. 0 where the field renders what
-    is not finite.
+    Both hold images of the same size with intrinsics, and the pose found with them as the start. 0 where the field is too noisy, or
+    renders what is not finite.
     """
+    if one.colour_noise is not None and one.colour_noise > NOISIEST:
+        return 0.0
     difference = _ray_costs(other, seed) - _ray_costs(one, seed)
     error = float(difference.std()) * len(difference) ** 0.5
     odds = LOG_ODDS_PER_DEVIATION * float(difference.sum()) / max(error, 1e-12)
