@@ -1,4 +1,4 @@
-"""Measured points with the map's exposure: gains, clipped colours, and exposures that are not to be believed."""
+"""Measured points with the map's exposure: gains, clipped colours, and exposures too far from the map's."""
 
 from __future__ import annotations
 

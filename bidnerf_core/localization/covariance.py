@@ -87,7 +87,10 @@ def without_direction(information: Float[Tensor, "6 6"], slope: Float[Tensor, "6
 
 
 def position_deviation(covariance: Float[Tensor, "6 6"]) -> float:
-    """Return the standard deviation (metres) of the position along its least certain direction; infinite if the covariance is not finite."""
+    """Return the standard deviation (metres) of the position along its least certain direction.
+
+    It is infinite if the covariance is not finite.
+    """
     if not bool(covariance.isfinite().all()):
         return math.inf
     return float(torch.linalg.eigvalsh(covariance[:3, :3])[-1].clamp(min=0).sqrt())
