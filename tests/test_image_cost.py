@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from torch import Generator
 
 import baked
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.costs.images import (
@@ -138,9 +139,8 @@ def test_the_exposure_is_what_a_general_solver_finds(generator: Generator) -> No
     scales = ColourScales(colour=100.0, gain=0.3, bias=0.2)  # nothing is an outlier
     rgb = torch.rand((1, 3, 40), generator=generator)
     wanted = 1.2 * rgb[0] - 0.05 + 0.01 * torch.randn((3, 40), generator=generator)
-    seen = RenderedView(
-        rgb, torch.zeros((1, 3, 40, 2)), torch.ones((1, 40)), torch.zeros((1, 40, 3)), torch.ones((1, 40))
-    )
+    camera = Intrinsics.from_focal(10.0, 8, 5)
+    seen = RenderedView(camera, rgb, torch.ones((1, 40)), torch.zeros((1, 40, 3)), torch.ones((1, 40)))
     found = exposed(seen, wanted, scales)
     x, y = rgb[0, 0].double().numpy(), wanted[0].double().numpy()
 

@@ -24,6 +24,7 @@ from bidnerf_core.localization.acceptance import (
 )
 from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.bid import BidConfig, bid
+from bidnerf_core.localization.by_blurred_image import refined_if_blurred
 from bidnerf_core.localization.by_colour import (
     ColourAnswer,
     localization_of,
@@ -84,6 +85,8 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     """
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
     found = _found(problem, config, seed)
+    if config.fused_rays:
+        found = refined_if_blurred(problem, found)
     if _is_settled(found) or found.outcome in FINAL or problem.surface is None:
         return found
     occluder = nearest_piece(problem)
@@ -253,10 +256,7 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer."""
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
     search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
-    # Images with a plain background were rendered and are as bright as the map; photos may have another exposure.
-    exposure = config.by_colour.refinement.exposure or not search.has_background
-    refinement = replace(config.by_colour.refinement, exposure=exposure)
-    by_colour = replace(config.by_colour, refinement=refinement)
+    by_colour = replace(config.by_colour, refinement=replace(config.by_colour.refinement, exposure=True))
     keyframes = SE3.from_matrix(surface.keyframes).to("cpu")
     known = Surroundings(keyframes, surface.extent, torch.zeros(3), search.middle)
     while True:

@@ -28,15 +28,13 @@ class Exposure:
     def applied(self, rendered: Float[Tensor, "h c n"]) -> Float[Tensor, "h c n"]:
         return self.gain[..., None] * rendered + self.bias[..., None]
 
-    def clips(
-        self, rendered: Float[Tensor, "h c n"], measured: Float[Tensor, "#h c n"]
-    ) -> Bool[Tensor, "h c n"]:
-        """Return which colours are black or white in the image, and carried beyond that by the exposure.
 
-        They agree with the exposure, whatever their difference from ``applied``, but do not determine it.
-        """
-        seen = self.applied(rendered)
-        return ((measured > 1 - NEARLY_CLIPPED) & (seen >= 1)) | ((measured < NEARLY_CLIPPED) & (seen <= 0))
+def clipped(seen: Float[Tensor, "*s"], measured: Float[Tensor, "#*s"]) -> Bool[Tensor, "*s"]:
+    """Return which colours are black or white in the image, and carried beyond that by an exposure, which makes them ``seen``.
+
+    They agree with the exposure, whatever the difference, but do not determine it.
+    """
+    return ((measured > 1 - NEARLY_CLIPPED) & (seen >= 1)) | ((measured < NEARLY_CLIPPED) & (seen <= 0))
 
 
 def fit_exposure(
@@ -62,15 +60,16 @@ def fit_exposure(
 
 
 def robust_exposure(
-    rendered: Float[Tensor, "h n c"], measured: Float[Tensor, "n c"], weights: Float[Tensor, "n c"], robust: Robust
+    rendered: Float[Tensor, "h c n"], measured: Float[Tensor, "c n"], weights: Float[Tensor, "c n"], robust: Robust
 ) -> Exposure:  # fmt: skip
     """Fit the exposure of each pose by iteratively reweighted least squares; colours that it clips have no weight.
 
     The rounds begin at a gain of 1. With a redescending loss they find images of up to two stops less, but one stop more.
     """
-    x, y, w = torch.where(weights > 0, rendered, 0).mT, measured.mT[None], weights.mT
-    exposure = Exposure(torch.ones_like(x[..., 0]), torch.zeros_like(x[..., 0]))
+    rendered = torch.where(weights > 0, rendered, 0)
+    exposure = Exposure(torch.ones_like(rendered[..., 0]), torch.zeros_like(rendered[..., 0]))
     for _ in range(EXPOSURE_ROUNDS):
-        factors = w * robust.weight(exposure.applied(x) - y) * ~exposure.clips(x, y)
-        exposure = fit_exposure(x, y, factors, EXPOSURE_PRIOR * factors.sum(-1))
+        seen = exposure.applied(rendered)
+        factors = weights * robust.weight(seen - measured) * ~clipped(seen, measured)
+        exposure = fit_exposure(rendered, measured[None], factors, EXPOSURE_PRIOR * factors.sum(-1))
     return exposure

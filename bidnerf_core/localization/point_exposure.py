@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
-from bidnerf_core.localization.exposure import robust_exposure
+from bidnerf_core.localization.exposure import clipped, robust_exposure
 from bidnerf_core.robust import Robust
 from bidnerf_core.se3 import SE3
 
@@ -31,17 +31,16 @@ def cloud_with_exposure_of_map(cost: SurfaceCost, T: SE3) -> PointCloud:
     found, cloud = cost.correspondences(T[None]), cost.cloud
     near, alike = cost.inliers(found)
     difference, _ = cost.colour_differences(found)
-    measured = cloud.rgb.double()
-    weights = (near[0] * cloud.coloured)[:, None].expand_as(measured).double()
-    surface = difference.double() + measured
+    measured = cloud.rgb.double().mT
+    weights = (near[0] * cloud.coloured).expand_as(measured).double()
+    surface = difference.double().mT + measured
     fitted = robust_exposure(surface, measured, weights, Robust("geman-mcclure", cost.scales.colour))
     gain, bias = fitted.gain[0], fitted.bias[0]
-    clipped = fitted.clips(surface.mT, measured.mT[None])[0].any(0)
-    kept = cloud.coloured & ~clipped
+    kept = cloud.coloured & ~clipped(fitted.applied(surface), measured)[0].any(0)
     moderate = (gain > 1 / STRONGEST) & (gain < STRONGEST) & (bias.abs() < MOST_BIAS)
     if not bool(moderate.all()) or float(kept.double().mean()) < LEAST_COLOURED:
         return cloud
-    exposed = replace(cloud, rgb=((measured - bias) / gain).clamp(0, 1).to(cloud.rgb), coloured=kept)
+    exposed = replace(cloud, rgb=((measured.mT - bias) / gain).clamp(0, 1).to(cloud.rgb), coloured=kept)
     _, then_alike = replace(cost, cloud=exposed).inliers(found)
     gained = float((near * (then_alike - alike))[0, kept].sum()) / len(cloud)
     return exposed if gained > CLEARLY_MORE else cloud

@@ -7,15 +7,17 @@ renderer; automatic differentiation is not needed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.localization.costs.thumbnails import Thumbnail, slopes, smooth
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.localization.costs.thumbnails import Thumbnail, blurred, slopes, smooth
 from bidnerf_core.localization.costs.view_renderers import ViewRenderer
-from bidnerf_core.localization.exposure import Exposure, fit_exposure
+from bidnerf_core.localization.exposure import Exposure, clipped, fit_exposure
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.robust import geman_mcclure_inlier
 from bidnerf_core.se3 import SE3
@@ -39,11 +41,27 @@ class ColourScales:
 class RenderedView:
     """A thumbnail's n pixels as the map renders them from each of h poses."""
 
+    camera: Intrinsics
     rgb: Float[Tensor, "h 3 n"]  # smooth
-    slopes: Float[Tensor, "h 3 n 2"]  # of it, per unit on the plane z = 1
     known: Float[Tensor, "h n"]  # share of the pixel that the map renders, 0 to 1
     points: Float[Tensor, "h n 3"]  # points seen by the pixels: metres, last camera's frame
     depth: Float[Tensor, "h n"]  # metres, in the thumbnail's camera
+
+    @cached_property
+    def slopes(self) -> Float[Tensor, "h 3 n 2"]:
+        """The change of the colours per unit on the plane z = 1."""
+        return slopes(self._image(self.rgb), self.camera)
+
+    def blurred(self, pixels: float) -> RenderedView:
+        """Return the colours convolved with a Gaussian of that standard deviation."""
+        if pixels == 0:
+            return self
+        known = self.known[:, None]
+        rgb, weight = (blurred(self._image(part), pixels).flatten(2) for part in (self.rgb * known, known))
+        return replace(self, rgb=rgb / weight.clamp(min=1e-3), known=weight[:, 0])
+
+    def _image(self, flat: Float[Tensor, "h c n"]) -> Float[Tensor, "h c y x"]:
+        return flat.unflatten(-1, (self.camera.height, self.camera.width))
 
 
 def render_view(renderer: ViewRenderer, small: Thumbnail, T: SE3) -> RenderedView:
@@ -60,9 +78,7 @@ def render_view(renderer: ViewRenderer, small: Thumbnail, T: SE3) -> RenderedVie
     rgb = rgb / known.clamp(min=1e-3)
     along = seen.along.view(count, -1)
     points = small.origin + along[..., None] * local
-    return RenderedView(
-        rgb.flatten(2), slopes(rgb, camera), known.flatten(1), points, along * small.directness
-    )
+    return RenderedView(camera, rgb.flatten(2), known.flatten(1), points, along * small.directness)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +94,9 @@ class ImageCost:
     thumbnails: Sequence[Thumbnail]
     scales: ColourScales
     pivot: Float[Tensor, "3"]  # metres, last camera's frame
+    blur: float = (
+        0.0  # standard deviation by which photos are more blurred than renderings, pixels of thumbnails
+    )
 
     def __call__(self, T: SE3) -> NormalEquations:
         parts = [self._of_thumbnail(small, T) for small in self.thumbnails]
@@ -87,32 +106,72 @@ class ImageCost:
         sound = T.translation.isfinite().all(-1) & T.rotation.isfinite().all(-1).all(-1)
         return NormalEquations(torch.where(sound, cost, torch.inf), gradient, hessian)
 
+    def with_blur_of(self, T: SE3, candidates: Sequence[float]) -> ImageCost:
+        """Return the cost with that blur among the candidates which makes renderings from one pose most like the photos."""
+        costs = torch.zeros(len(candidates), dtype=torch.float64, device=self.renderer.device)
+        for small in self.thumbnails:
+            seen = render_view(self.renderer, small, T[None])
+            costs += torch.stack(
+                [self._compared(small, seen.blurred(b)).cost[0] for b in candidates]
+            ).double()
+        return replace(self, blur=candidates[int(costs.argmin())])
+
     def _of_thumbnail(self, small: Thumbnail, T: SE3) -> tuple[Tensor, Tensor, Tensor]:
         """Return the cost, its gradient and its Hessian of one image."""
-        seen, measured = render_view(self.renderer, small, T), small.rgb.flatten(1)
-        error = exposed(seen, measured, self.scales) - measured
-        near = geman_mcclure_inlier((error**2).sum(1), self.scales.colour)
-        cost = (seen.known * (1 - near) + (1 - seen.known) * UNKNOWN_COST).mean(-1)
-        weight = seen.known * near**2 / self.scales.colour**2 / error.shape[-1]
+        seen = render_view(self.renderer, small, T).blurred(self.blur)
+        compared = self._compared(small, seen)
         by_point = _by_point(small, (seen.slopes + small.slopes) / 2, seen.depth)
         arm = (seen.points - self.pivot)[:, None].expand_as(by_point)
         rows = torch.cat([by_point, torch.linalg.cross(arm, by_point)], -1)
-        weighted = (weight[:, None, :, None] * rows).flatten(1, 2)
-        gradient = (weighted.mT @ error.flatten(1)[..., None])[..., 0]
-        return cost, gradient, weighted.mT @ rows.flatten(1, 2)
+        weighted = (compared.weight[..., None] * rows).flatten(1, 2)
+        gradient = (weighted.mT @ compared.error.flatten(1)[..., None])[..., 0]
+        return compared.cost, gradient, weighted.mT @ rows.flatten(1, 2)
+
+    def _compared(self, small: Thumbnail, seen: RenderedView) -> _Compared:
+        """Compare a rendered image, at the exposure that suits it best, with the measured one."""
+        measured, scale = small.rgb.flatten(1), self.scales.colour
+        corrected = exposed(seen, measured, self.scales)
+        error = corrected.clamp(0, 1) - measured
+        near = geman_mcclure_inlier((error**2).sum(1), scale)
+        cost = (seen.known * (1 - near) + (1 - seen.known) * UNKNOWN_COST).mean(-1)
+        weight = seen.known * near**2 / scale**2 / error.shape[-1]
+        inside = (corrected - 0.5).abs() < 0.5  # where a camera clips, the colour does not depend on the pose
+        return _Compared(cost, error, weight[:, None] * inside)
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """A rendered image beside a measured one."""
+
+    cost: Float[Tensor, "h"]
+    error: Float[Tensor, "h 3 n"]
+    weight: Float[Tensor, "h 3 n"]  # of each square in a step
+
+
+def uniform_cost(thumbnails: Sequence[Thumbnail], scale: float) -> float:
+    """Return the cost of images of one colour, the median of what was measured: a pose has to explain more than those."""
+    costs = []
+    for small in thumbnails:
+        measured = small.rgb.flatten(1)
+        squared = ((measured - measured.median(-1, keepdim=True).values) ** 2).sum(0)
+        costs.append((1 - geman_mcclure_inlier(squared, scale)).mean())
+    return float(torch.stack(costs).mean())
 
 
 def exposed(
     seen: RenderedView, measured: Float[Tensor, "3 n"], scales: ColourScales
 ) -> Float[Tensor, "h 3 n"]:
-    """Return the rendered colours at the exposure, within the priors, that brings them nearest to the measured ones."""
+    """Return the rendered colours at the exposure, within the priors, that brings them nearest to the measured ones.
+
+    They are not clipped. Measured colours that are, at black or white, do not bend the exposure.
+    """
     if not (scales.gain and scales.bias):
         return seen.rgb
     exposure: Exposure | None = None
     for _ in range(IMAGE_EXPOSURE_ROUNDS):
         rgb = seen.rgb if exposure is None else exposure.applied(seen.rgb)
         near = geman_mcclure_inlier(((measured - rgb) ** 2).sum(1, keepdim=True), scales.colour)
-        weights = seen.known[:, None] * near**2 / scales.colour**2
+        weights = (seen.known[:, None] * near**2 / scales.colour**2) * ~clipped(rgb, measured)
         exposure = fit_exposure(seen.rgb, measured[None], weights, scales.gain**-2, scales.bias**-2)
     assert exposure is not None  # there is at least one round
     return exposure.applied(seen.rgb)

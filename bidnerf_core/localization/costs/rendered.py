@@ -12,7 +12,7 @@ from bidnerf_core.constants import constant
 from bidnerf_core.field import RadianceField, Rays
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.costs.weighted_rays import RayCounts, WeightedRays, draw_weighted_rays
-from bidnerf_core.localization.exposure import Exposure, robust_exposure
+from bidnerf_core.localization.exposure import Exposure, clipped, robust_exposure
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
@@ -173,11 +173,11 @@ def _residuals(
     value, jacobian, weights = found.residuals.double(), found.jacobian.double(), rays.weights.double()
     if exposure:
         rendered, measured = found.rgb.double(), rays.observed.rgb.double()
-        fitted = robust_exposure(rendered, measured, weights[:, :3], objective.terms[0].robust)
+        fitted = robust_exposure(rendered.mT, measured.mT, weights[:, :3].mT, objective.terms[0].robust)
         seen = fitted.applied(rendered.mT).mT
         inside = ((seen - 0.5).abs() < 0.5)[..., None]
         value = torch.cat([seen.clamp(0, 1) - measured, value[..., 3:]], -1)
-        telling = weights[:, :3] * ~fitted.clips(rendered.mT, measured.mT[None]).mT
+        telling = weights[:, :3] * ~clipped(seen, measured)
         by_colour = inside * _without_exposure(rendered, inside * jacobian[..., :3, :], telling, fitted)
         jacobian = torch.cat([by_colour, jacobian[..., 3:, :]], -2)
     confidence = (

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from jaxtyping import Float
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, interpolate, pad
 
@@ -14,6 +16,9 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.constants import constant
 from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
+
+KERNEL_REACH = 3.0
+"""Radius of a blurring kernel in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +80,14 @@ def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
     flat = conv2d(pad(flat, (0, 0, 2, 2), mode="replicate"), kernel.view(1, 1, 5, 1))
     return flat.view(image.shape)
+
+
+def blurred(image: Float[Tensor, "b c h w"], pixels: float) -> Float[Tensor, "b c h w"]:
+    """Convolve with a Gaussian of that standard deviation; the border is repeated."""
+    size = 2 * math.ceil(KERNEL_REACH * pixels) + 1
+    reach = size // 2
+    wide = pad(image, (reach, reach, reach, reach), mode="replicate")
+    return gaussian_blur2d(wide, (size, size), (pixels, pixels), "constant")[..., reach:-reach, reach:-reach]
 
 
 def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, "*b n 2"]:

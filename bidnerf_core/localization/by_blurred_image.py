@@ -1,0 +1,132 @@
+"""Poses of blurred images: the whole image is compared with renderings that are as blurred.
+
+Keypoints are inaccurate in blurred images, and rendered rays are as sharp as the field, so that the edges, which tell most about
+the pose, count as outliers. A rendering blurred like the image has the same edges.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.localization.by_landmarks import is_sharp
+from bidnerf_core.localization.confidence import TRUSTED
+from bidnerf_core.localization.costs.images import ColourScales, ImageCost, render_view, uniform_cost
+from bidnerf_core.localization.costs.thumbnails import thumbnail
+from bidnerf_core.localization.costs.view_renderers import FieldRenderer
+from bidnerf_core.localization.covariance import LEAST_VARIANCE, position_deviation
+from bidnerf_core.localization.pivots import Pivot, pivot
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.solvers.levenberg_marquardt import Descent, descend
+from bidnerf_core.moving import moved
+from bidnerf_core.se3 import SE3
+
+WIDTH = 100
+"""Pixels of the longer side of the images that are compared."""
+BLURS = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
+"""Standard deviations that are tried, pixels of these images."""
+LEAST_BLUR = 0.7
+"""The least of them with which an image counts as blurred. A sharp image is averaged over its pixels, while rays are single."""
+CLEARLY_LESS = 0.85
+"""Cost with the best blur, as a share of that without, below which an image counts as blurred."""
+ROUNDS, STEPS = 3, 4
+"""The blur is estimated that often, each time followed by that many steps."""
+COLOUR = 0.1
+"""Norm of a colour difference at which a pixel is half an inlier."""
+EXPLAINED = 0.75
+"""Least share of the image's contrast that an accepted pose explains."""
+PRECISE = 0.01
+"""Largest standard deviation of an accepted position, as a share of the distance of what is seen."""
+INDEPENDENT_PIXELS = 60
+"""Number of independent measurements in a small image; set by the normalised errors on frames that were held out for tuning."""
+UNSUITABLE = (Outcome.AMBIGUOUS, Outcome.DIVERGED, Outcome.MIRRORED, Outcome.MISCALIBRATED)
+"""Outcomes of poses that a closer comparison does not put right."""
+
+
+def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
+    """Return a doubtful pose refined and judged anew if the images are more blurred than what the field renders from there.
+
+    Poses are returned as they are where depth was measured, part of an image is hidden, the intrinsics were corrected, or the
+    field is itself not sharp.
+    """
+    if not _is_eligible(problem, found):
+        return found
+    began = time.perf_counter()
+    start = found.T_world_camera.to(problem.device)
+    about = pivot("scene", replace(problem, start=found.T_world_camera)).to(problem.device)
+    sharp = _cost(problem, about)
+    blurred = sharp.with_blur_of(start, BLURS)
+    costs = [float(cost(start[None]).cost[0]) for cost in (blurred, sharp)]
+    if blurred.blur < LEAST_BLUR or not costs[0] < CLEARLY_LESS * costs[1]:
+        return found
+    done = _descents(sharp, start, about)
+    cost_at_end = float(done[-1].equations.cost[0])
+    if not math.isfinite(cost_at_end):
+        return found
+    T = done[-1].T[0].to("cpu").normalized()
+    covariance = about.to(torch.device("cpu")).at_camera(T, _covariance(done[-1], len(problem.views)))
+    distance = float(render_view(sharp.renderer, sharp.thumbnails[-1], done[-1].T).depth.median())
+    precision = position_deviation(covariance) / distance
+    verdict = _verdict(1 - cost_at_end / uniform_cost(sharp.thumbnails, COLOUR), precision)
+    return replace(
+        found,
+        T_world_camera=T,
+        outcome=verdict.outcome,
+        reason=verdict.reason,
+        confidence=None,
+        covariance=covariance if bool(covariance.isfinite().all()) else None,
+        loss=cost_at_end,
+        steps=found.steps + ROUNDS * STEPS,
+        seconds=found.seconds + time.perf_counter() - began,
+        poses=SE3.cat([found.poses, *(d.poses[1:, 0].to("cpu") for d in done)]),
+        losses=torch.cat([found.losses, *(d.costs[:-1, 0].cpu() for d in done)]),
+    )
+
+
+def _is_eligible(problem: Problem, found: Localization) -> bool:
+    """Whether an answer is doubtful, and whole images with the intrinsics given can be compared with the field's renderings."""
+    hidden = any(view.frame.hidden is not None for view in problem.views)
+    if problem.has_depth or hidden or not is_sharp(problem) or found.intrinsics is not None:
+        return False
+    return (found.confidence or 0.0) < TRUSTED and found.outcome not in UNSUITABLE
+
+
+def _cost(problem: Problem, about: Pivot) -> ImageCost:
+    """Return the cost of whole images against sharp renderings."""
+    renderer = FieldRenderer(problem.field, problem.bounds, problem.device)
+    small = [moved(thumbnail(view, WIDTH), problem.device) for view in problem.views]
+    assert about.T_camera_pivot is not None
+    middle = about.T_camera_pivot.translation.to(small[0].rgb)
+    return ImageCost(renderer, small, ColourScales(colour=COLOUR), middle)
+
+
+def _descents(cost: ImageCost, T: SE3, about: Pivot) -> list[Descent]:
+    """Take the steps of all rounds, each with the blur that suits its first pose."""
+    found = list[Descent]()
+    for _ in range(ROUNDS):
+        start = found[-1].T if found else T[None]
+        found.append(descend(cost.with_blur_of(start[0], BLURS), start, STEPS, about.moved, damping=1e-2))
+    return found
+
+
+def _covariance(done: Descent, views: int) -> Float[Tensor, "6 6"]:
+    """Return the covariance of an update at the pivot; not finite where the images do not determine it."""
+    variance = done.equations.cost[0].clamp(min=LEAST_VARIANCE) / (INDEPENDENT_PIXELS * views)
+    return torch.linalg.inv_ex(done.equations.hessian[0] / variance).inverse.cpu()
+
+
+def _verdict(explained: float, precision: float) -> Verdict:
+    """Judge a pose by how much of the image it explains, and by its deviation as a share of the distance of what is seen."""
+    share = f"{explained:.0%} of the contrast of the blurred image agrees with renderings that are as blurred"
+    if explained < EXPLAINED:
+        return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}, expected {EXPLAINED:.0%}")
+    if not precision <= PRECISE:
+        why = f"the image is blurred, so the position is uncertain by {precision:.1%} of the distance of what is seen"
+        return Verdict(Outcome.IMPRECISE, f"{why}, expected at most {PRECISE:.0%}")
+    return Verdict(Outcome.CONVERGED, share)
