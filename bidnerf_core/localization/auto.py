@@ -256,7 +256,6 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
     """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer."""
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
     search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
-    by_colour = replace(config.by_colour, refinement=replace(config.by_colour.refinement, exposure=True))
     keyframes = SE3.from_matrix(surface.keyframes).to("cpu")
     known = Surroundings(keyframes, surface.extent, torch.zeros(3), search.middle)
     while True:
@@ -264,10 +263,10 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
             found = search(hypotheses_for_images(known, problem.start, config.hypotheses, generator))
         if config.landmarks and _is_hopeless(problem):
             return _unrecognised(found, began)
-        answers.append(refine_by_colour(problem, found, by_colour, generator))
+        answers.append(refine_by_colour(problem, found, config.by_colour, generator))
         best = min(answers, key=lambda answer: answer.refined.loss)
         if best.verdict.accepted or len(answers) == config.rounds:
-            return localization_of(problem, best, by_colour, began, "auto")
+            return localization_of(problem, best, config.by_colour, began, "auto")
 
 
 def _is_hopeless(problem: Problem) -> bool:

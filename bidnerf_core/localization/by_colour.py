@@ -44,7 +44,7 @@ class ByColourConfig(Settings):
 
     steps: ColourRefinementSettings = ColourRefinementSettings()
     colour: ColourSettings = ColourSettings()
-    refinement: RefinementSettings = RefinementSettings(surface_sigma=0.006)
+    refinement: RefinementSettings = RefinementSettings(surface_sigma=0.006, exposure=True)
     thresholds: RenderedThresholds = RenderedThresholds()
 
 

@@ -54,7 +54,6 @@ class ImageSearch:
     renderer: ViewRenderer
     middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of what it sees; on the CPU
     extent: float  # metres: size of the scene
-    has_background: bool
     scales: ColourScales = field(default_factory=ColourScales)
 
     @staticmethod
@@ -68,7 +67,7 @@ class ImageSearch:
         has_background = float(seen.met.float().mean()) < 1 - OPEN
         renderer = SurfaceRenderer(surface, problem.bounds.background if has_background else None)
         middle = torch.tensor([0.0, 0.0, away])
-        return ImageSearch(problem.views, renderer, middle, surface.extent, has_background)
+        return ImageSearch(problem.views, renderer, middle, surface.extent)
 
     @staticmethod
     def in_field(problem: Problem, start: SE3) -> ImageSearch:
@@ -79,7 +78,7 @@ class ImageSearch:
         directions = T.rotate(torch.nn.functional.normalize(small.flat, dim=-1))
         away = float(renderer(T.translation.expand_as(directions), directions).along.median())
         extent = float(torch.linalg.vector_norm(torch.tensor(problem.bounds.size)))
-        return ImageSearch(problem.views, renderer, torch.tensor([0.0, 0.0, away]), extent, True)
+        return ImageSearch(problem.views, renderer, torch.tensor([0.0, 0.0, away]), extent)
 
     def __call__(self, T: SE3, stages: Sequence[ImageStage] = IMAGE_STAGES) -> SearchResult:
         """Search from the hypotheses T (h), by steps on the device of the renderer."""
