@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, replace
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from bidnerf_core.localization.acceptance import (
     landmark_verdict,
 )
 from bidnerf_core.localization.result import Outcome
+from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.map_camera import correction_between, map_camera
@@ -24,6 +26,7 @@ from bidnerf_core.localization.search.miscalibration import (
     probability_beside_approximate,
     probability_of_map_camera,
 )
+from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.calibration import GIVEN, NOMINAL, Calibration
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap
@@ -285,3 +288,27 @@ def test_an_approximate_focal_length_becomes_that_of_the_maps_camera(landmarks: 
     assert float(found.full_covariance.diagonal()[:3].sum()) < float(
         free.full_covariance.diagonal()[:3].sum()
     )
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["with the map's cameras", "without"])
+def test_an_approximate_focal_length_is_found_among_mostly_wrong_matches(
+    landmarks: LandmarkMap, known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Samples of four, which tell the focal length, are then hardly ever without a wrong match."""
+
+    def mostly_wrong(*given: Any) -> LandmarkMatches:
+        matches = unguided_matches(*given)
+        wrong = torch.rand(len(matches), generator=torch.Generator().manual_seed(0)) < 0.87
+        landmark = matches.landmark.clone()
+        landmark[wrong] = landmark[wrong].roll(1)
+        return replace(matches, landmark=landmark)
+
+    monkeypatch.setattr("bidnerf_core.localization.search.landmarks.unguided_matches", mostly_wrong)
+    points = Points(noise=NOISE)
+    stated = View(Frame("f", points.view(TRUE).frame.rgb, with_focal(1.1)), SE3.identity())
+    matcher = LandmarkMatcher(landmarks if known else replace(landmarks, cameras=()))
+    for seed in range(3):
+        found = propose(matcher, [stated], points, seed=seed, prior=NOMINAL)
+        assert found is not None
+        assert error(found) < 0.02
+        assert found.takes_map_camera == known

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.frames import Frame
 from bidnerf_core.localization import Localization, Outcome, pose_from_matrix
 from bidnerf_core.localization.result import Verdict
 from bidnerf_core.se3 import SE3
@@ -73,3 +75,12 @@ def test_only_converged_accepts_a_pose(outcome: Outcome) -> None:
     assert replace(FOUND, outcome=outcome).converged == accepted
     assert Verdict(outcome, "why").accepted == accepted
     assert replace(FOUND, outcome=outcome).plain()["outcome"] == outcome.value == str(outcome)
+
+
+def test_a_frame_is_as_taken_with_the_intrinsics_of_the_answer() -> None:
+    given, corrected = Intrinsics.from_focal(90.0, 8, 6), Intrinsics.from_focal(100.0, 8, 6)
+    frame = Frame("photo", torch.zeros((6, 8, 3)), given)
+    assert FOUND.frame_as_taken(frame) is frame
+    taken = replace(FOUND, intrinsics=corrected).frame_as_taken(frame)
+    assert taken.intrinsics == corrected
+    assert taken.rgb is frame.rgb

@@ -117,5 +117,4 @@ def test_a_background_is_told_from_holes() -> None:
     search = image_search(baked.unseen()[0])
     assert isinstance(search.renderer, SurfaceRenderer)
     assert search.renderer.background == baked.BOUNDS.background
-    assert search.has_background
     assert float(search.middle[2]) == pytest.approx(3.2, abs=0.5)  # cameras look at the toy from 3.5

@@ -47,8 +47,8 @@ class Answer:
 
     @property
     def posed(self) -> PosedImage:
-        query, T_world_camera = self.query, self.found.T_world_camera
-        return PosedImage(query.name, self.number, query.frame.intrinsics, T_world_camera, query.file)
+        query, intrinsics = self.query, self.found.frame_as_taken(self.query.frame).intrinsics
+        return PosedImage(query.name, self.number, intrinsics, self.found.T_world_camera, query.file)
 
     def _off(self, pose: SE3) -> PoseError | None:
         return None if self.query.truth is None else pose_error(pose, self.query.truth)
@@ -106,9 +106,8 @@ class Answers:
         else:
             show_in_short(answer)
         if self._spec.draw is not None:
-            picture = Painter(self._stored, answer.query.frame).overlay(
-                answer.start, answer.found.T_world_camera
-            )
+            frame = answer.found.frame_as_taken(answer.query.frame)
+            picture = Painter(self._stored, frame).overlay(answer.start, answer.found.T_world_camera)
             file = self._spec.draw / f"overlay-{answer.query.name}.png"
             write_file(file, bytes(iio.imwrite("<bytes>", picture, extension=".png")))
 

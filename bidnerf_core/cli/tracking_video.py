@@ -91,7 +91,7 @@ class TrackingVideo:
         return writer
 
     def _drawn(self, frame: Frame, found: Localization) -> UInt8[np.ndarray, "h w 3"]:
-        painter = Painter(self._scene, frame)
+        painter = Painter(self._scene, found.frame_as_taken(frame))
         caption = "rendered at the pose found" if found.converged else f"not accepted: {found.outcome}"
         tiles = (
             tile(_observed(frame, painter.observed), f"observed: {frame.name}"),

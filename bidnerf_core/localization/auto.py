@@ -262,7 +262,7 @@ def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: 
         with torch.no_grad():
             found = search(hypotheses_for_images(known, problem.start, config.hypotheses, generator))
         if config.landmarks and _is_hopeless(problem):
-            return _unrecognised(found, began)
+            return _unrecognised(problem, found, began)
         answers.append(refine_by_colour(problem, found, config.by_colour, generator))
         best = min(answers, key=lambda answer: answer.refined.loss)
         if best.verdict.accepted or len(answers) == config.rounds:
@@ -275,12 +275,14 @@ def _is_hopeless(problem: Problem) -> bool:
     return textured and not is_sharp(problem)
 
 
-def _unrecognised(found: SearchResult, began: float) -> Localization:
+def _unrecognised(problem: Problem, found: SearchResult, began: float) -> Localization:
     """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
+    approximate = any(view.frame.focal_is_approximate for view in problem.views)
+    focal = "; the focal length is only approximate" if approximate else ""
     return Localization(
         T_world_camera=found.T[0].normalized(),
         outcome=Outcome.TOO_FEW_MATCHES,
-        reason="no landmarks were recognised, and the field is too blurred to compare images with its renderings",
+        reason=f"too few landmarks were recognised, and the field is too blurred to compare images with its renderings{focal}",
         steps=len(found.losses),
         seconds=time.perf_counter() - began,
         loss=float(found.scores[0]),

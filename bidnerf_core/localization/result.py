@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.files import write_file
+from bidnerf_core.frames import Frame
 from bidnerf_core.se3 import SE3
 
 
@@ -82,6 +83,10 @@ class Localization:
     def converged(self) -> bool:
         """Whether the method accepts its own answer."""
         return self.outcome is Outcome.CONVERGED
+
+    def frame_as_taken(self, frame: Frame) -> Frame:
+        """Return the last image's frame with the intrinsics with which the pose was found: the given ones or corrected ones."""
+        return frame if self.intrinsics is None else replace(frame, intrinsics=self.intrinsics)
 
     def plain(self) -> dict[str, Any]:
         """Return the result as JSON values, with the keys of ``bidnerf localize --json``.
