@@ -94,6 +94,12 @@ def test_what_shows_something_else_is_not_accepted() -> None:
     assert not found.converged
 
 
+def test_an_image_of_one_colour_tells_nothing() -> None:
+    plain = Frame("plain", torch.full((CAMERA.height, CAMERA.width, 3), 0.5), CAMERA)
+    given = answer(ASIDE, Outcome.RENDERING_MISMATCH)
+    assert refined_if_blurred(problem(View(plain, TRUTH)), given) is given
+
+
 @pytest.mark.parametrize("blur", [1.0, 2.0])
 def test_the_blur_is_found_from_a_pose_that_is_nearly_right(blur: float) -> None:
     small = thumbnail(View(photo(blur).frame, SE3.identity()), CAMERA.width)

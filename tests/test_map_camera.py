@@ -19,7 +19,7 @@ from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.map_camera import correction_between, map_camera
+from bidnerf_core.localization.search.map_camera import SAME_CAMERA, correction_between, map_camera
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import (
     CameraEvidence,
@@ -312,3 +312,15 @@ def test_an_approximate_focal_length_is_found_among_mostly_wrong_matches(
         assert found is not None
         assert error(found) < 0.02
         assert found.takes_map_camera == known
+
+
+def test_intrinsics_that_are_also_the_maps_are_mistaken_less_often(landmarks: LandmarkMap) -> None:
+    """An image of the map's camera that seems to need a correction is trusted more than one of an unknown camera."""
+    apparent = with_focal(1.01)
+    known, unknown = (
+        localized(part, PINHOLE, apparent).miscalibration.worst
+        for part in (landmarks, replace(landmarks, cameras=()))
+    )
+    assert known[0] == unknown[0] == 0  # the focal length
+    odds = [p / (1 - p) for _, p in (known, unknown)]
+    assert odds[0] == pytest.approx((1 - SAME_CAMERA) * odds[1], rel=0.1)

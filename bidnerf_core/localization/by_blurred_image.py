@@ -65,6 +65,9 @@ def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
     costs = [float(cost(start[None]).cost[0]) for cost in (blurred, sharp)]
     if blurred.blur < LEAST_BLUR or not costs[0] < CLEARLY_LESS * costs[1]:
         return found
+    uniform = uniform_cost(sharp.thumbnails, COLOUR)
+    if uniform == 0:
+        return found  # an image of one colour, which any pose explains
     done = _descents(sharp, start, about)
     cost_at_end = float(done[-1].equations.cost[0])
     if not math.isfinite(cost_at_end):
@@ -73,7 +76,7 @@ def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
     covariance = about.to(torch.device("cpu")).at_camera(T, _covariance(done[-1], len(problem.views)))
     distance = float(render_view(sharp.renderer, sharp.thumbnails[-1], done[-1].T).depth.median())
     precision = position_deviation(covariance) / distance
-    verdict = _verdict(1 - cost_at_end / uniform_cost(sharp.thumbnails, COLOUR), precision)
+    verdict = _verdict(1 - cost_at_end / uniform, precision)
     return replace(
         found,
         T_world_camera=T,

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, SAME_LOG_ODDS, MapCamera
+from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, SAME_CAMERA, SAME_LOG_ODDS, MapCamera
 from bidnerf_core.mapping.calibration import (
     CALIBRATED,
     GIVEN,
@@ -53,6 +53,16 @@ class TakenIntrinsics:
     camera: MapCamera | None = None  # the map's, if it is taken
     alternative: Calibration = GIVEN  # correction of those taken
     probability: float = 0.0  # that the alternative is right
+    as_map: bool = False  # whether the given intrinsics are those of the map's images
+
+    @property
+    def log_odds_of_mistake(self) -> float:
+        """Logarithm of the odds, before an image is looked at, that the intrinsics taken are wrong.
+
+        Intrinsics that are also those of the map's images are mistaken only for another camera's image.
+        """
+        share = MISTAKES * (1 - SAME_CAMERA) if self.as_map else MISTAKES
+        return math.log(share / (1 - share))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +100,7 @@ class Miscalibration:
         value = value - _as_tensor(taken.calibration)
         right, wrong = (noise + prior.deviations.square() for prior in (CALIBRATED, MISTAKEN))
         log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
-        log_odds = log_ratio + math.log(MISTAKES / (1 - MISTAKES)) + other_log_odds
+        log_odds = log_ratio + taken.log_odds_of_mistake + other_log_odds
         return Miscalibration(
             value, free.calibration_deviations, log_odds.sigmoid(), unresolved_deviations(value, noise),
             _as_tensor(taken.alternative), value.new_tensor(taken.probability),
@@ -125,7 +135,9 @@ def taken_intrinsics(
     if approximate:
         likely = probability_beside_approximate(free, landmarks, camera) > LIKELY
         return TakenIntrinsics(camera.calibration, camera) if likely else TakenIntrinsics()
-    if not bool(camera.differs.any()) or not camera.is_near(OTHER_CAMERA):
+    if not bool(camera.differs.any()):
+        return TakenIntrinsics(as_map=True)
+    if not camera.is_near(OTHER_CAMERA):
         return TakenIntrinsics()
     probability, there = probability_of_map_camera(free, landmarks, camera, other_log_odds), camera.correction
     if probability > 0.5:
