@@ -47,9 +47,7 @@ def judged(verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnosti
     """Return the confidence in a pose, and the verdict, which it can turn into a rejection."""
     value = confidence(diagnostics)
     if value is not None and verdict.accepted and value < ACCEPTED:
-        verdict = Verdict(
-            Outcome.UNCERTAIN, f"right with a probability of {value:.0%} only; {verdict.reason}"
-        )
+        verdict = Verdict(Outcome.UNCERTAIN, f"only {value:.0%} likely to be right; {verdict.reason}")
     return Judgement(verdict, value)
 
 

@@ -27,11 +27,11 @@ class Outcome(StrEnum):
     FREE_SPACE_VIOLATED = "free space violated"  # lines of sight pass through the surface
     RENDERING_MISMATCH = "rendering mismatch"  # the field renders something else from there
     UNDETERMINED = "undetermined"  # the measurements do not constrain all six degrees of freedom
-    NOT_SETTLED = "not settled"  # fresh rays still ask for a long step
+    NOT_SETTLED = "not settled"  # newly drawn rays still call for a large step
     HIGH_LOSS = "high loss"  # a descent ended above the loss that counts as converged
     DIVERGED = "diverged"  # the loss or the pose became infinite or not a number
     MISCALIBRATED = (
-        "miscalibrated"  # the image contradicts the intrinsics, or does not tell them from the map's
+        "miscalibrated"  # the image contradicts the intrinsics, or cannot tell them from the map's
     )
     MIRRORED = "mirrored"  # the mirror image fits the map better than the image
     IMPRECISE = "imprecise"  # the pose is too uncertain, compared with the distance of what is in view

@@ -61,11 +61,20 @@ class Calibration:
     @property
     def sentences(self) -> tuple[str, str, str, str]:
         """Each part of the correction in words, in the order of the fields."""
+        longer, right, down, higher = (
+            word if value >= 0 else opposite
+            for value, word, opposite in (
+                (self.log_focal, "longer", "shorter"),
+                (self.shift_u, "right", "left"),
+                (self.shift_v, "down", "up"),
+                (self.radial, "higher", "lower"),
+            )
+        )
         return (
-            f"a focal length {self.focal_factor - 1:+.1%} from the given one",
-            f"a principal point {self.shift_u:+.1%} of the focal length further right",
-            f"a principal point {self.shift_v:+.1%} of the focal length further down",
-            f"a radial distortion {self.radial:+.3f} from the given one",
+            f"a focal length {abs(self.focal_factor - 1):.1%} {longer} than given",
+            f"a principal point {abs(self.shift_u):.1%} of the focal length further {right}",
+            f"a principal point {abs(self.shift_v):.1%} of the focal length further {down}",
+            f"a radial distortion {abs(self.radial):.3f} {higher} than given",
         )
 
 
