@@ -39,7 +39,7 @@ def test_a_good_pose_by_landmarks_is_accepted_and_a_poor_one_is_not() -> None:
     good, bad = (confidence.judged(FINE, d) for d in (GOOD, poor))
     assert good.verdict is FINE
     assert bad.verdict.outcome is Outcome.UNCERTAIN
-    assert "probability" in bad.verdict.reason
+    assert "likely to be right" in bad.verdict.reason
     assert good.confidence is not None
     assert bad.confidence is not None
     assert 0 <= bad.confidence < confidence.ACCEPTED <= good.confidence <= 1
