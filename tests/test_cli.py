@@ -28,7 +28,9 @@ from bidnerf_core.cli import COMMANDS, main, progress
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
 from bidnerf_core.registry import list_backends
-from bidnerf_core.storage import load_info, load_map
+from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.storage import MapInfo, load_info, load_map
+from bidnerf_core.training import Progress
 from commands import CommandResult, Run
 from tiny import backends_listed_once  # noqa: F401
 
@@ -95,6 +97,15 @@ def assert_refused(outcome: CommandResult, status: int, *fragments: str) -> None
     assert outcome.err.startswith("bidnerf ")
     for fragment in fragments:
         assert fragment in outcome.err
+
+
+@pytest.mark.parametrize(("samples", "shown"), [(math.nan, ""), (31.5, "  31.5 samples a ray")])
+def test_a_line_of_progress_leaves_out_what_the_recipe_does_not_tell(
+    samples: float, shown: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = MapInfo("fog", {}, demo_object().bounds, 0, complete=False)
+    progress.StoredTraining(tmp_path, info, None, 5, 60.0).step(Progress(5, 5, 0.25, 6.0, samples))
+    assert capsys.readouterr().err == f"step 5/5  loss 0.25000  PSNR 6.00 dB{shown}  0 s left\n"
 
 
 # Datasets that cannot be used.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
@@ -83,7 +84,9 @@ class StoredTraining(StoppableBar):
     def step(self, progress: TrainingProgress) -> None:
         self._resumed = None  # it is as large as the field and its optimizer
         self._step, self.total = progress.step, progress.total
-        numbers = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB  {progress.samples_per_ray:.1f} samples a ray"
+        numbers = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
+        if not math.isnan(progress.samples_per_ray):  # not every recipe tells
+            numbers += f"  {progress.samples_per_ray:.1f} samples a ray"
         self._bar.update(self._task, completed=progress.step, total=progress.total, numbers=numbers)
         now = time.monotonic()
         last = progress.step == progress.total
