@@ -57,3 +57,19 @@ def test_every_option_has_a_help_text(words: list[str], monkeypatch: pytest.Monk
         text = (action.help or "").split("(default")[0].strip()
         assert len(text.split()) > 1, f"{name}: {action.help!r}"
         assert text.split()[0].lower() not in NO_BEGINNING, f"{name}: {text!r}"
+
+
+@pytest.mark.parametrize(
+    "words", [[c, *choice] for c in COMMANDS for choice in CHOICES.get(c, [[]])], ids=" ".join
+)
+def test_boxes_are_whole_on_a_terminal_of_80_columns(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([*words, "--help-all"]) == 0
+    page = capsys.readouterr().out
+    assert "``" not in page
+    rows = [line for line in page.splitlines() if line[:1] in "╭│╰╮+|" and line]
+    assert rows
+    assert len(rows[0]) <= 80
+    assert [line for line in rows if len(line) != len(rows[0]) or line[-1] not in "╮│╯+|"] == []

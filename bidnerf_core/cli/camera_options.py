@@ -15,7 +15,7 @@ NO = "no"
 """The value of ``--register-depth`` that takes depth as it is."""
 
 one_camera = tyro.conf.create_mutex_group(
-    required=False, title="the camera of images that have none in their format (default: as EXIF has it)"
+    required=False, title="camera of images whose format has none (default: from EXIF)"
 )
 CameraFile = Annotated[
     Path | None,

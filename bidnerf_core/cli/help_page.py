@@ -77,8 +77,8 @@ class Page(io.StringIO):
 
     def wrapped(self, width: int) -> str:
         """Return the page with lines of ``width`` characters at most, and short headings."""
-        lines = self.getvalue().splitlines()
-        return "".join(f"{_wrapped(_headed(line.rstrip()), width)}\n" for line in lines)
+        lines = [_quoted(_headed(line.rstrip())) for line in self.getvalue().splitlines()]
+        return "".join(f"{_wrapped(line, width)}\n" for line in lines)
 
 
 def _headed(line: str) -> str:
@@ -88,6 +88,12 @@ def _headed(line: str) -> str:
         return line
     edge = line.rindex("options ") + len("options ")
     return line[: found.start()] + line[found.end() : edge] + line[edge] * len(found[0]) + line[edge:]
+
+
+def _quoted(line: str) -> str:
+    """Return a line with plain quotes in place of the double backticks of docstrings, and boxes as wide as before."""
+    cells = re.split(r"([│|])", line)
+    return "".join(cell.replace("``", "'") + " " * cell.count("``") for cell in cells).rstrip()
 
 
 def _wrapped(line: str, width: int) -> str:
