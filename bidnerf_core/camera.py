@@ -46,7 +46,7 @@ class Intrinsics:
         for name in ("fx", "fy"):
             value = getattr(self, name)
             if not SMALLEST_FOCAL <= value <= LARGEST_PIXELS:
-                raise InputError(f"focal length {name} is {value}, expected a positive number of pixels")
+                raise InputError(f"focal length {name} is {value}, {_expected_focal(value)}")
         if not (1 <= self.width <= LARGEST_SIZE and 1 <= self.height <= LARGEST_SIZE):
             expected = f"1x1 to {LARGEST_SIZE}x{LARGEST_SIZE}"
             raise InputError(f"image size is {self.width}x{self.height}, expected {expected}")
@@ -88,7 +88,11 @@ class Intrinsics:
             raise InputError(
                 f"horizontal field of view is {degrees}, expected degrees between 0 and 180 (both excluded)"
             )
-        return Intrinsics.from_focal(focal_length(width, math.radians(degrees)), width, height)
+        focal = focal_length(width, math.radians(degrees))
+        if not SMALLEST_FOCAL <= focal <= LARGEST_PIXELS:
+            found = f"horizontal field of view is {degrees}, which makes a focal length of {focal:.3g} pixels"
+            raise InputError(f"{found}, {_expected_focal(focal)}")
+        return Intrinsics.from_focal(focal, width, height)
 
     def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
         return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=dtype)
@@ -164,6 +168,14 @@ class Intrinsics:
 def _require(name: str, value: object, kind: type, expected: str) -> None:
     if isinstance(value, bool) or not isinstance(value, kind):
         raise InputError(f"{name} is {value!r:.60}, expected {expected}")
+
+
+def _expected_focal(value: float) -> str:
+    if value > LARGEST_PIXELS:
+        return f"expected at most {LARGEST_PIXELS:g} pixels"
+    if 0 < value < SMALLEST_FOCAL:
+        return f"expected at least {SMALLEST_FOCAL:g} pixels"
+    return "expected a positive number of pixels"
 
 
 def _require_size(name: str, value: object) -> None:

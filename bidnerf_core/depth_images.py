@@ -52,15 +52,20 @@ class DepthImage:
         return float(measured.median()) if measured.numel() else None
 
     def remark(self, unit_assumed: bool) -> str | None:
-        """Return a line that says which unit was assumed and which values were dropped, or None."""
+        """Return a line that says which unit was assumed, what is missing and which values were dropped, or None."""
         parts = []
-        if unit_assumed:
-            middle = "nothing was measured" if self.median is None else f"median depth {self.median:.4g} m"
+        if self.median is None:
+            parts.append("the depth image holds no measurement, so colour alone is used")
+        elif unit_assumed:
+            middle = f"median depth {self.median:.4g} m"
             parts.append(f"depth_unit is not given, {self.unit:g} m a step is assumed: {middle}")
-        if self.replaced:
-            found = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
-            parts.append(f"counted as not measured: {found}")
-        return "; ".join(parts) or None
+        return "; ".join([*parts, *filter(None, [self.dropped])]) or None
+
+    @property
+    def dropped(self) -> str | None:
+        """A clause that says which values were dropped, or None."""
+        found = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
+        return f"counted as not measured: {found}" if found else None
 
 
 def read_depth(path: Path, unit: float) -> Float[Tensor, "h w"]:
@@ -162,8 +167,8 @@ class DepthReader:
         new = {name: count for name, count in found.replaced.items() if name not in self._mentioned}
         if new:
             self._mentioned |= new.keys()
-            remark = replace(found, replaced=new).remark(unit_assumed=False)
+            dropped = replace(found, replaced=new).dropped
             warnings.warn(
-                f"{path}: depth: {remark}, here and in the images that follow", InputWarning, stacklevel=2
+                f"{path}: depth: {dropped}, here and in the images that follow", InputWarning, stacklevel=2
             )
         return found

@@ -24,3 +24,8 @@ def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str
     """Return the question whether the one of ``known`` was meant that is spelt most alike, or ``otherwise`` if none is."""
     near = difflib.get_close_matches(name, known, n=1)
     return f", did you mean {near[0]!r}?" if near else otherwise
+
+
+def amount(count: int, noun: str) -> str:
+    """Return a number with its noun, which takes an s unless the number is 1."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import BinaryIO, TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from scipy.sparse import csr_array
 from torch import Tensor
 
@@ -208,8 +209,16 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             raise _too_large(path, "more than 178 megapixels") from error
         except Exception as error:  # decoders raise whatever they like, SyntaxError included
             raise InputError(
-                f"{path}: not readable as an image ({reason(error)}), expected a whole image file"
+                f"{path}: not readable as an image ({_why_unreadable(file, error)}), expected a whole image file"
             ) from error
+
+
+def _why_unreadable(file: BinaryIO, error: Exception) -> str:
+    if os.fstat(file.fileno()).st_size == 0:
+        return "the file is empty"
+    if isinstance(error, UnidentifiedImageError):  # its text has the repr of the open file
+        return "its content is of no known image format"
+    return reason(error)
 
 
 def _check_pixels(path: Path, width: int, height: int) -> None:

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.field import RadianceField, SceneBounds
 from bidnerf_core.files import read_file, write_file
 from bidnerf_core.localization.problem import on_device
@@ -262,7 +262,7 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:
     """Return the state from which the interrupted training of ``field`` can be resumed."""
     if info.training is None:
-        raise InputError(f"{folder}: training is complete ({info.step} steps), nothing to resume")
+        raise InputError(f"{folder}: training is complete ({amount(info.step, 'step')}), nothing to resume")
     path = folder / info.weights
     weights = checked_weights(field, read_tensors(path), path)
     return TrainingState(info.step, weights, read_tensors(folder / info.training))

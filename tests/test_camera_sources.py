@@ -153,6 +153,19 @@ def test_numbers_that_no_camera_has_are_refused(given: dict[str, float]) -> None
         found(**given)
 
 
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"focal": 1e30}, "focal length fx is 1e[+]30, expected at most 1e[+]09 pixels"),
+        ({"focal": 1e-9}, "focal length fx is 1e-09, expected at least 1e-06 pixels"),
+        ({"hfov": 0.0001}, "view is 0.0001, which makes a focal .*, expected at most 1e[+]09 pixels"),
+    ],
+)
+def test_the_limits_of_a_focal_length_are_stated(given: dict[str, float], expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
+        found(**given)
+
+
 def test_a_camera_of_another_resolution_is_scaled() -> None:
     given = Intrinsics(1500.0, 1510.0, 1000.0, 760.0, 2016, 1512, (0.1, 0, 0, 0))
     assert found(camera=given) == Intrinsics(3000.0, 3020.0, 2000.0, 1520.0, *SIZE, (0.1, 0, 0, 0))

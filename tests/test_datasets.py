@@ -617,7 +617,11 @@ def damaged(path: Path, how: str) -> None:
 def test_damaged_files(nerfstudio: Callable[..., Path], what: str, how: str) -> None:
     folder = nerfstudio()
     damaged(folder / what, how)
-    assert message(folder).startswith(f"{folder / what}: not readable as an image (")
+    text = message(folder)
+    assert text.startswith(f"{folder / what}: not readable as an image (")
+    assert "BufferedReader" not in text
+    assert ("the file is empty" in text) == (how == "empty")
+    assert ("no known image format" in text) == (how == "text")
 
 
 def test_damaged_jpeg_and_array(nerfstudio: Callable[..., Path]) -> None:

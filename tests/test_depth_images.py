@@ -72,7 +72,10 @@ def test_a_unit_that_is_missing_is_assumed_and_said(kind: str, unit: float) -> N
 def test_depth_without_any_measurement_has_no_median() -> None:
     found = depth_image(np.zeros((2, 3), dtype=np.uint16), None, "depth")
     assert found.median is None
-    assert "nothing was measured" in str(found.remark(unit_assumed=True))
+    said = "the depth image holds no measurement, so colour alone is used"
+    assert found.remark(unit_assumed=True) == found.remark(unit_assumed=False) == said
+    saturated = depth_image(np.full((2, 3), 65535, dtype=np.uint16), None, "depth")
+    assert saturated.remark(unit_assumed=True) == f"{said}; counted as not measured: 6 x 65535"
 
 
 @pytest.mark.parametrize("unit", [0.0, -1.0, np.nan, np.inf])

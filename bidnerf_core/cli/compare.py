@@ -28,7 +28,7 @@ from bidnerf_core.cli.common import (
     wrong_usage,
 )
 from bidnerf_core.cli.method_options import Preset, chosen_settings
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.bench import changed_settings
 from bidnerf_core.evaluation.closed_form_data import is_closed_form
 from bidnerf_core.evaluation.comparison import Comparison, MapRow, compare_maps, plan_comparison
@@ -142,7 +142,9 @@ def _say_progress(done: int, total: int, measured: Measured) -> None:
     error = result.error
     off = f"{error.translation:.3f} m, {error.rotation_deg:.2f} deg" if error else "not finite"
     name = Path(result.trial.map).name
-    say(f"{done}/{total}  {result.frame} in {name}: {off}, {result.steps} steps, {result.seconds:.1f} s")
+    say(
+        f"{done}/{total}  {result.frame} in {name}: {off}, {amount(result.steps, 'step')}, {result.seconds:.1f} s"
+    )
 
 
 def _write(found: Comparison, out: Path) -> None:

@@ -27,7 +27,7 @@ from bidnerf_core.cli.common import (
 )
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.trial_progress import TrialProgress
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.bench import (
     Plan,
     changed_settings,
@@ -144,7 +144,7 @@ def _evaluate(trials: list[Trial], out: Path, workers: int | None, dask: str | N
                 note_run(out, provenance(command, what))
                 _run(todo, file, executor, at_once)
         file.put_in_order(trials)
-    show(f"{len(trials)} trials in {out}; 'bidnerf report {out}' shows them")
+    show(f"{amount(len(trials), 'trial')} in {out}; 'bidnerf report {out}' shows them")
 
 
 def _note_unchecked(trials: list[Trial], file: ResultsFile, out: Path) -> None:

@@ -47,16 +47,27 @@ class StartSpec:
 def read_pose(path: Path) -> SE3:
     """Read a 4x4 camera-to-world matrix, alone or under "T_world_camera", as ``localize --json`` prints it.
 
-    Raises ``InputError`` where the file holds no rigid transform by rows.
+    A list of one such object is taken as that object. Raises ``InputError`` where the file holds no rigid transform by rows.
     """
     content = read_file(path, "a pose file")
     try:
         found = json.loads(content)
     except (ValueError, RecursionError) as error:
+        lines = [line for line in content.splitlines() if line.strip()]
+        if len(lines) > 1 and all(line.startswith(b"{") for line in lines):  # as ``--json`` prints several
+            raise _not_one(path, len(lines)) from error
         raise InputError(f"{path}: not JSON ({error}), {EXPECTED_POSE}") from error
+    if isinstance(found, list) and all(isinstance(entry, dict) for entry in found):
+        if len(found) != 1:  # as ``--out`` writes several
+            raise _not_one(path, len(found))
+        (found,) = found
     rows = found.get("T_world_camera") if isinstance(found, dict) else found
     try:
         matrix = torch.tensor(rows, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise InputError(f"{path}: no matrix of numbers in it, {EXPECTED_POSE}") from error
     return pose_from_matrix(matrix, f"{path}: T_world_camera")
+
+
+def _not_one(path: Path, count: int) -> InputError:
+    return InputError(f"{path}: holds {count} poses, expected one")

@@ -37,7 +37,7 @@ from bidnerf_core.cli.tracked_path import TrackedPath, check_out
 from bidnerf_core.cli.tracking_video import TrackingVideo, check_video
 from bidnerf_core.datasets import FrameSequence, given_sensor, open_sequence
 from bidnerf_core.datasets.given_camera import GivenCamera
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.plot_style import require_matplotlib
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import AutoConfig, Localization, Localizer, Tracker, TrackerConfig
@@ -154,7 +154,9 @@ class _Step:
             self._lost_at = number
             say(f"frame {number} ({frame.name}): {found.outcome}: {found.reason}")
         elif found.converged and self._lost_at is not None:
-            say(f"frame {number} ({frame.name}): tracking again after {number - self._lost_at} frames")
+            say(
+                f"frame {number} ({frame.name}): tracking again after {amount(number - self._lost_at, 'frame')}"
+            )
             self._lost_at = None
         return found
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.cli.common import UsageError, say
 from bidnerf_core.datasets.pose_writing import POSE_WRITERS, PosedImage, write_poses
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.evaluation.trajectory import ErrorSummary, TrajectoryErrors, spans
 from bidnerf_core.evaluation.trajectory_plot import PlottedPath, plot_path
@@ -77,7 +77,7 @@ class TrackedPath:
             return
         write_poses(out, [frame.posed for frame in self.accepted])
         if left_out := len(self.frames) - len(self.accepted):
-            say(f"{out}: {len(self.accepted)} poses; {left_out} that did not converge are left out")
+            say(f"{out}: {amount(len(self.accepted), 'pose')}; {left_out} that did not converge are left out")
 
     def plot(self, file: Path, surface: SurfaceMap | None) -> None:
         """Draw the path. Raises ``InputError`` without matplotlib or without any frame."""

@@ -29,7 +29,7 @@ from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
 from bidnerf_core.cli.training_views import RefinementChoice, located, prepared
 from bidnerf_core.datasets import Background, Dataset, DepthRegistration, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames import View
 from bidnerf_core.images import background_colour
 from bidnerf_core.map_cameras import as_given, at_stored_poses, stored_cameras
@@ -182,7 +182,9 @@ def load_interrupted(out: Path, baking: bool) -> MapInfo:
         raise InputError(f"{error}; nothing to resume, train without --resume") from error
     if info.complete and not (baking and info.surface is None):
         baked = " and baked" if info.surface is not None else ""
-        raise InputError(f"{out}: training is complete ({info.step} steps){baked}, nothing to resume")
+        raise InputError(
+            f"{out}: training is complete ({amount(info.step, 'step')}){baked}, nothing to resume"
+        )
     return info
 
 
@@ -255,7 +257,7 @@ def _resume(
         )
     views = at_stored_poses(views, info.cameras)
     if info.complete:  # stopped between training and baking
-        say(f"{out}: training is complete ({info.step} steps); baking its surface")
+        say(f"{out}: training is complete ({amount(info.step, 'step')}); baking its surface")
         bake_map(out, views, BakeConfig())
         return
     tracked, views = located(views)  # the same as when the training began
