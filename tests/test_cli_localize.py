@@ -77,6 +77,16 @@ def test_a_photo_has_no_error_since_it_has_no_truth(bidnerf: Run, shared: Path, 
     assert status == 0
     assert out.startswith("t_0001: ")
     assert "error" not in out
+    assert out.splitlines()[-5] == "  T_world_camera"
+
+
+def test_depth_without_a_measurement_is_told(
+    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
+) -> None:
+    empty = tmp_path / "t_0001.npy"
+    np.save(empty, np.zeros((24, 24), dtype=np.uint16))
+    err = bidnerf(*place, shared / "photos/t_0001.png", *FOCAL, "--depth", empty)[2]
+    assert "the depth image holds no measurement, so colour alone is used" in err
 
 
 def test_an_answer_is_the_same_alone_among_others_and_as_a_frame(

@@ -15,7 +15,7 @@ from bidnerf_core.cli.common import UsageError, print_json, say, show
 from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.queries import Query
 from bidnerf_core.datasets.pose_writing import POSE_WRITERS, PosedImage
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.trials import plain_localization
 from bidnerf_core.files import write_file
@@ -150,7 +150,7 @@ class Answers:
         WRITERS[_ending(out)](out, accepted)
         left_out = self._total - len(accepted)
         if left_out:
-            say(f"{out}: {len(accepted)} poses; {left_out} that did not converge are left out")
+            say(f"{out}: {amount(len(accepted), 'pose')}; {left_out} that did not converge are left out")
 
 
 def _ending(path: Path) -> str:
@@ -166,10 +166,13 @@ def show_in_full(answer: Answer) -> None:
         show(f"  start error  {start}")
         show(f"  final error  {_shown(answer.error)}")
     if found.covariance is not None:
-        show(f"  estimated    {_deviation(found.covariance)}")
-    show(f"  {found.steps} steps, {found.seconds:.2f} s, loss {found.loss:.5f}, method {found.method}")
+        show(f"  uncertainty  {_deviation(found.covariance)}")
+    show(
+        f"  {amount(found.steps, 'step')}, {found.seconds:.2f} s, loss {found.loss:.5f}, method {found.method}"
+    )
+    show("  T_world_camera")
     for row in found.T_world_camera.matrix().tolist():
-        show("  " + " ".join(f"{value: .6f}" for value in row))
+        show("    " + " ".join(f"{value: .6f}" for value in row))
 
 
 def show_in_short(answer: Answer) -> None:
@@ -177,7 +180,7 @@ def show_in_short(answer: Answer) -> None:
     found, error = answer.found, answer.error
     verdict = "converged" if found.converged else f"NOT converged ({found.reason})"
     known = "" if error is None else f"error {_shown(error)}; "
-    show(f"{answer.query.name}: {known}{verdict}; {found.steps} steps, {found.seconds:.2f} s")
+    show(f"{answer.query.name}: {known}{verdict}; {amount(found.steps, 'step')}, {found.seconds:.2f} s")
 
 
 def _shown(error: PoseError) -> str:
