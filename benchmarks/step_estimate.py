@@ -2,7 +2,7 @@
 
     python benchmarks/step_estimate.py DATA --map MAP [MAP ...] --name step_estimate_lego
 
-The step runs on the pretended device of ``bidnerf_core.testing.elsewhere``, in the shapes that it would have on a GPU. Each
+The step runs on the simulated device of ``bidnerf_core.testing.elsewhere``, in the shapes that it would have on a GPU. Each
 operation that is not a mere view counts as one kernel, which reads its arguments and writes its results once; matrix products
 count 2 m n k operations. From these follow three lower bounds, of which the largest is the estimate: traffic at ``BANDWIDTH``,
 arithmetic at ``ARITHMETIC``, and launches at ``LAUNCH`` each. It is an estimate and no measurement: caches make traffic

@@ -438,7 +438,9 @@ def test_unknown_split_and_frame(blender: Path) -> None:
         InputError, match=r"split 'train': no frame 'r_11' among its 3 frames, did you mean 'r_1'\?"
     ):
         dataset.views("train", ["r_0", "r_11"])
-    with pytest.raises(InputError, match=r"no frame 'chair' among its 3 frames, expected a name as 'r_0'"):
+    with pytest.raises(
+        InputError, match=r"no frame 'chair' among its 3 frames, expected a name such as 'r_0'"
+    ):
         dataset.views("train", ["chair"])
 
 

@@ -1,4 +1,4 @@
-"""Device discipline: what the pretended device forbids, and that steps with planted faults fail the contract."""
+"""Device discipline: what the simulated device forbids, and that steps with planted faults fail the contract."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole methods with the map on a pretended device: they find the poses that they find on the CPU, and return them there."""
+"""Whole methods with the map on a simulated device: they find the poses that they find on the CPU, and return them there."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def same(here: Localization, there: Localization, tolerance: float = 1e-6) -> No
 def on_both(
     map: Any, frame: Frame, method: str = "auto", start: SE3 | None = None, **settings: Any
 ) -> Localization:
-    """Return what a method finds with the map on the CPU, after comparing it with what it finds on the pretended device."""
+    """Return what a method finds with the map on the CPU, after comparing it with what it finds on the simulated device."""
     config = settings_of(method, settings)
     here = Localizer(map, method, config)(frame, start)
     with Elsewhere():

@@ -324,3 +324,15 @@ def test_intrinsics_that_are_also_the_maps_are_mistaken_less_often(landmarks: La
     assert known[0] == unknown[0] == 0  # the focal length
     odds = [p / (1 - p) for _, p in (known, unknown)]
     assert odds[0] == pytest.approx((1 - SAME_CAMERA) * odds[1], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("correction", "words"),
+    [
+        (Calibration(log_focal=0.05), "a focal length 5.1% longer than given"),
+        (Calibration(log_focal=-0.05), "a focal length 4.9% shorter than given"),
+        (Calibration(radial=-0.03), "a radial distortion 0.030 lower than given"),
+    ],
+)
+def test_a_correction_reads_as_words(correction: Calibration, words: str) -> None:
+    assert correction.sentence == words

@@ -1,4 +1,4 @@
-"""Steps on a surface that lies on a pretended device: they neither leave it nor wait for it, and lead where the CPU's do."""
+"""Steps on a surface that lies on a simulated device: they neither leave it nor wait for it, and lead where the CPU's do."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from problems import FieldMap
 
 @dataclass(frozen=True)
 class Place:
-    """Where steps are taken: on the CPU, or on the pretended device while ``mode`` is active."""
+    """Where steps are taken: on the CPU, or on the simulated device while ``mode`` is active."""
 
     mode: Elsewhere | None = None
     surface: Callable[[SurfaceMap], SurfaceMap] = lambda surface: (

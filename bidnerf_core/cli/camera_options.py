@@ -47,7 +47,7 @@ RegisterDepth = Annotated[
     option(
         "SENSOR.json",
         "file with the intrinsics of the depth camera and T_colour_depth (4x4), from which depth is registered to colour"
-        " images; 'no' where it belongs to them already",
+        " images; 'no' if depth is already registered",
         "as the format has it",
     ),
 ]

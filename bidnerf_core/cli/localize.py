@@ -62,7 +62,9 @@ def run(arguments: list[str]) -> None:
         *,
         depth: Annotated[
             tuple[Path, ...],
-            option("FILE...", "depth images or .npy of the photos, in their order or by their names", ""),
+            option(
+                "FILE...", "depth images or .npy of the photos, in the same order, or matched by name", ""
+            ),
         ] = (),
         camera: CameraFile = None,
         focal: FocalLength = None,

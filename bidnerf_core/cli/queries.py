@@ -15,7 +15,7 @@ from bidnerf_core.datasets.dataset import unique_names
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.datasets.transforms import TransformsDataset
-from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import window as windowed
 from bidnerf_core.observations import Observations
@@ -105,7 +105,7 @@ class DepthPoints:
         rays = self.sparse.rays(views, split)
         names = [view.frame.name for view in views]
         blind = ", ".join(name for name in names if len(self.sparse.seen(name, split)) == 0)
-        say(f"{names[-1]}: {len(rays)} points seen{blind and f', none by {blind}'}")
+        say(f"{names[-1]}: {amount(len(rays), 'point')} seen{blind and f', none by {blind}'}")
         return rays
 
 
@@ -260,7 +260,7 @@ def _depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Pa
         return {by_stem[stem]: file for stem, file in zip(stems, depth, strict=True)}
     if len(depth) != len(photos):
         raise UsageError(
-            f"--depth names {len(depth)} files for {len(photos)} photos, expected one for each in their order, or files"
-            " of the same names"
+            f"--depth names {amount(len(depth), 'file')} for {amount(len(photos), 'photo')}, expected one for each, in the"
+            " same order or matched by name"
         )
     return dict(zip(photos, depth, strict=True))

@@ -78,5 +78,5 @@ def _not_there(name: str, names: Sequence[str], stems: Sequence[str]) -> str:
     if meant:
         listed = ", ".join(meant[:4]) + (", ..." if len(meant) > 4 else "")
         return f"frame {name!r} is ambiguous, expected one of {listed}"
-    hint = spelling_hint(name, names, f", expected a name as {names[0]!r}" if names else "")
+    hint = spelling_hint(name, names, f", expected a name such as {names[0]!r}" if names else "")
     return f"no frame {name!r} among its {len(names)} frames{hint}"

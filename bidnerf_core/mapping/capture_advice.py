@@ -86,7 +86,7 @@ def _trial(report: CaptureReport) -> Iterator[str]:
     errors = f", median error {trial.translation:.3g} m and {trial.rotation_deg:.2g}°" if trial.found else ""
     yield (
         f"of {_photos(trial.images)} held out of the landmarks, {trial.found} {_were(trial.found)} localized by them"
-        f"{errors}; expect the same of new photos that are taken likewise"
+        f"{errors}; expect similar results for new photos taken the same way"
     )
 
 
@@ -104,7 +104,7 @@ def _problems(report: CaptureReport) -> Iterator[str]:
 def _advice(report: CaptureReport) -> Iterator[str]:
     covered = report.coverage
     if len(report.photos) < LEAST_PHOTOS:
-        yield f"{_photos(len(report.photos))} are hardly enough for a map; take twenty or more, with much overlap"
+        yield f"{_photos(len(report.photos))} {_is(len(report.photos))} hardly enough for a map; take twenty or more, with much overlap"
     for gap in covered.gaps:
         yield f"no photo in {_between(gap)}: take some there, every 10 to 15°"
     if covered.open_side is not None:

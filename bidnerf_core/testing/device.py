@@ -51,7 +51,7 @@ class _Scene:
 def check_steps(field: RadianceField) -> None:
     """Check that steps at each level neither copy between devices nor wait for one, and lead where they do on the CPU.
 
-    The device is a pretended one, see ``elsewhere``. Fields without parameters and buffers have no device and pass.
+    The device is a simulated one, see ``elsewhere``. Fields without parameters and buffers have no device and pass.
     """
     for number in range(len(levels(field))):
         expected = _first_order(_problem(field), number, None)

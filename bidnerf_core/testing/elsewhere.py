@@ -1,4 +1,4 @@
-"""A pretended device, which proves on any machine that code neither copies between devices nor waits for one.
+"""A simulated device, which proves on any machine that code neither copies between devices nor waits for one.
 
 Tensors on the device "meta" stand for those on a GPU. While ``Elsewhere`` is active they hold values, which are kept and
 computed on the CPU, so that code runs as it does elsewhere; but tensors of both devices in one operation, which a GPU forbids,
@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from bidnerf_core import constants
 
 DEVICE = torch.device("meta")
-"""The pretended device."""
+"""The simulated device."""
 
 _aten = torch.ops.aten
 READS = {

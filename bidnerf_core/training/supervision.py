@@ -30,8 +30,7 @@ class SupervisionConfig(Settings):
     depth_weight: NotNegative = 0.1
     distortion_weight: NotNegative = 0.0  # weight of the term that gathers a ray's weight in one place
     exposure: bool = True  # learn a colour transform of each image, unless images have alpha
-    # weigh the colours of a blurred image by the share of fine detail that it has of what images from nearby have
-    sharpness: bool = True
+    sharpness: bool = True  # down-weight blurred images
 
 
 class Supervision:
