@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ import tiny
 from bidnerf_core.cli import COMMANDS, main, progress
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
-from bidnerf_core.registry import list_backends
+from bidnerf_core.registry import list_backends, load_backend
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.storage import MapInfo, load_info, load_map
 from bidnerf_core.training import Progress
@@ -820,6 +821,15 @@ def test_no_start_is_refused_by_methods_that_need_one(bidnerf: Run, shared: Path
         "localize", shared / "map", shared / "data", "--frame", "t_0000", "--no-start", "--method", "bid"
     )
     assert_refused(found, 1, "'bid' needs a start", "give one, or take method 'auto'")
+
+
+def test_a_backend_whose_module_has_no_docstring_is_listed_with_its_own_summary(
+    bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bare = [replace(info, summary="") for info in list_backends() if info.name == "hashgrid"]
+    monkeypatch.setattr("bidnerf_core.cli.backends.list_backends", lambda: bare)
+    (row,) = strict(bidnerf("backends", "--json").out)
+    assert row["summary"] == load_backend("hashgrid").summary
 
 
 def test_backends_are_listed(bidnerf: Run) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 from rich.table import Table
 
 from bidnerf_core.cli.common import Flag, option, parse, print_json, print_table
-from bidnerf_core.registry import BackendInfo, list_backends
+from bidnerf_core.registry import BackendError, BackendInfo, list_backends, load_backend
 
 
 def run(arguments: list[str]) -> None:
@@ -15,7 +15,7 @@ def run(arguments: list[str]) -> None:
 
 
 def backends(json: Annotated[Flag, option(None, "print a JSON list", "")] = False) -> None:
-    """List the installed kinds of field, importing none of them."""
+    """List the installed kinds of field, importing only those whose module has no docstring."""
     infos = list_backends()
     if json:
         print_json([_row(info) for info in infos])
@@ -24,14 +24,24 @@ def backends(json: Annotated[Flag, option(None, "print a JSON list", "")] = Fals
     table = Table("name", "summary", "distribution", "version", *faults, box=None, pad_edge=False)
     for info in infos:
         fault = [info.fault or ""] if faults else []
-        table.add_row(info.name, info.summary, info.distribution, info.version, *fault)
+        table.add_row(info.name, _summary(info), info.distribution, info.version, *fault)
     print_table(table)
+
+
+def _summary(info: BackendInfo) -> str:
+    """Return the first line of the module's docstring or, without one, what the backend says of itself when imported."""
+    if info.summary or info.fault:
+        return info.summary
+    try:
+        return str(load_backend(info.name).summary)
+    except BackendError:
+        return ""  # loading it for use will report the fault
 
 
 def _row(info: BackendInfo) -> dict[str, str | None]:
     return {
         "name": info.name,
-        "summary": info.summary,
+        "summary": _summary(info),
         "distribution": info.distribution,
         "version": info.version,
         "value": info.value,
