@@ -292,10 +292,12 @@ def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
     answers = tracked(known, tracker)
     assert_right(answers, known)
     assert [answer.focal_factor for answer in answers] == pytest.approx([1 / 1.06] * 4, rel=0.01)
+    assert [answer.intrinsics for answer in answers] == [CAMERA] * 4
     exact = flight()[4:6]
     answers = tracked(exact, tracker)
     assert_right(answers, exact)
     assert [answer.focal_factor for answer in answers] == [1, 1]
+    assert [answer.intrinsics for answer in answers] == [None, None]
 
 
 @pytest.mark.parametrize("depth", [True, False])

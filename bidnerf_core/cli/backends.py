@@ -15,7 +15,7 @@ def run(arguments: list[str]) -> None:
 
 
 def backends(json: Annotated[Flag, option(None, "print a JSON list", "")] = False) -> None:
-    """List the installed kinds of field, importing only those whose module has no docstring."""
+    """List the installed kinds of field."""
     infos = list_backends()
     if json:
         print_json([_row(info) for info in infos])
@@ -29,11 +29,11 @@ def backends(json: Annotated[Flag, option(None, "print a JSON list", "")] = Fals
 
 
 def _summary(info: BackendInfo) -> str:
-    """Return the first line of the module's docstring or, without one, what the backend says of itself when imported."""
+    """Return what the module's docstring or the metadata says or, without these, what the backend itself says when imported."""
     if info.summary or info.fault:
         return info.summary
     try:
-        return str(load_backend(info.name).summary)
+        return load_backend(info.name).summary
     except BackendError:
         return ""  # loading it for use will report the fault
 

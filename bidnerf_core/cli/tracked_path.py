@@ -45,8 +45,9 @@ class TrackedPath:
         self._backend = backend
 
     def add(self, frame: Frame, time: float | None, found: Localization, truth: SE3 | None = None) -> None:
+        intrinsics = found.frame_as_taken(frame).intrinsics
         posed = PosedImage(
-            frame.name, len(self.frames), frame.intrinsics, found.T_world_camera, None, time, found.covariance
+            frame.name, len(self.frames), intrinsics, found.T_world_camera, None, time, found.covariance
         )
         # The path of each single search would make long sequences large.
         self.frames.append(TrackedFrame(posed, replace(found, poses=found.poses[-1:]), truth))

@@ -86,7 +86,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
     found = _found(problem, config, seed)
     if config.fused_rays:
-        found = refined_if_blurred(problem, found)
+        found = refined_if_blurred(problem, found, config.fused_rays, seed)
     if _is_settled(found) or found.outcome in FINAL or problem.surface is None:
         return found
     occluder = nearest_piece(problem)
@@ -278,7 +278,7 @@ def _is_hopeless(problem: Problem) -> bool:
 def _unrecognised(problem: Problem, found: SearchResult, began: float) -> Localization:
     """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
     approximate = any(view.frame.focal_is_approximate for view in problem.views)
-    focal = "; the focal length is only approximate" if approximate else ""
+    focal = "; give the camera's calibration instead of an approximate focal length" if approximate else ""
     return Localization(
         T_world_camera=found.T[0].normalized(),
         outcome=Outcome.TOO_FEW_MATCHES,

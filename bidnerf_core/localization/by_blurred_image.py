@@ -1,4 +1,4 @@
-"""Poses of blurred images: the whole image is compared with renderings that are as blurred.
+"""Poses of blurred images: the whole image is compared with renderings that are blurred to match.
 
 Keypoints are inaccurate in blurred images, and rendered rays are as sharp as the field, so that the edges, which tell most about
 the pose, count as outliers. A rendering blurred like the image has the same edges.
@@ -20,6 +20,7 @@ from bidnerf_core.localization.costs.images import ColourScales, ImageCost, rend
 from bidnerf_core.localization.costs.thumbnails import thumbnail
 from bidnerf_core.localization.costs.view_renderers import FieldRenderer
 from bidnerf_core.localization.covariance import LEAST_VARIANCE, position_deviation
+from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -45,15 +46,18 @@ PRECISE = 0.01
 """Largest standard deviation of an accepted position, as a share of the distance of what is seen."""
 INDEPENDENT_PIXELS = 60
 """Number of independent measurements in a small image; set by the normalised errors on frames that were held out for tuning."""
-UNSUITABLE = (Outcome.AMBIGUOUS, Outcome.DIVERGED, Outcome.MIRRORED, Outcome.MISCALIBRATED)
+UNSUITABLE = (
+    Outcome.AMBIGUOUS, Outcome.DIVERGED, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.TOO_FEW_MATCHES
+)  # fmt: skip
 """Outcomes of poses that a closer comparison does not put right."""
 
 
-def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
-    """Return a doubtful pose refined and judged anew if the images are more blurred than what the field renders from there.
+def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: int) -> Localization:
+    """Return a doubtful pose refined and judged anew if the images are blurrier than what the field renders from there.
 
-    Poses are returned as they are where depth was measured, part of an image is hidden, the intrinsics were corrected, or the
-    field is itself not sharp.
+    Poses are returned as they are where depth was measured, part of an image is hidden, the intrinsics were corrected, the field
+    is itself not sharp, or the map has no surface. ``rays`` and ``seed`` are those of ``mirror_rejection``, which judges poses that
+    are accepted here only.
     """
     if not _is_eligible(problem, found):
         return found
@@ -77,12 +81,16 @@ def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
     distance = float(render_view(sharp.renderer, sharp.thumbnails[-1], done[-1].T).depth.median())
     precision = position_deviation(covariance) / distance
     verdict = _verdict(1 - cost_at_end / uniform, precision)
+    if verdict.accepted and not found.converged and problem.matcher is not None:
+        there = replace(problem, start=T)
+        verdict = mirror_rejection(there, problem.matcher, 0.0, rays, seed) or verdict
     return replace(
         found,
         T_world_camera=T,
         outcome=verdict.outcome,
         reason=verdict.reason,
         confidence=None,
+        diagnostics=None,
         covariance=covariance if bool(covariance.isfinite().all()) else None,
         loss=cost_at_end,
         steps=found.steps + ROUNDS * STEPS,
@@ -95,7 +103,8 @@ def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
 def _is_eligible(problem: Problem, found: Localization) -> bool:
     """Whether an answer is doubtful, and whole images with the intrinsics given can be compared with the field's renderings."""
     hidden = any(view.frame.hidden is not None for view in problem.views)
-    if problem.has_depth or hidden or not is_sharp(problem) or found.intrinsics is not None:
+    unsuited_map = problem.surface is None or not is_sharp(problem)
+    if problem.has_depth or hidden or unsuited_map or found.intrinsics is not None:
         return False
     return (found.confidence or 0.0) < TRUSTED and found.outcome not in UNSUITABLE
 
@@ -126,7 +135,7 @@ def _covariance(done: Descent, views: int) -> Float[Tensor, "6 6"]:
 
 def _verdict(explained: float, precision: float) -> Verdict:
     """Judge a pose by how much of the image it explains, and by its deviation as a share of the distance of what is seen."""
-    share = f"{explained:.0%} of the contrast of the blurred image agrees with renderings that are as blurred"
+    share = f"{explained:.0%} of the contrast of the blurred image agrees with renderings blurred to match"
     if explained < EXPLAINED:
         return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}, expected {EXPLAINED:.0%}")
     if not precision <= PRECISE:

@@ -111,8 +111,8 @@ class Tracker:
             answer, state = self._continued(frame, image, state, state.motion, seconds)
         # Points are followed from the last image, even past frames without one.
         self._state = state = state if image is None else replace(state, image=image)
-        factor = 1.0 if state.camera is None else state.camera.focal_factor(stated)
-        return replace(answer, seconds=clocks.perf_counter() - began, focal_factor=factor)
+        answer = replace(answer, seconds=clocks.perf_counter() - began, focal_factor=1.0, intrinsics=None)
+        return answer if state.camera is None else state.camera.stated_in(answer, stated)
 
     def save(self, path: str | Path) -> None:
         """Write the tracker's state to a file, from which ``restore`` continues exactly here."""

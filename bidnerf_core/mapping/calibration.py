@@ -72,8 +72,8 @@ class Calibration:
         )
         return (
             f"a focal length {abs(self.focal_factor - 1):.1%} {longer} than given",
-            f"a principal point {abs(self.shift_u):.1%} of the focal length further {right}",
-            f"a principal point {abs(self.shift_v):.1%} of the focal length further {down}",
+            f"a principal point {abs(self.shift_u):.1%} of the focal length further {right} than given",
+            f"a principal point {abs(self.shift_v):.1%} of the focal length further {down} than given",
             f"a radial distortion {abs(self.radial):.3f} {higher} than given",
         )
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.localization.costs.thumbnails import Thumbnail, blurred, slopes, smooth
+from bidnerf_core.localization.costs.thumbnails import Thumbnail, gaussian_blurred, slopes, smooth
 from bidnerf_core.localization.costs.view_renderers import ViewRenderer
 from bidnerf_core.localization.exposure import Exposure, clipped, fit_exposure
 from bidnerf_core.localization.normal_equations import NormalEquations
@@ -57,7 +57,9 @@ class RenderedView:
         if pixels == 0:
             return self
         known = self.known[:, None]
-        rgb, weight = (blurred(self._image(part), pixels).flatten(2) for part in (self.rgb * known, known))
+        rgb, weight = (
+            gaussian_blurred(self._image(part), pixels).flatten(2) for part in (self.rgb * known, known)
+        )
         return replace(self, rgb=rgb / weight.clamp(min=1e-3), known=weight[:, 0])
 
     def _image(self, flat: Float[Tensor, "h c n"]) -> Float[Tensor, "h c y x"]:
@@ -94,9 +96,8 @@ class ImageCost:
     thumbnails: Sequence[Thumbnail]
     scales: ColourScales
     pivot: Float[Tensor, "3"]  # metres, last camera's frame
-    blur: float = (
-        0.0  # standard deviation by which photos are more blurred than renderings, pixels of thumbnails
-    )
+    # Standard deviation by which photos are blurrier than renderings, pixels of thumbnails.
+    blur: float = 0.0
 
     def __call__(self, T: SE3) -> NormalEquations:
         parts = [self._of_thumbnail(small, T) for small in self.thumbnails]
@@ -149,7 +150,7 @@ class _Compared:
 
 
 def uniform_cost(thumbnails: Sequence[Thumbnail], scale: float) -> float:
-    """Return the cost of images of one colour, the median of what was measured: a pose has to explain more than those."""
+    """Return the cost of images of one colour, the median of what was measured: the baseline that a pose must beat."""
     costs = []
     for small in thumbnails:
         measured = small.rgb.flatten(1)

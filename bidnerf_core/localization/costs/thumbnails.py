@@ -82,12 +82,10 @@ def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     return flat.view(image.shape)
 
 
-def blurred(image: Float[Tensor, "b c h w"], pixels: float) -> Float[Tensor, "b c h w"]:
+def gaussian_blurred(image: Float[Tensor, "b c h w"], pixels: float) -> Float[Tensor, "b c h w"]:
     """Convolve with a Gaussian of that standard deviation; the border is repeated."""
     size = 2 * math.ceil(KERNEL_REACH * pixels) + 1
-    reach = size // 2
-    wide = pad(image, (reach, reach, reach, reach), mode="replicate")
-    return gaussian_blur2d(wide, (size, size), (pixels, pixels), "constant")[..., reach:-reach, reach:-reach]
+    return gaussian_blur2d(image, (size, size), (pixels, pixels), "replicate")
 
 
 def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, "*b n 2"]:

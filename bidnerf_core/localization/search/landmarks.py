@@ -137,5 +137,4 @@ def _map_camera_consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: 
         return None
     data = query.seen_by(camera).observed(matches)
     found = sample_consensus(data, matches.view, query.threshold, seed)
-    given = query.images[-1].intrinsics
-    return None if found is None else replace(found, focal_factor=camera.intrinsics.fx / given.fx)
+    return None if found is None else replace(found, focal_factor=camera.calibration.focal_factor)

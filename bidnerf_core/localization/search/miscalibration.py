@@ -136,7 +136,7 @@ def taken_intrinsics(
         likely = probability_beside_approximate(free, landmarks, camera) > LIKELY
         return TakenIntrinsics(camera.calibration, camera) if likely else TakenIntrinsics()
     if not bool(camera.differs.any()):
-        return TakenIntrinsics(as_map=True)
+        return TakenIntrinsics(as_map=camera.is_near(CALIBRATED))
     if not camera.is_near(OTHER_CAMERA):
         return TakenIntrinsics()
     probability, there = probability_of_map_camera(free, landmarks, camera, other_log_odds), camera.correction

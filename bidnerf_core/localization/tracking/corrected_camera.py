@@ -7,6 +7,7 @@ from typing import Any
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame
+from bidnerf_core.localization.result import Localization
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,12 @@ class CorrectedCamera:
     def corrected(self, frame: Frame) -> Frame:
         """Return the frame with better intrinsics."""
         return replace(frame, intrinsics=self.changed(frame.intrinsics)) if self.applies_to(frame) else frame
+
+    def stated_in(self, answer: Localization, frame: Frame) -> Localization:
+        """Return the answer for a frame with the intrinsics that replace its own, if they do."""
+        taken = self.corrected(frame).intrinsics
+        corrected = None if taken == frame.intrinsics else taken
+        return replace(answer, focal_factor=self.focal_factor(frame), intrinsics=corrected)
 
     def changed(self, camera: Intrinsics) -> Intrinsics:
         """Return better intrinsics; those of another focus or size are changed in the same proportion."""
