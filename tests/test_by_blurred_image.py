@@ -19,11 +19,14 @@ from bidnerf_core.localization.costs.thumbnails import gaussian_blurred, thumbna
 from bidnerf_core.localization.costs.view_renderers import FieldRenderer
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.result import Outcome
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.rendering import render_image
 from bidnerf_core.sampling import Stratified
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
+from landmark_scene import Points, ring
 from problems import FieldMap
 
 CLOUDS = GaussianBlobs.random(12, density=400.0)
@@ -95,6 +98,19 @@ def test_nor_one_by_measured_depth_nor_in_a_blurred_field_nor_without_a_surface(
     assert refined_if_blurred(replace(problem(photo(3.0)), surface=None), given) is given
     assert refined_if_blurred(problem(photo(2.0, depth=True)), given) is given
     assert refined_if_blurred(replace(problem(photo(2.0)), colour_noise=0.1), given) is given
+
+
+@pytest.mark.parametrize(("factor", "refined"), [(1.0, True), (1.05, False)])
+def test_nor_one_with_intrinsics_that_differ_from_the_maps(factor: float, refined: bool) -> None:
+    """A wrong focal length hardly shows in a blurred image, but moves the pose."""
+    cameras = (replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy),)
+    points = Points()
+    matcher = LandmarkMatcher(
+        replace(build_landmarks(ring(points), points), cameras=cameras)
+    )  # any landmarks
+    given = answer(ASIDE)
+    found = refined_if_blurred(replace(problem(photo(2.0)), matcher=matcher), given)
+    assert (found is not given) == refined
 
 
 @pytest.mark.parametrize("outcome", [Outcome.CONVERGED, Outcome.RENDERING_MISMATCH])
