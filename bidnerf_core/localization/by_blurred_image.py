@@ -33,15 +33,15 @@ WIDTH = 100
 """Pixels of the longer side of the images that are compared."""
 BLURS = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
 """Standard deviations that are tried, pixels of these images."""
-LEAST_BLUR = 0.7
+NOTICEABLE_BLUR = 0.7
 """The least of them with which an image counts as blurred. A sharp image is averaged over its pixels, while rays are single."""
 CLEARLY_LESS = 0.85
 """Cost with the best blur, as a share of that without, below which an image counts as blurred."""
 ROUNDS, STEPS = 3, 4
 """The blur is estimated that often, each time followed by that many steps."""
-COLOUR = 0.1
+HALF_AN_INLIER = 0.1
 """Norm of a colour difference at which a pixel is half an inlier."""
-EXPLAINED = 0.75
+LEAST_EXPLAINED = 0.75
 """Least share of the image's contrast that an accepted pose explains."""
 PRECISE = 0.01
 """Largest standard deviation of an accepted position, as a share of the distance of what is seen."""
@@ -66,14 +66,14 @@ def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: i
     start = found.T_world_camera.to(problem.device)
     about = pivot("scene", replace(problem, start=found.T_world_camera)).to(problem.device)
     sharp = _cost(problem, about)
-    blurred = sharp.with_blur_of(start, BLURS)
-    costs = [float(cost(start[None]).cost[0]) for cost in (blurred, sharp)]
-    if blurred.blur < LEAST_BLUR or not costs[0] < CLEARLY_LESS * costs[1]:
+    costs = sharp.costs_of_blurs(start, BLURS).tolist()
+    best = min(range(len(BLURS)), key=costs.__getitem__)
+    if BLURS[best] < NOTICEABLE_BLUR or not costs[best] < CLEARLY_LESS * costs[0]:
         return found
-    uniform = uniform_cost(sharp.thumbnails, COLOUR)
+    uniform = uniform_cost(sharp.thumbnails, HALF_AN_INLIER)
     if uniform == 0:
         return found  # an image of one colour, which any pose explains
-    done = _descents(sharp, start, about)
+    done = _descents(replace(sharp, blur=BLURS[best]), start, about)
     cost_at_end = float(done[-1].equations.cost[0])
     if not math.isfinite(cost_at_end):
         return found
@@ -124,15 +124,15 @@ def _cost(problem: Problem, about: Pivot) -> ImageCost:
     small = [moved(thumbnail(view, WIDTH), problem.device) for view in problem.views]
     assert about.T_camera_pivot is not None
     middle = about.T_camera_pivot.translation.to(small[0].rgb)
-    return ImageCost(renderer, small, ColourScales(colour=COLOUR), middle)
+    return ImageCost(renderer, small, ColourScales(colour=HALF_AN_INLIER), middle)
 
 
 def _descents(cost: ImageCost, T: SE3, about: Pivot) -> list[Descent]:
-    """Take the steps of all rounds, each with the blur that suits its first pose."""
-    found = list[Descent]()
-    for _ in range(ROUNDS):
-        start = found[-1].T if found else T[None]
-        found.append(descend(cost.with_blur_of(start[0], BLURS), start, STEPS, about.moved, damping=1e-2))
+    """Take the steps of all rounds, each with the blur that suits its first pose; ``cost`` has that of the first round."""
+    found = [descend(cost, T[None], STEPS, about.moved, damping=1e-2)]
+    for _ in range(ROUNDS - 1):
+        T = found[-1].T[0]
+        found.append(descend(cost.with_blur_of(T, BLURS), T[None], STEPS, about.moved, damping=1e-2))
     return found
 
 
@@ -145,8 +145,8 @@ def _covariance(done: Descent, views: int) -> Float[Tensor, "6 6"]:
 def _verdict(explained: float, precision: float) -> Verdict:
     """Judge a pose by how much of the image it explains, and by its deviation as a share of the distance of what is seen."""
     share = f"{explained:.0%} of the contrast of the blurred image agrees with renderings blurred to match"
-    if explained < EXPLAINED:
-        return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}, expected {EXPLAINED:.0%}")
+    if explained < LEAST_EXPLAINED:
+        return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}, expected {LEAST_EXPLAINED:.0%}")
     if not precision <= PRECISE:
         why = f"the image is blurred, so the position is uncertain by {precision:.1%} of the distance of what is seen"
         return Verdict(Outcome.IMPRECISE, f"{why}, expected at most {PRECISE:.0%}")

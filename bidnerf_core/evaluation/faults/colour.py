@@ -14,9 +14,7 @@ from PIL import Image
 from torch import Generator, Tensor
 
 from bidnerf_core.frames import Frame
-
-KERNEL_REACH = 3.0
-"""Radius of a blurring kernel in standard deviations."""
+from bidnerf_core.localization.costs.thumbnails import KERNEL_REACH
 
 
 def exposure(frame: Frame, factor: float, generator: Generator) -> Frame:

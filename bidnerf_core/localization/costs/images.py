@@ -109,13 +109,17 @@ class ImageCost:
 
     def with_blur_of(self, T: SE3, candidates: Sequence[float]) -> ImageCost:
         """Return the cost with that blur among the candidates which makes renderings from one pose most like the photos."""
+        return replace(self, blur=candidates[int(self.costs_of_blurs(T, candidates).argmin())])
+
+    def costs_of_blurs(self, T: SE3, candidates: Sequence[float]) -> Float[Tensor, "b"]:
+        """Return the cost with each blur from one pose, which is rendered once."""
         costs = torch.zeros(len(candidates), dtype=torch.float64, device=self.renderer.device)
         for small in self.thumbnails:
             seen = render_view(self.renderer, small, T[None])
             costs += torch.stack(
                 [self._compared(small, seen.blurred(b)).cost[0] for b in candidates]
             ).double()
-        return replace(self, blur=candidates[int(costs.argmin())])
+        return costs / len(self.thumbnails)
 
     def _of_thumbnail(self, small: Thumbnail, T: SE3) -> tuple[Tensor, Tensor, Tensor]:
         """Return the cost, its gradient and its Hessian of one image."""
