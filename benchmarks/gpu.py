@@ -1,9 +1,11 @@
 """What a GPU makes of the methods: time of a step by backend and where it goes, no-start localization, the paper's tables.
 
-    python benchmarks/gpu.py DATA --map MAP [--map MAP ...] --out FOLDER [--part steps no_start tables]
+    python benchmarks/gpu.py DATA --map MAP [--map MAP ...] --out FOLDER [--part training steps no_start tables]
 
+- ``training``: ``map_quality.py`` on the device, for each backend that is named by ``--train``: time, quality, memory;
 - ``steps``: milliseconds of a step of ``bid`` with 2048 rays at each level of each map, timed with events of the device after a
-  warm-up, with the operations that take most of it; the steps run under PyTorch's check that the host never waits;
+  warm-up: launched one operation after the other, under PyTorch's check that the host never waits, and as a CUDA graph, as
+  ``bid`` takes them; with the number of operations and those that take most of the time;
 - ``no_start``: method ``auto`` on RGB-D and on RGB test frames: median time and success;
 - ``tables``: ``paper_tables.py`` with preset ``paper`` and with ``paper-scene``, on the device.
 
@@ -14,6 +16,7 @@ Finished rows are kept in FOLDER, safe against any kill: the same command goes o
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import subprocess
 import sys
@@ -48,6 +51,7 @@ from bidnerf_core.localization.method_settings import (
 from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.solvers.adam import AdamSteps
+from bidnerf_core.localization.solvers.cuda_graph import recorded
 from bidnerf_core.waiting import without_waiting
 
 TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
@@ -55,7 +59,10 @@ FRAMES = 40
 """Largest number of frames that are localized without a start."""
 
 
-def made_steps(folder: str, data: str, level: int, device: torch.device, rays: int = TIMED_RAYS) -> AdamSteps:
+def made_steps(
+    folder: str, data: str, level: int, device: torch.device, rays: int = TIMED_RAYS,
+    generator: torch.Generator | None = None,
+) -> AdamSteps:  # fmt: skip
     """Return the steps of ``bid`` from 0.1 units beside the first test frame's pose."""
     stored, dataset = opened(folder, data)
     there = None if device.type == "cpu" else device
@@ -65,56 +72,94 @@ def made_steps(folder: str, data: str, level: int, device: torch.device, rays: i
     usual = METHODS["bid"].settings("paper-scene")
     loss = SampledLoss(
         problem.on_device(), objective_of(usual.colour, usual.depth), RayCounts(rays),
-        DescentSettings(rays=rays, level=level), ReachSettings(), torch.Generator(device).manual_seed(0),
+        DescentSettings(rays=rays, level=level), ReachSettings(), generator or torch.Generator(device).manual_seed(0),
     )  # fmt: skip
     # Poses stay where they are, so that all steps render alike.
     rate = AdamSettings(learning_rate=1e-9, decay=1.0)
     return AdamSteps(loss, pivot("scene", problem), rate, problem.start_for("bid").to(device))
 
 
-def timed_steps(steps: AdamSteps, warm_up: int, count: int) -> dict[str, Any]:
-    """Return the median time of a step (ms) by the device's events, and the operations that take most of it."""
+def timed(step: Callable[[], None], count: int) -> tuple[float, float]:
+    """Return the median and the largest time of a step (ms) by the device's events."""
+    torch.cuda.synchronize()
+    marks = [torch.cuda.Event(enable_timing=True) for _ in range(count + 1)]
+    for mark in marks[:-1]:
+        mark.record()
+        step()
+    marks[-1].record()
+    torch.cuda.synchronize()
+    times = [a.elapsed_time(b) for a, b in pairwise(marks)]
+    return statistics.median(times), max(times)
+
+
+def timed_steps(steps: AdamSteps, device: torch.device, generator: torch.Generator) -> dict[str, Any]:
+    """Return the times of a step, launched and as a graph, and the operations that take most of the time."""
     with without_waiting():
-        for number in range(warm_up):
-            steps(number)
+        for _ in range(WARM_UP):
+            steps()
         torch.cuda.synchronize()
-        marks = [torch.cuda.Event(enable_timing=True) for _ in range(count + 1)]
         torch.cuda.set_sync_debug_mode("error")  # a step in which the host waits raises
         try:
-            for number, mark in enumerate(marks[:-1]):
-                mark.record()
-                steps(number)
-            marks[-1].record()
+            launched = timed(steps, TIMED)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-        torch.cuda.synchronize()
-        times = [a.elapsed_time(b) for a, b in pairwise(marks)]
-        return {"ms": statistics.median(times), "ms_most": max(times), "operations": operations(steps)}
+        found = operations(steps)
+        began = time.perf_counter()
+        replay = recorded(steps, device, generator)
+        recording = time.perf_counter() - began
+        timed(replay, WARM_UP)
+        graph = timed(replay, TIMED)
+    return {
+        "graph_ms": graph[0],
+        "graph_ms_most": graph[1],
+        "recording_ms": 1000 * recording,
+        "launched_ms": launched[0],
+        "launched_ms_most": launched[1],
+        "is_graph": replay is not steps,
+        **found,
+    }
 
 
-def operations(steps: AdamSteps) -> list[dict[str, Any]]:
-    """Return the ten operations that take most of the device's time, with their share of it."""
+def operations(steps: AdamSteps) -> dict[str, Any]:
+    """Return how many kernels a step launches, how long they take, and the ten that take most of that, with their share of it."""
     kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
-    with torch.profiler.profile(activities=kinds) as profile:
-        for number in range(PROFILED):
-            steps(number)
+    with torch.profiler.profile(activities=kinds, acc_events=True) as profile:
+        for _ in range(PROFILED):
+            steps()
         torch.cuda.synchronize()
-    rows = profile.key_averages()
-    total = sum(row.self_device_time_total for row in rows) or 1
-    most = sorted(rows, key=lambda row: -row.self_device_time_total)[:10]
-    return [
-        {"name": row.key, "calls": row.count / PROFILED, "share": row.self_device_time_total / total}
-        for row in most
-    ]
+    kernels = [row for row in profile.key_averages() if row.device_type == torch.autograd.DeviceType.CUDA]
+    total = sum(row.self_device_time_total for row in kernels) or 1
+    most = sorted(kernels, key=lambda row: -row.self_device_time_total)[:10]
+    return {
+        "kernels": sum(row.count for row in kernels) / PROFILED,
+        "kernels_ms": total / 1000 / PROFILED,
+        "operations": [
+            {"name": row.key, "calls": row.count / PROFILED, "share": row.self_device_time_total / total}
+            for row in most
+        ],
+    }
 
 
 def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
     """Return the times of a step at each level of a map."""
-    count = len(levels(opened(folder, data, str(device))[0].field))
-    return {
-        f"level {level}": timed_steps(made_steps(folder, data, level, device), WARM_UP, TIMED)
-        for level in range(count)
-    }
+    found = {}
+    for level in range(len(levels(opened(folder, data, str(device))[0].field))):
+        generator = torch.Generator(device).manual_seed(0)
+        steps = made_steps(folder, data, level, device, generator=generator)
+        found[f"level {level}"] = timed_steps(steps, device, generator)
+    return found
+
+
+def trained(backend: str, data: str, out: Path, device: torch.device) -> dict[str, Any]:
+    """Train a map with the defaults of a backend, and return its quality and what the training took."""
+    script, name = Path(__file__).with_name("map_quality.py"), f"map_gpu_{backend}"
+    subprocess.run(
+        [sys.executable, str(script), data, "--out", str(out / f"{backend}_map"), "--name", name,
+         "--results", str(out), "--device", str(device), "--", "--backend", backend, "--device", str(device)],
+        check=True,
+    )  # fmt: skip
+    record = json.loads((out / f"{name}.json").read_text())
+    return {"record": name, "training": record["results"]["training"], "levels": record["results"]["levels"]}
 
 
 def no_start_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
@@ -138,13 +183,15 @@ def _without_depth(view: View) -> View:
     return replace(view, frame=replace(view.frame, depth=None))
 
 
-def table_rows(folder: str, data: str, out: Path, preset: str, device: torch.device) -> dict[str, Any]:
+def table_rows(
+    folder: str, data: str, out: Path, preset: str, device: torch.device, workers: int
+) -> dict[str, Any]:
     """Run the paper's tables in a process of their own, which goes on where it stopped."""
     script = Path(__file__).with_name("paper_tables.py")
     began, tables = time.perf_counter(), out / preset
     subprocess.run(
         [sys.executable, str(script), data, "--map", folder, "--out", str(tables), "--preset", preset,
-         "--device", str(device), "--workers", "1"],
+         "--device", str(device), "--workers", str(workers)],
         check=True,
     )  # fmt: skip
     return {"folder": tables.name, "seconds": time.perf_counter() - began}
@@ -166,8 +213,14 @@ def main() -> None:
     parser.add_argument("data")
     parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
     parser.add_argument("--out", type=Path, default=RESULTS)
-    parts = ("steps", "no_start", "tables")
+    parts = ("training", "steps", "no_start", "tables")
     parser.add_argument("--part", nargs="+", choices=parts, default=list(parts))
+    parser.add_argument(
+        "--train", nargs="*", default=[], help="backends to train on DATA with their defaults"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=4, help="processes that share the device for the tables"
+    )
     given = parser.parse_args()
     if not torch.cuda.is_available():
         print("no GPU here: nothing was measured, and no record was written")
@@ -176,13 +229,20 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, Any] = {"gpu": gpu, "rays": TIMED_RAYS}
     with RowStore(given.out / "gpu.rows.jsonl") as store:
+        for backend in given.train if "training" in given.part else []:
+            make = partial(trained, backend, given.data, given.out, device)
+            results.setdefault("training", {})[backend] = store.get(
+                [gpu, backend, "training"], partial(attempted, f"{backend}: training", make)
+            )
         for folder in given.map:
             name = Path(folder).name
             rows: dict[str, Callable[[], Any]] = {
                 "steps": partial(step_rows, folder, given.data, device),
                 "no_start": partial(no_start_rows, folder, given.data, device),
             } | {
-                f"tables {preset}": partial(table_rows, folder, given.data, given.out, preset, device)
+                f"tables {preset}": partial(
+                    table_rows, folder, given.data, given.out, preset, device, given.workers
+                )
                 for preset in ("paper", "paper-scene")
             }
             for row, make in rows.items():

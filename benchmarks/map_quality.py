@@ -30,7 +30,7 @@ from kornia.metrics import psnr, ssim
 
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.field import RadianceField, SceneBounds, device_of, levels
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
@@ -109,11 +109,11 @@ def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[
 @torch.no_grad()
 def samples_per_ray(field: RadianceField, bounds: SceneBounds, views: list[View]) -> float:
     """Mean number of queried samples over every fourth pixel along each axis, those that miss the scene included."""
-    taken, rays = 0, 0
+    taken, rays, device = 0, 0, device_of(field)
     for view in views:
         ray = view.frame.intrinsics.unproject(view.frame.intrinsics.pixel_centres())[::4, ::4].reshape(-1, 3)
-        T = view.T_ref_camera.to(dtype=torch.float32)
-        turned = T.rotate(ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True))
+        T = view.T_ref_camera.to(dtype=torch.float32, device=device)
+        turned = T.rotate((ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)).to(device))
         taken += int(field.sampler(bounds.rays(T.translation.expand_as(turned), turned)).valid.sum())
         rays += len(turned)
     return taken / rays
@@ -174,12 +174,16 @@ def main() -> None:
     parser.add_argument(
         "--without-depth", action="store_true", help="train on the colours of transforms_train.json alone"
     )
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the record")
+    parser.add_argument(
+        "--device", default="cpu", help="where images are rendered; to train there too: -- --device"
+    )
     words = sys.argv[1:]
     end = words.index("--") if "--" in words else len(words)
     given = parser.parse_args(words[:end])
     trained = train_without_depth if given.without_depth else train
     training = {} if given.keep else trained(given.data, given.out, words[end + 1 :])
-    stored = load_map(given.out)
+    stored = load_map(given.out, given.device)
     views = open_dataset(given.data, stored.bounds.background).views("test")
     results = {
         "backend": stored.info.backend,
@@ -201,7 +205,7 @@ def main() -> None:
         results["pixels_moved_median"] = statistics.median(m.pixels for m in moved) if moved else 0.0
     if compared := beside_dense(stored.field, stored.bounds, views):
         results["beside_dense"] = compared
-    print(write_record(RESULTS / f"{given.name}.json", results, seed=stored.info.config.get("seed", 0)))
+    print(write_record(given.results / f"{given.name}.json", results, seed=stored.info.config.get("seed", 0)))
     print({k: v for k, v in results.items() if k != "config"})
 
 

@@ -98,8 +98,8 @@ def test_without_a_surface_no_start_is_refused_in_a_line(shared: Path, folder: P
 def _ball(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is baked is a ball, whatever the map shows."""
 
-    def ball(folder: Path, **options: bool) -> Map:
-        return replace(load_map(folder, **options), field=HomogeneousBall(0.5, 300.0))
+    def ball(folder: Path, *place: str, **options: bool) -> Map:
+        return replace(load_map(folder, *place, **options), field=HomogeneousBall(0.5, 300.0))
 
     monkeypatch.setattr(module, "load_map", ball)
 

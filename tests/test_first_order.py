@@ -24,8 +24,9 @@ from bidnerf_core.localization.method_settings import (
     ReachSettings,
     objective_of,
 )
-from bidnerf_core.localization.pivots import PivotName, pivot
+from bidnerf_core.localization.pivots import Pivot, PivotName, pivot
 from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.history import WINDOW
 from bidnerf_core.pixels import DrawerName, draw, uniform
 from bidnerf_core.rendering import render_image
@@ -191,3 +192,44 @@ def test_rays_are_moved_to_the_device_of_the_field(problem: Problem) -> None:
     rays = pixels.rays(problem.start, BOUNDS)
     parts = (pixels.origins, pixels.directions, pixels.rgb, pixels.distance, rays.origins, rays.near)
     assert {part.device.type for part in parts} == {"meta"}
+
+
+def test_updates_are_those_of_torch() -> None:
+    """Steps on a quadratic loss of the translation, beside torch's own Adam on the same gradients."""
+    goal = torch.tensor([0.5, -2.0, 1.0], dtype=torch.float64)
+    config = AdamSettings(learning_rate=0.1, decay=0.5, decay_steps=10)
+    steps = AdamSteps(
+        lambda T: (T.translation - goal).square().sum(), Pivot(SE3.identity()), config, SE3.identity()
+    )
+    place = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([place])
+    for number in range(2 * WINDOW):
+        optimizer.param_groups[0]["lr"] = 0.1 * 0.5 ** (number / 10)
+        optimizer.zero_grad()
+        (place - goal).square().sum().backward()
+        optimizer.step()
+        steps()
+        torch.testing.assert_close(steps.T.translation, place.detach())
+
+
+def test_a_block_holds_the_steps_that_were_taken() -> None:
+    config = AdamSettings(learning_rate=0.1)
+    steps = AdamSteps(lambda T: T.translation.sum() + 1, Pivot(SE3.identity()), config, SE3.identity())
+    for _ in range(WINDOW):
+        steps()
+    poses, losses, finite = steps.block()
+    assert finite.all()
+    torch.testing.assert_close(losses[1:], poses.translation[:-1].sum(-1) + 1)
+    torch.testing.assert_close(poses[WINDOW - 1].matrix(), steps.T.matrix())
+    steps()
+    torch.testing.assert_close(steps.block()[0][0].matrix(), steps.T.matrix())
+
+
+def test_a_step_that_is_not_finite_leaves_the_pose() -> None:
+    steps = AdamSteps(
+        lambda T: T.translation.sum() / 0, Pivot(SE3.identity()), AdamSettings(), SE3.identity()
+    )
+    steps()
+    _, _, finite = steps.block()
+    assert torch.equal(steps.T.matrix(), SE3.identity().matrix())
+    assert not finite[0]

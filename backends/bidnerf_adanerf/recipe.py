@@ -15,8 +15,9 @@ from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_st
 from bidnerf_adanerf.field import AdaNerfField
 from bidnerf_adanerf.oracle_loss import oracle_loss
 from bidnerf_core.carving import occupied_voxels
-from bidnerf_core.field import SceneBounds
+from bidnerf_core.field import SceneBounds, device_of
 from bidnerf_core.frames import View
+from bidnerf_core.moving import moved
 from bidnerf_core.rendering import query_samples, render, rendering_weights
 from bidnerf_core.training import Report, StepOutcome, Supervision, TrainingBatch, fit
 from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
@@ -49,7 +50,8 @@ def sparsity(step: int, config: AdaNerfConfig) -> float:
 def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, report: Report) -> None:
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     room = room_for_matter(views, field.bounds, config.room_resolution) if config.carve else None
-    supervision = Supervision(views, field.bounds, config)
+    room = moved(room, device_of(field))
+    supervision = Supervision(views, field.bounds, config, device_of(field))
 
     @cache
     def rays_per_step(sparse: bool) -> int:  # constant in a phase, also where training resumes

@@ -1,35 +1,36 @@
 """Multiresolution hash encoding (Mueller et al. 2022, "Instant Neural Graphics Primitives", section 3).
 
-Pure torch, laid out for the cores of a CPU and equally usable on a GPU:
+Pure torch, laid out for the cores of a CPU, and for a GPU with all levels in few operations:
 
 * arrays are (corner, point), so that all arithmetic runs along contiguous points;
 * a pair of features is read and accumulated as one complex number: one memory access a corner (a "unit" below);
 * the points go through a level in chunks whose temporaries stay in the cache, and so does the table of the level;
-* levels are computed on several threads at once, because torch gathers and scatters on one;
+* levels are computed on several threads at once, because torch gathers and scatters on one; on a GPU, where launching
+  an operation takes longer than many a level, those of a kind are computed together (``LevelGroup``);
 * the backward pass is written by hand: gradients to a table are scattered to recomputed corner indices, and the
   derivative by position is kept from the forward pass, where the corner values are at hand anyway.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from bidnerf_core.constants import constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.settings import Range, Settings
+from bidnerf_hashgrid.levels import Level, LevelGroup, make_levels, one_by_one, together
 from bidnerf_hashgrid.threads import concurrently, slices, threads_for
 
-# The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.
-PRIMES = (1, 2654435761 - 2**32, 805459861)
 CPU_CHUNK = 32768
+GPU_CHUNK = 2**22
+"""Number of points times levels that are computed at once: a quarter of a gigabyte for the features of their corners."""
 
 
 @dataclass(frozen=True)
@@ -56,57 +57,12 @@ class HashEncodingConfig(Settings):
             )
 
 
-@dataclass(frozen=True)
-class _Level:
-    resolution: int
-    entries: int
-    strides: tuple[int, int, int]
-    hashed: bool
-    smooth: bool
-
-
-def _make_levels(config: HashEncodingConfig) -> tuple[_Level, ...]:
-    """Return the levels, with resolutions by eqs. 2 and 3; one whose vertices fit in the table is stored without a hash."""
-    growth = math.log(config.finest_resolution / config.base_resolution) / max(config.levels - 1, 1)
-    levels = []
-    for index in range(config.levels):
-        # The small addend keeps an exact product, such as N_max itself, from being rounded down.
-        resolution = math.floor(config.base_resolution * math.exp(growth * index) + 1e-6)
-        side, table_size = resolution + 1, 2**config.log2_table_size
-        hashed = side**3 > table_size
-        strides = PRIMES if hashed else (1, side, side**2)
-        entries = table_size if hashed else side**3
-        levels.append(_Level(resolution, entries, strides, hashed, config.interpolation == "smooth"))
-    return tuple(levels)
-
-
-def _vertices(
-    points: Float[Tensor, "3 n"], level: _Level
-) -> tuple[Int[Tensor, "3 2 n"], Float[Tensor, "3 n"]]:
-    """Return the terms of the lower and upper vertex of each axis in a corner's index, and the position in the cell."""
-    scaled = points * level.resolution
-    # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
-    lower = scaled.to(torch.int32).clamp_(0, level.resolution - 1)
-    strides = constant(level.strides, lower)[:, None]
-    terms = lower.new_empty(3, 2, lower.shape[1])
-    torch.mul(lower, strides, out=terms[:, 0])
-    torch.add(terms[:, 0], strides, out=terms[:, 1])
-    return terms.bitwise_and_(level.entries - 1) if level.hashed else terms, scaled.sub_(lower)
-
-
-def _corner_indices(terms: Int[Tensor, "3 2 m"], level: _Level) -> Int[Tensor, " 8*m"]:
-    """Return the table indices of the eight corners (eq. 4, or the dense index), ordered (z, y, x, point)."""
-    combine = torch.bitwise_xor if level.hashed else torch.add
-    x, y, z = terms.unbind()
-    return combine(combine(z[:, None], y)[:, :, None], x).view(-1)
-
-
-def _weights(fraction: Float[Tensor, "3 n"], level: _Level, unit: int) -> Float[Tensor, "3 w"]:
+def _weights(fraction: Float[Tensor, "3 k m"], smooth: bool, unit: int) -> Float[Tensor, "3 w"]:
     """Return the weight of the upper vertex by axis (the fraction, or its smoothstep), repeated within a unit."""
-    return _repeat(fraction * fraction * (3 - 2 * fraction) if level.smooth else fraction, unit)
+    return _repeat(fraction * fraction * (3 - 2 * fraction) if smooth else fraction, unit).flatten(1)
 
 
-def _repeat(values: Float[Tensor, "3 n"], unit: int) -> Float[Tensor, "3 w"]:
+def _repeat(values: Float[Tensor, "*shape m"], unit: int) -> Float[Tensor, "*shape w"]:
     return _as_floats(torch.complex(values, values)) if unit == 2 else values
 
 
@@ -153,52 +109,78 @@ def _spread(gradient: Float[Tensor, " w"], weights: Float[Tensor, "3 w"]) -> Flo
     return gradient
 
 
-def _chunks(points: Float[Tensor, "3 n"]) -> list[slice]:
-    count = points.shape[1]
-    return slices(count, CPU_CHUNK if points.device.type == "cpu" else max(count, 1))
+def _chunks(points: Float[Tensor, "3 n"], group: LevelGroup) -> list[slice]:
+    """Return the parts of the points whose temporaries stay in the cache of a CPU, or are a small part of a GPU's memory."""
+    size = CPU_CHUNK if points.device.type == "cpu" else max(1, GPU_CHUNK // len(group))
+    return slices(points.shape[1], size)
 
 
-def _encode_level(
+def _encode_group(
     points: Float[Tensor, "3 n"],
     table: Float[Tensor, "t f"],
-    level: _Level,
-    values: Float[Tensor, "c w"],
-    slopes: Float[Tensor, "c 3 w"] | None,
+    group: LevelGroup,
+    smooth: bool,
+    values: Float[Tensor, "k c w"],
+    slopes: Float[Tensor, "k c 3 w"] | None,
 ) -> None:
-    """Write the features of a level to ``values``, and their derivatives by position in cells to ``slopes``."""
-    unit = _unit(table.shape[1])
+    """Write the features of levels to ``values``, and their derivatives by position in cells to ``slopes``."""
+    unit, count = _unit(table.shape[1]), len(group)
     columns = _as_units(table, unit).unbind(1)
-    for chunk in _chunks(points):
+    for chunk in _chunks(points, group):
         wide = slice(chunk.start * unit, chunk.stop * unit)
-        terms, fraction = _vertices(points[:, chunk], level)
-        weights = _weights(fraction, level, unit)
-        index = _corner_indices(terms, level)
+        terms, fraction = group.vertices(points[:, chunk])
+        weights = _weights(fraction, smooth, unit)
+        index = group.corner_indices(terms)
         for k, column in enumerate(columns):
             corners = _as_floats(column.index_select(0, index)).view(2, 2, 2, -1)
             if slopes is None:
-                values[k, wide] = _interpolate(corners, weights)
+                values[:, k, wide] = _interpolate(corners, weights).view(count, -1)
             else:
-                values[k, wide], by_axis = _interpolate_with_slopes(corners, weights)
+                value, by_axis = _interpolate_with_slopes(corners, weights)
+                values[:, k, wide] = value.view(count, -1)
                 for axis, slope in enumerate(by_axis):
-                    slopes[k, axis, wide] = slope
-        if slopes is not None and level.smooth:
-            slopes[:, :, wide] *= _repeat(6 * fraction * (1 - fraction), unit)
+                    slopes[:, k, axis, wide] = slope.view(count, -1)
+        if slopes is not None and smooth:
+            slopes[:, :, :, wide] *= _repeat(6 * fraction * (1 - fraction), unit).movedim(1, 0)[:, None]
+
+
+def _add_position_gradient(
+    slopes: Float[Tensor, "k c 3 w"],
+    gradient: Float[Tensor, "k c w"],
+    group: LevelGroup,
+    total: Float[Tensor, "3 w"],
+) -> None:
+    """Add the gradient of levels' features, carried back to the points, to ``total``."""
+    if len(group) == 1:
+        for slope, row in zip(slopes[0], gradient[0], strict=True):
+            total.addcmul_(slope, row, value=group.levels[0].resolution)
+    else:
+        scaled = gradient * group.resolutions(gradient)[:, None, None]
+        total += (slopes * scaled[:, :, None]).sum((0, 1))
 
 
 def _add_table_gradient(
-    points: Float[Tensor, "3 n"], gradient: Float[Tensor, "c w"], level: _Level, table: Float[Tensor, "t f"]
+    points: Float[Tensor, "3 n"],
+    gradient: Float[Tensor, "k c w"],
+    group: LevelGroup,
+    smooth: bool,
+    table: Float[Tensor, "t f"],
 ) -> None:
-    """Add the gradient of a level's features, carried back to its entries, to ``table``."""
+    """Add the gradient of levels' features, carried back to their entries, to ``table``."""
     unit = _unit(table.shape[1])
-    for chunk in _chunks(points):
+    for chunk in _chunks(points, group):
         wide = slice(chunk.start * unit, chunk.stop * unit)
-        terms, fraction = _vertices(points[:, chunk], level)
-        weights = _weights(fraction, level, unit)
+        terms, fraction = group.vertices(points[:, chunk])
+        weights = _weights(fraction, smooth, unit)
         # scatter_add_ takes int64 only, and is still twice as fast as index_add_ with int32.
-        index = _corner_indices(terms, level).long()
-        for target, row in zip(_as_units(table, unit).unbind(1), gradient, strict=True):
-            corners = _spread(row[wide], weights).view(-1)
+        index = group.corner_indices(terms).long()
+        for k, target in enumerate(_as_units(table, unit).unbind(1)):
+            corners = _spread(gradient[:, k, wide].reshape(-1), weights).view(-1)
             target.scatter_add_(0, index, _as_units(corners, unit))
+
+
+def _laid_end_to_end(tables: Sequence[Float[Tensor, "_ f"]]) -> Float[Tensor, "t f"]:
+    return tables[0] if len(tables) == 1 else torch.cat(list(tables))
 
 
 class _Encode(torch.autograd.Function):
@@ -210,23 +192,28 @@ class _Encode(torch.autograd.Function):
     def forward(
         ctx: Any,
         points: Float[Tensor, "3 n"],
-        levels: tuple[_Level, ...],
+        levels: tuple[Level, ...],
         total: int,
+        smooth: bool,
         want_slopes: bool,
         *tables: Float[Tensor, "_ f"],
     ) -> Float[Tensor, "n width"]:
         count, features = points.shape[1], tables[0].shape[1]
         unit = _unit(features)
+        groups = one_by_one(levels) if points.device.type == "cpu" else together(levels)
         rows = points.new_empty(total, features // unit, count * unit)
         rows[len(levels) :] = 0
         slopes = [
-            points.new_empty(features // unit, 3, count * unit) if want_slopes else None for _ in levels
+            points.new_empty(len(group), features // unit, 3, count * unit) if want_slopes else None
+            for group in groups
         ]
-        parts = zip(tables, levels, rows[: len(levels)], slopes, strict=True)
-        tasks = [partial(_encode_level, points, *part) for part in parts]
-        concurrently(tasks, threads_for(points.shape[1], points.device))
+        tasks = [
+            partial(_encode_group, points, _laid_end_to_end(tables[group.span]), group, smooth, rows[group.span], slope)
+            for group, slope in zip(groups, slopes, strict=True)
+        ]  # fmt: skip
+        concurrently(tasks, threads_for(count, points.device))
         ctx.save_for_backward(points, *(slope for slope in slopes if slope is not None))
-        ctx.levels, ctx.features = levels, features
+        ctx.groups, ctx.features, ctx.smooth = groups, features, smooth
         encoded = rows.new_empty(count, total * features)
         _as_units(encoded, unit)[:] = _as_units(rows, unit).flatten(0, 1).t()
         return encoded
@@ -240,22 +227,22 @@ class _Encode(torch.autograd.Function):
         rows = rows.unflatten(0, (-1, ctx.features // unit))
         to_points: Tensor | None = None
         if ctx.needs_input_grad[0]:
-            to_points = torch.zeros_like(slopes[0][0])
-            for level, slope, part in zip(ctx.levels, slopes, rows, strict=False):
-                for k in range(len(part)):
-                    to_points.addcmul_(slope[k], part[k], value=level.resolution)
+            to_points = torch.zeros_like(slopes[0][0, 0])
+            for group, slope in zip(ctx.groups, slopes, strict=True):
+                _add_position_gradient(slope, rows[group.span], group, to_points)
             to_points = to_points.unflatten(1, (-1, unit)).sum(-1)
-        to_tables = [
-            points.new_zeros(level.entries, ctx.features) if needed else None
-            for level, needed in zip(ctx.levels, ctx.needs_input_grad[4:], strict=True)
-        ]
-        tasks = [
-            partial(_add_table_gradient, points, part, level, table)
-            for part, level, table in zip(rows[: len(to_tables)], ctx.levels, to_tables, strict=True)
-            if table is not None
-        ]
+        needed, tasks = ctx.needs_input_grad[5:], []
+        to_tables: list[Tensor | None] = []
+        for group in ctx.groups:
+            if not any(needed[group.span]):
+                to_tables += [None] * len(group)
+                continue
+            table = points.new_zeros(sum(group.entries), ctx.features)
+            tasks.append(partial(_add_table_gradient, points, rows[group.span], group, ctx.smooth, table))
+            to_tables += table.split(group.entries)
         concurrently(tasks, threads_for(points.shape[1], points.device))
-        return to_points, None, None, None, *to_tables
+        found = [part if wanted else None for part, wanted in zip(to_tables, needed, strict=True)]
+        return to_points, None, None, None, None, *found
 
 
 class HashEncoding(nn.Module):
@@ -269,7 +256,9 @@ class HashEncoding(nn.Module):
     def __init__(self, config: HashEncodingConfig) -> None:
         super().__init__()
         self.config = config
-        self.levels = _make_levels(config)
+        self.levels = make_levels(
+            config.levels, 2**config.log2_table_size, config.base_resolution, config.finest_resolution
+        )
         # One table per level: an inactive level has no gradient at all and so costs the optimizer nothing.
         self.tables = nn.ParameterList(
             nn.Parameter(torch.empty(level.entries, config.features).uniform_(-1e-4, 1e-4))
@@ -291,5 +280,6 @@ class HashEncoding(nn.Module):
         points = positions.to(self.tables[0].dtype).clamp(0, 1).t().contiguous()
         want_slopes = torch.is_grad_enabled() and points.requires_grad
         tables = list(self.tables)[: len(levels)]
-        encoded: Tensor = _Encode.apply(points, levels, self.config.levels, want_slopes, *tables)
+        smooth = self.config.interpolation == "smooth"
+        encoded: Tensor = _Encode.apply(points, levels, self.config.levels, smooth, want_slopes, *tables)
         return encoded

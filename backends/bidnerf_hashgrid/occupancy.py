@@ -57,7 +57,7 @@ class OccupancyGrid(nn.Module):
     @torch.no_grad()
     def restrict(self, allowed: Bool[Tensor, "n n n"]) -> None:
         """Mark all cells but ``allowed`` as empty."""
-        self.peak *= allowed
+        self.peak *= allowed.to(self.peak.device)
         self.prune(0.0)
 
     @torch.no_grad()

@@ -10,7 +10,7 @@ from torch import Generator
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import SceneBounds
+from bidnerf_core.field import SceneBounds, device_of
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import Rendering, render
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
@@ -69,7 +69,8 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
     if config.carve and report.resume() is None:
         for grid in (field.occupancy, field.coarse_sampler):
             grid.restrict(occupied_voxels(views, grid.grid))
-    supervision, pruned = Supervision(views, field.bounds, config), pruning(config, field.bounds)
+    supervision = Supervision(views, field.bounds, config, device_of(field))
+    pruned = pruning(config, field.bounds)
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
         {

@@ -11,6 +11,7 @@ from torch import Generator
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
+from bidnerf_core.field import device_of
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
 from bidnerf_core.settings import Count, Positive, Range
@@ -51,7 +52,7 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.carve:
         field.room.cells.copy_(occupied_voxels(views, field.room.grid))
-    supervision = Supervision(views, field.bounds, config)
+    supervision = Supervision(views, field.bounds, config, device_of(field))
     rays_per_step = _rays_per_step(field, supervision, config)
 
     def outcome(step: int, generator: Generator) -> StepOutcome:

@@ -8,8 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import torch
+
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
-from bidnerf_core.cli.common import Flag, MapFolder, UsageError, locked, option, parse, read_views, say
+from bidnerf_core.cli.common import (
+    Device,
+    Flag,
+    MapFolder,
+    UsageError,
+    locked,
+    option,
+    parse,
+    read_views,
+    say,
+)
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
@@ -24,6 +36,7 @@ from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
 from bidnerf_core.mapping.landmarks import HeldOutTrial
 from bidnerf_core.mapping.pose_scatter import update_scatter
+from bidnerf_core.moving import working_device
 from bidnerf_core.storage import (
     LandmarkSource,
     Map,
@@ -58,6 +71,7 @@ def _bake(
     rendered_landmarks: Annotated[
         Flag, option(None, "replace landmarks of photos by landmarks of rendered images", "")
     ] = False,
+    device: Device = "cpu",
     config: BakeConfig = BakeConfig(),
 ) -> None:
     """Find the surface and the landmarks of a map, and store them in the map.
@@ -69,26 +83,26 @@ def _bake(
     """
     if rendered_landmarks and data is not None:
         raise UsageError("--rendered-landmarks takes no photos, but --data gives some; expected one of them")
-    info, registration = load_info(map), depth_registration(register_depth)
+    info, registration, there = load_info(map), depth_registration(register_depth), working_device(device)
     with locked(map):
         views = list[View]()
         if data is not None:
             dataset = open_dataset(data, info.bounds.background, camera=camera, register_depth=registration)
             views = at_stored_poses(read_views(dataset, split), info.cameras)
-        bake_map(map, views, config, rendered_landmarks)
+        bake_map(map, views, config, rendered_landmarks, device=there)
 
 
 def bake_map(
     folder: Path, views: Sequence[View], config: BakeConfig, rendered_landmarks: bool = False,
-    tracked: TrackedViews | None = None,
+    tracked: TrackedViews | None = None, device: torch.device | str = "cpu",
 ) -> None:  # fmt: skip
     """Bake the surface and the landmarks of the map in ``folder``; ``tracked`` if the views' keypoints were tracked already.
 
     Views with measured depth take the place of rendered ones for the surface, and all ``views`` give landmarks. Without
     views, landmarks come from images that the field renders, unless the map has landmarks of photos, which are kept where
-    ``rendered_landmarks`` does not ask for others.
+    ``rendered_landmarks`` does not ask for others. Images are rendered on ``device``.
     """
-    stored = load_map(folder, baked=False)  # its parts may be damaged, and are to be replaced
+    stored = load_map(folder, device, baked=False)  # its parts may be damaged, and are to be replaced
     places = [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     cameras = cameras_of(stored.info) or places
     if not cameras:

@@ -67,6 +67,7 @@ def option(metavar: str | None, help: str, default: str | None = None) -> Any:
 MapFolder: TypeAlias = Annotated[
     Path, tyro.conf.Positional, option("MAP", "folder of a map, as 'bidnerf train' writes it")
 ]
+Device: TypeAlias = Annotated[str, option("NAME", "device on which the field computes: cpu, cuda ...")]
 DataFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, option("DATA", "folder of a dataset")]
 Flag: TypeAlias = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]

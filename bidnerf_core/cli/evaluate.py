@@ -15,6 +15,7 @@ import tyro
 
 from bidnerf_core.cli.common import (
     LARGEST_SEED,
+    Device,
     Names,
     UsageError,
     option,
@@ -94,7 +95,7 @@ def run(arguments: list[str]) -> None:
                 "none",
             ),
         ] = (),
-        device: Annotated[str, option("NAME", "device on which the map lies: cpu, cuda ...")] = "cpu",
+        device: Device = "cpu",
         workers: Annotated[
             int | None, option("N", "number of processes, of one thread each", "one a core; one on a GPU")
         ] = None,

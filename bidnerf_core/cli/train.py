@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
+
 from bidnerf_core.backend import Backend
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.cli.bake import bake_map
@@ -14,6 +16,7 @@ from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_
 from bidnerf_core.cli.common import (
     DEFAULT_BACKEND,
     DataFolder,
+    Device,
     Flag,
     UsageError,
     option,
@@ -35,6 +38,7 @@ from bidnerf_core.images import background_colour
 from bidnerf_core.map_cameras import as_given, at_stored_poses, stored_cameras
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.mapping.landmark_building import TrackedViews
+from bidnerf_core.moving import moved, working_device
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import MapInfo, build_field, load_info, load_state
@@ -113,6 +117,7 @@ def run(arguments: list[str]) -> None:
                 "refine the given poses by the keypoints that images share: always, never, or auto: if inconsistent",
             ),
         ] = "auto",
+        device: Device = "cpu",
         no_bake: Annotated[
             Flag, option(None, "leave the surface and the landmarks to 'bidnerf bake'", "")
         ] = False,
@@ -131,7 +136,7 @@ def run(arguments: list[str]) -> None:
         if background is not None:
             with wrong_usage():
                 background_colour(background)
-        registration = depth_registration(register_depth)
+        registration, there = depth_registration(register_depth), working_device(device)
         source = Source(data, split, background, depth_points, model_points, camera, registration)
         try:
             if resume:
@@ -139,10 +144,12 @@ def run(arguments: list[str]) -> None:
                 _check_unchanged(out, info, named, kind(), config)
                 _check_refinement(out, info, refine_poses)
                 with output_folder(out, overwrite=True):
-                    _resume(info, source, out, checkpoint_every, not no_bake)
+                    _resume(info, source, out, checkpoint_every, not no_bake, there)
             else:
                 with output_folder(out, overwrite):
-                    _start(chosen, name, source, out, config, checkpoint_every, not no_bake, refine_poses)
+                    _start(
+                        chosen, name, source, out, config, checkpoint_every, not no_bake, refine_poses, there
+                    )
         except TrainingStopped as stopped:
             say(f"{out}: saved after step {stopped.step}; the same with --resume goes on from there")
             raise KeyboardInterrupt from stopped
@@ -154,9 +161,9 @@ def run(arguments: list[str]) -> None:
 def train_map(
     backend: Backend, name: str, views: Sequence[View], config: Any, out: Path, data: str,
     background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS, baked: bool = True,
-    sparse_depth: int = 0, refinement: RefinementChoice = "auto",
+    sparse_depth: int = 0, refinement: RefinementChoice = "auto", device: torch.device | str = "cpu",
 ) -> None:  # fmt: skip
-    """Train a new map into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
+    """Train a new map on ``device`` into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
     taken = prepared(views, refinement)
     if not taken.distances:
         say(
@@ -168,7 +175,7 @@ def train_map(
         name, to_plain(config, "config"), bounds, 0, False, data, cameras=taken.cameras,
         pose_refinement=taken.refinement, distances=taken.distances, sparse_depth=sparse_depth,
     )  # fmt: skip
-    _run(backend, info, out, taken.views, taken.tracked, checkpoint_seconds, baked)
+    _run(backend, info, out, taken.views, taken.tracked, checkpoint_seconds, baked, device)
 
 
 def load_interrupted(out: Path, baking: bool) -> MapInfo:
@@ -225,7 +232,7 @@ def _check_refinement(out: Path, info: MapInfo, refinement: RefinementChoice) ->
 
 def _start(
     backend: Backend, name: str, source: Source, out: Path, config: Any, checkpoint_seconds: float, baked: bool,
-    refinement: RefinementChoice,
+    refinement: RefinementChoice, device: torch.device,
 ) -> None:  # fmt: skip
     dataset = source.dataset(source.background)
     views, sparse_depth = source.views(dataset)
@@ -233,12 +240,12 @@ def _start(
         say(f"{source.data}: no measured depth in split {source.split!r}; training on colour only")
     train_map(
         backend, name, views, config, out, source.data.resolve().name, dataset.background, checkpoint_seconds,
-        baked, sparse_depth, refinement,
+        baked, sparse_depth, refinement, device,
     )  # fmt: skip
 
 
 def _resume(
-    info: MapInfo, source: Source, out: Path, checkpoint_seconds: float, baked: bool
+    info: MapInfo, source: Source, out: Path, checkpoint_seconds: float, baked: bool, device: torch.device,
 ) -> None:  # fmt: skip
     data, split, background = source.data, source.split, source.background
     dataset = source.dataset(info.bounds.background if background is None else background)
@@ -258,17 +265,18 @@ def _resume(
     views = at_stored_poses(views, info.cameras)
     if info.complete:  # stopped between training and baking
         say(f"{out}: training is complete ({amount(info.step, 'step')}); baking its surface")
-        bake_map(out, views, BakeConfig())
+        bake_map(out, views, BakeConfig(), device=device)
         return
     tracked, views = located(views)  # the same as when the training began
-    _run(load_backend(info.backend, str(out)), info, out, views, tracked, checkpoint_seconds, baked)
+    _run(load_backend(info.backend, str(out)), info, out, views, tracked, checkpoint_seconds, baked, device)
 
 
 def _run(
     backend: Backend, info: MapInfo, out: Path, views: Sequence[View], tracked: TrackedViews | None,
-    checkpoint_seconds: float, baked: bool,
+    checkpoint_seconds: float, baked: bool, device: torch.device | str,
 ) -> None:  # fmt: skip
-    field, config = build_field(backend, info, str(out))
+    built, config = build_field(backend, info, str(out))
+    field = moved(built, device)
     state = load_state(out, info, field) if info.step else None
     if state is not None:
         say(f"{out}: going on from step {info.step}")
@@ -277,7 +285,7 @@ def _run(
         report.finish(field)
     if baked:
         try:
-            bake_map(out, views, BakeConfig(), tracked=tracked)
+            bake_map(out, views, BakeConfig(), tracked=tracked, device=device)
         except InputError as error:  # the map itself is sound
             say(f"{out}: no surface baked: {error}")
     say(f"{out}: map of {info.data}, {sum(f.stat().st_size for f in out.iterdir()) / 2**20:.1f} MiB")

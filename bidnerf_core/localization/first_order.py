@@ -34,7 +34,9 @@ def descended(
         problem.on_device(), objective, RayCounts(rays.rays, depth_rays), rays, reach, generator
     )
     history = History([start])
-    finite, reason = follow_gradient(loss, pivot(rays.pivot, problem), adam, history, device)
+    finite, reason = follow_gradient(
+        loss, pivot(rays.pivot, problem), adam, history, device, generator if loss.repeats else None
+    )
     T, mean = history.answer(adam.answer)
     verdict = descent_verdict(mean, adam.converged_loss, finite, reason)
     return Localization(

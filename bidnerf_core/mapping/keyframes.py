@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.field import RadianceField, SceneBounds, device_of
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.pixels import draw, uniform
 from bidnerf_core.rendering import render, render_image
@@ -39,6 +39,7 @@ def rendered_views(field: RadianceField, bounds: SceneBounds, cameras: Sequence[
 @torch.no_grad()
 def colour_noise(field: RadianceField, bounds: SceneBounds, views: Sequence[View]) -> float:
     """Return the root mean square difference between rendered and photographed colours, over pixels of all views."""
-    pixels = draw(views, max(NOISE_RAYS, len(views)), uniform, torch.Generator().manual_seed(0)).flattened()
+    count, generator = max(NOISE_RAYS, len(views)), torch.Generator().manual_seed(0)
+    pixels = draw(views, count, uniform, generator, device=device_of(field)).flattened()
     seen = render(field, bounds.rays(pixels.origins, pixels.directions), bounds.background)
     return float((seen.rgb - pixels.rgb).square().mean().sqrt())

@@ -99,12 +99,12 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
     )
     steps = AdamSteps(loss, pivot("scene", problem), AdamSettings(), start.to(device))
     with without_waiting():
-        steps(0)
+        steps()
         if mode is None:
-            steps(1)
+            steps()
         else:
             with mode.strict():
-                steps(1)
+                steps()
     return steps.T.to("cpu").matrix()
 
 

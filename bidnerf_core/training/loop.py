@@ -48,6 +48,8 @@ def fit(
 ) -> None:
     """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` of Adam.
 
+    The generator is one of the CPU wherever the field lies, so that a training draws the same everywhere.
+
     ``beside`` is what is learned with the field and not kept with it; its parameters are among the groups. Training resumes from ``report.resume()``, saves when ``report.due`` says so and, when ``report.stopping`` is set, saves
     and raises ``TrainingStopped``. A resumed run computes what an uninterrupted one would have. Raises ``InputError`` where
     the loss is not finite.
@@ -111,6 +113,7 @@ def _restore(
     for number, parameter in enumerate(_parameters(optimizer)):
         prefix = f"{number}."
         found = {k[len(prefix) :]: v.clone() for k, v in state.optimizer.items() if k.startswith(prefix)}
+        found = {name: value.to(parameter.device) for name, value in found.items()}
         if found:
             optimizer.state[parameter] = found
     return state.step

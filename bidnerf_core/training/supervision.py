@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
@@ -34,17 +35,19 @@ class SupervisionConfig(Settings):
 
 
 class Supervision:
-    """The rays of training views and their loss."""
+    """The rays of training views and their loss, on the device of the field that is trained."""
 
-    def __init__(self, views: Sequence[View], bounds: SceneBounds, config: SupervisionConfig) -> None:
+    def __init__(
+        self, views: Sequence[View], bounds: SceneBounds, config: SupervisionConfig, device: torch.device | str = "cpu"
+    ) -> None:  # fmt: skip
         self.config = config
-        self.bank = RayBank(views, bounds)
+        self.bank = RayBank(views, bounds, device)
         self.side = bounds.side
         learned = config.exposure and not self.bank.has_alpha
-        self.colours = ColourTransforms(len(views)) if learned else None
+        self.colours = ColourTransforms(len(views)).to(device) if learned else None
         kept = detail_kept(views) if config.sharpness else None
         # None where no image is blurred, so that nothing changes
-        self.image_weight = None if kept is None or bool((kept == 1).all()) else kept.float()
+        self.image_weight = None if kept is None or bool((kept == 1).all()) else kept.float().to(device)
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         return self.bank.draw(count, generator)

@@ -54,6 +54,11 @@ class SampledLoss:
         first, *others = (self._loss(scene, batch, T_world_last) for batch in self._batches)
         return sum(others, start=first)
 
+    @property
+    def repeats(self) -> bool:
+        """Whether each call computes the same, but for the random numbers; a blur fades from call to call."""
+        return self.reach.blur == 0
+
     def _field(self) -> RadianceField:
         """Return the level that is rendered, with the sampling and the blur of this step."""
         scene, reach = self.problem.level(self.rays.level), self.reach

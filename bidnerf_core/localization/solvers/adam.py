@@ -6,84 +6,122 @@ import math
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
+from jaxtyping import Float
+from torch import Generator, Tensor
 
+from bidnerf_core.constants import constant
 from bidnerf_core.localization.method_settings import AdamSettings
 from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.solvers.cuda_graph import WARM_UP, recorded
 from bidnerf_core.localization.solvers.history import WINDOW, History
 from bidnerf_core.se3 import SE3
 from bidnerf_core.waiting import without_waiting
 
 Loss = Callable[[SE3], Tensor]
 
+BETAS, EPSILON = (0.9, 0.999), 1e-8
+"""Decays of the moments, and what is added to the root of the second (Kingma and Ba 2015, Alg. 1)."""
+
 
 class AdamSteps:
     """Steps of one pose, on its own device: no step reads a number from it, or copies anything from or to it.
 
     Each step writes the pose as an update delta of the current one about ``pivot``, takes the gradient by delta at 0, and
-    moves by what Adam makes of it. A step that is not finite leaves the pose where it is.
+    moves by what Adam makes of it. A step that is not finite leaves the pose where it is. What a step changes lies in
+    tensors that it writes in place, so that a step recorded as a CUDA graph is the next one whenever it is replayed.
     """
 
     def __init__(self, loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3) -> None:
-        self.T, self._loss, self._config = start, loss, config
         device = start.translation.device
-        self._pivot = pivot.to(device)
-        self._delta = [torch.zeros(3, dtype=torch.float64, device=device).requires_grad_() for _ in range(2)]
-        self._rates = (config.learning_rate, config.learning_rate / pivot.reach)
-        groups = [{"params": [x], "lr": rate} for x, rate in zip(self._delta, self._rates, strict=True)]
-        self._optimizer = torch.optim.Adam(groups, betas=(0.9, 0.999))
+        self._loss, self._pivot, self._config = loss, pivot.to(device), config
+        turning = config.learning_rate / pivot.reach
+        self._rate = torch.tensor([config.learning_rate] * 3 + [turning] * 3, dtype=torch.float64).to(device)
+        self._T = SE3(start.rotation.clone(), start.translation.clone())
+        self._steps, self._updates, self._row = (
+            torch.zeros((), dtype=dtype, device=device) for dtype in (torch.float64, torch.float64, torch.long)
+        )  # fmt: skip
+        self._mean, self._square = (torch.zeros(6, dtype=torch.float64, device=device) for _ in range(2))
+        # Pose, loss before the step, and whether the step was finite.
+        self._log = torch.zeros(WINDOW, 14, dtype=torch.float64, device=device)
 
-    def __call__(self, step: int) -> tuple[Tensor, Tensor]:
-        """Take a step, and return the loss before it, and whether the pose after it is finite."""
-        rho, phi = self._delta
-        fade = self._config.decay ** (step / self._config.decay_steps)
-        for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
-            group["lr"] = rate * fade
-        value = self._loss(self._pivot.moved(self.T, torch.cat([rho, phi])))
+    @property
+    def T(self) -> SE3:
+        """The current pose."""
+        return SE3(self._T.rotation.clone(), self._T.translation.clone())
+
+    def __call__(self) -> None:
+        """Take a step."""
+        delta = torch.zeros_like(self._rate).requires_grad_()
+        value = self._loss(self._pivot.moved(self._T, delta))
+        update = torch.zeros_like(delta)
         if value.requires_grad:  # it does not where no ray meets anything
-            rho.grad, phi.grad = torch.autograd.grad(value, (rho, phi))
-            self._optimizer.step()
+            (gradient,) = torch.autograd.grad(value, delta)
+            update = self._update(gradient)
         with torch.no_grad():
-            moved = self._pivot.moved(self.T, torch.cat([rho, phi])).polished()
+            moved = self._pivot.moved(self._T, update).polished()
             finite = moved.rotation.isfinite().all() & moved.translation.isfinite().all()
-            self.T = SE3(
-                torch.where(finite, moved.rotation, self.T.rotation),
-                torch.where(finite, moved.translation, self.T.translation),
-            )
-            rho.zero_()
-            phi.zero_()
-        return value.detach(), finite
+            for now, then in ((self._T.rotation, moved.rotation), (self._T.translation, moved.translation)):
+                now.copy_(torch.where(finite, then, now))
+            pose = torch.cat([self._T.rotation.flatten(), self._T.translation])
+            row = torch.cat([pose, torch.stack([value.detach().to(pose), finite.to(pose)])])
+            self._log.index_copy_(0, self._row[None], row[None])
+            self._row.add_(1).remainder_(WINDOW)
+            self._steps += 1
+
+    def block(self) -> tuple[SE3, Float[Tensor, "s"], Float[Tensor, "s"]]:
+        """Return the poses after the last ``WINDOW`` steps, on the CPU, the loss before each, and whether each was finite.
+
+        It is for the end of each ``WINDOW`` steps; rows of steps that were not taken are those of earlier ones.
+        """
+        log = self._log.cpu()
+        self._row.zero_()
+        return SE3(log[:, :9].unflatten(1, (3, 3)), log[:, 9:12]), log[:, 12], log[:, 13]
+
+    @torch.no_grad()
+    def _update(self, gradient: Float[Tensor, "6"]) -> Float[Tensor, "6"]:
+        """Return the step of Adam (Kingma and Ba 2015, Alg. 1), whose learning rate decays with the number of steps."""
+        self._updates += 1
+        first, second = BETAS
+        self._mean.lerp_(gradient, 1 - first)
+        self._square.mul_(second).addcmul_(gradient, gradient, value=1 - second)
+        decays = constant(BETAS, self._updates)
+        bias, bias_of_square = (1 - decays**self._updates).unbind()
+        fade = constant((self._config.decay,), self._steps)[0] ** (self._steps / self._config.decay_steps)
+        root = self._square.sqrt() / bias_of_square.sqrt() + EPSILON
+        return -self._rate * fade / bias * (self._mean / root)
 
 
 def follow_gradient(
-    loss: Loss, pivot: Pivot, config: AdamSettings, history: History, device: torch.device
-) -> tuple[bool, str]:
+    loss: Loss, pivot: Pivot, config: AdamSettings, history: History, device: torch.device,
+    generator: Generator | None = None,
+) -> tuple[bool, str]:  # fmt: skip
     """Take steps from ``history.T``, record them, and return whether they stayed finite and why they ended.
 
     Steps are taken on ``device``, ``WINDOW`` at a time; the host reads them after each block. If a reason to stop arose
-    within a block, the steps after it are forgotten.
+    within a block, the steps after it are forgotten. With ``generator``, from which the loss draws and beside which it is
+    the same in each call, steps on a GPU are replayed as a CUDA graph.
     """
     steps = AdamSteps(loss, pivot, config, history.T.to(device))
+    take: Callable[[], None] = steps
     for first in range(0, config.max_steps, WINDOW):
-        poses, losses, finite = [], [], []
+        count = min(WINDOW, config.max_steps - first)
         with without_waiting():
-            for step in range(first, min(first + WINDOW, config.max_steps)):
-                value, sound = steps(step)
-                poses.append(steps.T)
-                losses.append(value)
-                finite.append(sound)
-        reason = _recorded(history, config, SE3.stack(poses).to("cpu"), losses, finite)
+            for step in range(count):
+                if generator is not None and first + step == WARM_UP:
+                    take = recorded(steps, device, generator)
+                take()
+        poses, losses, finite = steps.block()
+        reason = _recorded(history, config, poses[:count], losses[:count], finite[:count] > 0)
         if reason is not None:
             return reason
     return True, f"reached {config.max_steps} steps"
 
 
 def _recorded(
-    history: History, config: AdamSettings, poses: SE3, losses: list[Tensor], finite: list[Tensor]
+    history: History, config: AdamSettings, poses: SE3, losses: Tensor, finite: Tensor
 ) -> tuple[bool, str] | None:
     """Add a block of steps to the history, up to the first at which to stop; return whether all is finite, and why to stop."""
-    values, sound = torch.stack(losses).double().tolist(), torch.stack(finite).tolist()
-    for number, (value, is_finite) in enumerate(zip(values, sound, strict=True)):
+    for number, (value, is_finite) in enumerate(zip(losses.tolist(), finite.tolist(), strict=True)):
         step = len(history.losses) + 1
         if not math.isfinite(value):
             return False, f"the loss was {value} at step {step}"

@@ -10,6 +10,7 @@ from typing import Annotated
 from torch import Generator
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.field import device_of
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
 from bidnerf_core.settings import Count, NotNegative, Range
@@ -41,7 +42,7 @@ def train(field: NerfPytorchField, views: Sequence[View], config: NerfPytorchCon
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.checkpoint and report.resume() is None:
         _start_from(Path(config.checkpoint), field)
-    bank = RayBank(views, field.bounds)
+    bank = RayBank(views, field.bounds, device_of(field))
     side = max(field.bounds.size)
 
     def outcome(step: int, generator: Generator) -> StepOutcome:

@@ -9,7 +9,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_core.field import FieldValues, SceneBounds, device_of
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
 from bidnerf_core.sampling import Stratified
@@ -65,7 +65,7 @@ class TemplateBackend:
     def train(
         self, field: TemplateField, views: Sequence[View], config: TemplateConfig, report: Report
     ) -> None:
-        bank = RayBank(views, field.bounds)
+        bank = RayBank(views, field.bounds, device_of(field))
 
         def outcome(step: int, generator: Generator) -> StepOutcome:
             batch = bank.draw(config.rays_per_step, generator)

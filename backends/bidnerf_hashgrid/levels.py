@@ -1,0 +1,117 @@
+"""Levels of a hash encoding: their sizes, and where their tables hold the vertices around a point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.constants import constant
+from bidnerf_hashgrid.threads import slices
+
+# The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.
+PRIMES = (1, 2654435761 - 2**32, 805459861)
+MOST_ENTRIES = 2**31
+"""Entries of tables laid end to end that an int32 tells apart."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """A grid of vertices, whose features are in a table of ``entries``."""
+
+    resolution: int  # cells along a side
+    entries: int
+    strides: tuple[int, int, int]  # factor of each coordinate in a vertex's place
+    hashed: bool
+
+
+def make_levels(count: int, table_size: int, base: float, finest: float) -> tuple[Level, ...]:
+    """Return ``count`` levels with resolutions by eqs. 2 and 3; one whose vertices fit in the table is stored without a hash."""
+    growth = math.log(finest / base) / max(count - 1, 1)
+    levels = []
+    for index in range(count):
+        # The small addend keeps an exact product, such as N_max itself, from being rounded down.
+        resolution = math.floor(base * math.exp(growth * index) + 1e-6)
+        side = resolution + 1
+        hashed = side**3 > table_size
+        strides = PRIMES if hashed else (1, side, side**2)
+        levels.append(Level(resolution, table_size if hashed else side**3, strides, hashed))
+    return tuple(levels)
+
+
+@dataclass(frozen=True)
+class LevelGroup:
+    """Adjacent levels that are computed together, their tables laid end to end: all of them hashed, or none."""
+
+    levels: tuple[Level, ...]
+    first: int  # number of the first among all levels
+
+    def __len__(self) -> int:
+        return len(self.levels)
+
+    @property
+    def span(self) -> slice:
+        """The places of these levels among all."""
+        return slice(self.first, self.first + len(self))
+
+    @cached_property
+    def entries(self) -> list[int]:
+        return [level.entries for level in self.levels]
+
+    def resolutions(self, like: Tensor) -> Float[Tensor, "k"]:
+        return constant(tuple(level.resolution for level in self.levels), like)
+
+    def vertices(self, points: Float[Tensor, "3 m"]) -> tuple[Int[Tensor, "3 2 k m"], Float[Tensor, "3 k m"]]:
+        """Return the terms of the lower and upper vertex of each axis in a corner's index, and the position in the cell."""
+        scaled = points[:, None] * self.resolutions(points)[:, None]
+        lower = scaled.to(torch.int32).clamp_(min=0)
+        # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
+        last = constant(tuple(level.resolution - 1 for level in self.levels), lower)[:, None]
+        torch.minimum(lower, last, out=lower)
+        strides = constant(tuple(s for axis in zip(*self._strides, strict=True) for s in axis), lower)
+        terms = lower.new_empty(3, 2, *lower.shape[1:])
+        torch.mul(lower, strides.view(3, -1, 1), out=terms[:, 0])
+        torch.add(terms[:, 0], strides.view(3, -1, 1), out=terms[:, 1])
+        if self.levels[0].hashed:
+            terms.bitwise_and_(self.entries[0] - 1)
+        if (
+            len(self) > 1
+        ):  # where each table begins: above all bits of a hash, which the others leave as they are
+            terms[0] += constant(self._offsets, lower)[:, None]
+        return terms, scaled.sub_(lower)
+
+    def corner_indices(self, terms: Int[Tensor, "3 2 k m"]) -> Int[Tensor, " 8*k*m"]:
+        """Return the places of the eight corners (eq. 4, or the dense index), ordered (z, y, x, level, point)."""
+        combine = torch.bitwise_xor if self.levels[0].hashed else torch.add
+        x, y, z = terms.unbind()
+        return combine(combine(z[:, None], y)[:, :, None], x).view(-1)
+
+    @cached_property
+    def _strides(self) -> list[tuple[int, int, int]]:
+        return [level.strides for level in self.levels]
+
+    @cached_property
+    def _offsets(self) -> tuple[int, ...]:
+        return tuple(sum(self.entries[:k]) for k in range(len(self)))
+
+
+def one_by_one(levels: Sequence[Level]) -> list[LevelGroup]:
+    """Return each level as a group of its own: its table stays in the cache of a core."""
+    return [LevelGroup((level,), number) for number, level in enumerate(levels)]
+
+
+def together(levels: Sequence[Level]) -> list[LevelGroup]:
+    """Return as few groups as possible: on a GPU, each operation takes a launch, however few points it has."""
+    groups = []
+    dense = sum(not level.hashed for level in levels)  # the coarse ones, which come first
+    for first, kind in ((0, levels[:dense]), (dense, levels[dense:])):
+        most = MOST_ENTRIES // max((level.entries for level in kind), default=1)
+        groups += [
+            LevelGroup(tuple(kind[part]), first + part.start) for part in slices(len(kind), max(1, most))
+        ]
+    return groups
