@@ -96,7 +96,7 @@ class Resampled:
 OfRays = TypeVar("OfRays", Rays, RaySamples)
 
 
-def _rows(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
+def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
     """Return the rays, or the samples of the rays, with these numbers."""
     leading = (of.near if isinstance(of, Rays) else of.starts[..., 0]).dim()
     parts = (getattr(of, field.name) for field in fields(of))
@@ -166,7 +166,7 @@ class Concentrated:
         if not may_wait(few.device):
             return _either(few, kept, self._concentrated(rays, rough, jitter))
         many = (~few).reshape(-1).nonzero()[:, 0]
-        found = self._concentrated(_rows(rays, many), _rows(rough, many), jitter)
+        found = self._concentrated(rows_of(rays, many), rows_of(rough, many), jitter)
         merged = (
             old.reshape(-1, self.count).index_copy(0, many, new).reshape(old.shape)
             for old, new in zip(_parts(kept), _parts(found), strict=True)

@@ -69,6 +69,14 @@ class SE3:
         """Rotate directions, which the translation does not affect."""
         return _matvec(self.rotation, vectors)
 
+    def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
+        """Return ``retract`` to first order in ``tangent``: at 0 it has the same value and derivative, of few operations.
+
+        Elsewhere it is not rigid.
+        """
+        rho, phi = tangent[..., :3], tangent[..., 3:]
+        return SE3(self.rotation + self.rotation @ skew(phi), self.translation + _matvec(self.rotation, rho))
+
     def retract(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
         """Return the right update ``self @ exp(tangent)``."""
         return self @ SE3.exp(tangent)

@@ -17,11 +17,12 @@ from bidnerf_core import Localizer
 from bidnerf_core.backend import quick_config
 from bidnerf_core.cli import main
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_core.field import FieldValues, SceneBounds, device_of, levels
 from bidnerf_core.localization import settings_of
 from bidnerf_core.localization.solvers import adam
 from bidnerf_core.localization.solvers.cuda_graph import recorded
 from bidnerf_core.registry import load_backend
+from bidnerf_core.rendering import render_image
 from bidnerf_core.storage import load_map
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views
 from bidnerf_core.training import Progress, Silent
@@ -120,3 +121,13 @@ def test_a_training_goes_on_elsewhere(tmp_path: Path) -> None:
     weights = [dict(part.field.state_dict()) for part in maps]  # type: ignore[attr-defined]
     assert all(value.device.type == "cpu" for value in weights[1].values())
     assert main(["bake", str(there), "--device", "cuda", "--rendered-landmarks"]) == 0
+
+
+def test_levels_lie_where_their_field_does() -> None:
+    backend = load_backend("hashgrid")
+    field: Any = backend.build(backend.config_type(), BOUNDS)
+    view = rgbd_views()[0]
+    there = field.to("cuda")
+    for level in levels(there):
+        assert device_of(level).type == "cuda"
+        assert render_image(level, view.frame.intrinsics, view.T_ref_camera, BOUNDS).rgb.device.type == "cpu"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from bidnerf_core.localization.costs import linearization
 from bidnerf_core.localization.costs.linearization import linearize
 from rendered_rays import BOUNDS, FIELD, MISS, OBJECTIVE, OBSERVED, PIVOTS, POSES, held, seen
 
@@ -49,3 +50,11 @@ def test_rays_that_miss_everything_have_no_derivative() -> None:
     torch.testing.assert_close(found.residuals[..., :3], (background - OBSERVED.rgb).expand(3, 40, 3))
     missed = torch.where(OBSERVED.measured, MISS, 0.0).double()
     torch.testing.assert_close(found.residuals[..., 3], missed.expand(3, 40))
+
+
+def test_all_channels_in_one_pass_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = seen(POSES, PIVOTS["scene"], least_weight=1e-3)
+    monkeypatch.setattr(linearization, "_all_at_once", lambda *_: True)
+    found = seen(POSES, PIVOTS["scene"], least_weight=1e-3)
+    torch.testing.assert_close(found.jacobian, expected.jacobian)
+    torch.testing.assert_close(found.steepness, expected.steepness)

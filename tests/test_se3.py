@@ -152,3 +152,12 @@ def test_is_rigid_refuses(spoil: str) -> None:
     }
     assert not bool(SE3(T.rotation * change[spoil].double(), T.translation).is_rigid())
     assert not bool(SE3(T.rotation, torch.tensor([0.0, math.inf, 0.0], dtype=torch.float64)).is_rigid())
+
+
+def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one() -> None:
+    T = SE3.exp(torch.tensor([0.3, -1.0, 2.0, 0.4, -0.7, 0.2], dtype=torch.float64))
+    zero = torch.zeros(6, dtype=torch.float64)
+    parts = (lambda x: T.retract(x).matrix(), lambda x: T.retract_linearly(x).matrix())
+    torch.testing.assert_close(parts[1](zero), parts[0](zero))
+    exact, linear = (torch.autograd.functional.jacobian(part, zero) for part in parts)
+    torch.testing.assert_close(linear, exact)

@@ -45,6 +45,12 @@ class Pivot:
             return SE3.exp(delta) @ T  # a left update (iNeRF, section 3.1)
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
 
+    def moved_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
+        """Return ``moved`` to first order in ``delta``: at 0 it has the same value and derivative, of few operations."""
+        if self.T_camera_pivot is None:
+            return SE3.identity(device=delta.device).retract_linearly(delta) @ T
+        return (T @ self.T_camera_pivot).retract_linearly(delta) @ self.T_camera_pivot.inverse()
+
     def at(self, T: SE3) -> SE3:
         """Return T_world_pivot, of which ``moved`` is a right update, for poses with any leading axes."""
         return T @ (T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot)

@@ -1,7 +1,7 @@
 """Residuals of rendered rays and their Jacobian by the pose: one backward pass a channel, for any differentiable field.
 
 Rays are independent of each other, so the derivative of a channel's sum over all rays by their origins and directions holds
-every ray's own. Four passes give the whole Jacobian of an RGB-D objective.
+every ray's own. Four passes give the whole Jacobian of an RGB-D objective; on a GPU, one pass over four copies of the rays.
 """
 
 from __future__ import annotations
@@ -16,8 +16,12 @@ from bidnerf_core.field import RadianceField, Rays, RaySamples
 from bidnerf_core.observations import Observations
 from bidnerf_core.rendering import Rendering, render_samples
 from bidnerf_core.residuals import Residual
+from bidnerf_core.sampling import rows_of
 from bidnerf_core.se3 import SE3
 from bidnerf_core.waiting import may_wait
+
+MOST_AT_ONCE = 2**20
+"""Number of samples, copies included, up to which all channels are differentiated in one pass."""
 
 BackgroundColour = tuple[float, float, float]
 
@@ -92,18 +96,35 @@ def _ray_gradients(
         samples = replace(samples, valid=kept)
     if len(busy) == 0 or not channels:
         return results[0], results[1]
-    leaves = [part[busy].detach().requires_grad_() for part in (rays.origins, rays.directions)]
-    few = Rays(leaves[0], leaves[1], rays.near[busy], rays.far[busy])
-    rendering: Rendering = render_samples(field, few, samples, background)
-    found = residual(rendering, observed[busy])
-    for channel in channels:
+    copies = len(channels) if _all_at_once(samples, len(channels)) else 1
+    if copies > 1:
+        samples = rows_of(samples, torch.arange(len(busy), device=busy.device).repeat(copies))
+    few, seen = rows_of(rays, busy.repeat(copies)), observed[busy.repeat(copies)]
+    leaves = [part.detach().requires_grad_() for part in (few.origins, few.directions)]
+    moving = replace(few, origins=leaves[0], directions=leaves[1])
+    rendering: Rendering = render_samples(field, moving, samples, background)
+    found = residual(rendering, seen).unflatten(0, (copies, -1))
+    # Each pass is of one channel of each copy of the rays.
+    passes = [channels] if copies > 1 else [(channel,) for channel in channels]
+    for wanted in passes:
+        total = sum((found[copy, :, c].sum() for copy, c in enumerate(wanted)), start=found.new_zeros(()))
         gradients = torch.autograd.grad(
-            found[:, channel].sum(), leaves, retain_graph=channel != channels[-1], allow_unused=True
+            total, leaves, retain_graph=wanted is not passes[-1], allow_unused=True
         )
         for result, gradient in zip(results, gradients, strict=True):
-            if gradient is not None:
-                result[busy, channel] = gradient
+            for channel, part in zip(
+                wanted, () if gradient is None else gradient.chunk(copies), strict=False
+            ):
+                result[busy, channel] = part
     return results[0], results[1]
+
+
+def _all_at_once(samples: RaySamples, channels: int) -> bool:
+    """Return whether to differentiate all channels in one pass, over as many copies of the rays.
+
+    A CPU would have more to compute. On a GPU, passes over a few thousand samples take the time to launch them.
+    """
+    return samples.valid.device.type != "cpu" and channels * samples.valid.numel() <= MOST_AT_ONCE
 
 
 def _gathered(samples: RaySamples, kept: Bool[Tensor, "r s"], rays: Tensor) -> RaySamples:

@@ -52,7 +52,7 @@ class AdamSteps:
     def __call__(self) -> None:
         """Take a step."""
         delta = torch.zeros_like(self._rate).requires_grad_()
-        value = self._loss(self._pivot.moved(self._T, delta))
+        value = self._loss(self._pivot.moved_linearly(self._T, delta))
         update = torch.zeros_like(delta)
         if value.requires_grad:  # it does not where no ray meets anything
             (gradient,) = torch.autograd.grad(value, delta)

@@ -8,12 +8,17 @@ a graph of them takes the device's time only. What may be recorded is what runs 
 from __future__ import annotations
 
 from collections.abc import Callable
+from threading import Lock
 
 import torch
 from torch import Generator
 
 WARM_UP = 3
 """Steps to take before one is recorded: caches are filled and kernels loaded in these, which a recording does not allow."""
+
+
+_recording = Lock()
+"""One recording at a time: it begins with waiting for all that the device does, which another recording forbids."""
 
 
 def recorded(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
@@ -23,16 +28,14 @@ def recorded(step: Callable[[], None], device: torch.device, generator: Generato
     """
     if device.type != "cuda":
         return step
-    graph = torch.cuda.CUDAGraph()
+    graph, before = torch.cuda.CUDAGraph(), generator.clone_state()
     graph.register_generator_state(generator)
-    with torch.cuda.device(device):
-        torch.cuda.synchronize()
-        state = generator.get_state()
+    with _recording, torch.cuda.device(device):
         try:
-            with torch.cuda.graph(graph):
+            # Other threads may go on launching.
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 step()
         except RuntimeError:  # it waits for the device somewhere, as a third party's field may
-            torch.cuda.synchronize()
-            generator.set_state(state)
+            generator.graphsafe_set_state(before)  # the other one expects to be recorded still
             return step
     return graph.replay
