@@ -14,13 +14,17 @@ from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import AutoConfig, Localization
 from bidnerf_core.localization.by_colour import without_the_imprecise
+from bidnerf_core.localization.colour_calibration import without_the_miscalibrated
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.result import Outcome
+from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap, bake
+from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.se3 import SE3
+from landmark_scene import Points, ring
 from problems import FieldMap, localize
 
 BOUNDS = replace(baked.BOUNDS, lower=(-1.2, -1.2, -1.2), upper=(1.2, 1.2, 1.2))
@@ -94,16 +98,33 @@ def test_a_map_without_surface_needs_a_start() -> None:
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(("typical", "kept"), [(0.0, True), (0.02, True), (0.003, False)])
-def test_an_answer_far_less_certain_than_those_of_the_map_is_rejected(typical: float, kept: bool) -> None:
-    answer = Localization(
+def accepted() -> Localization:
+    return Localization(
         T_world_camera=SE3.identity(), outcome=Outcome.CONVERGED, reason="well", steps=0, seconds=0.0, loss=0.0,
         method="auto", poses=SE3.identity()[None], losses=torch.zeros(0, dtype=torch.float64),
         covariance=0.05**2 * torch.eye(6, dtype=torch.float64),
     )  # fmt: skip
-    found = without_the_imprecise(answer, typical)
+
+
+@pytest.mark.parametrize(("typical", "kept"), [(0.0, True), (0.02, True), (0.003, False)])
+def test_an_answer_far_less_certain_than_those_of_the_map_is_rejected(typical: float, kept: bool) -> None:
+    found = without_the_imprecise(accepted(), typical)
     assert found.converged == kept
     if not kept:
         assert found.outcome is Outcome.IMPRECISE
         assert "0.05" in found.reason
         assert "0.003" in found.reason
+
+
+@pytest.mark.parametrize(("factor", "kept"), [(1.0, True), (1.05, False), (0.96, False), (1.5, True)])
+def test_a_pose_by_colour_with_intrinsics_near_the_maps_own_is_rejected(factor: float, kept: bool) -> None:
+    """Other intrinsics, as another camera has them, are taken at their word."""
+    points, camera = Points(), baked.CAMERA
+    cameras = (replace(camera, fx=factor * camera.fx, fy=factor * camera.fy),)
+    matcher = LandmarkMatcher(replace(build_landmarks(ring(points), points), cameras=cameras))
+    query = replace(problem(photograph(UNSEEN[0])), matcher=matcher)
+    found = without_the_miscalibrated(accepted(), query)
+    assert found.converged == kept
+    if not kept:
+        assert found.outcome is Outcome.MISCALIBRATED
+        assert "intrinsics" in found.reason

@@ -40,6 +40,7 @@ from bidnerf_core.localization.by_landmarks import (
     is_sharp,
     localization_by_landmarks,
 )
+from bidnerf_core.localization.colour_calibration import without_the_miscalibrated
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
@@ -131,7 +132,7 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     else:
         found = _by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
-        found = without_the_imprecise(found, typical)
+        found = without_the_miscalibrated(without_the_imprecise(found, typical), problem)
     if matcher is None:
         return found
     found = _compared_with_landmarks(found, problem, matcher, config, seed, began)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.localization.by_landmarks import is_sharp
+from bidnerf_core.localization.colour_calibration import may_be_miscalibrated
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.costs.images import ColourScales, ImageCost, render_view, uniform_cost
 from bidnerf_core.localization.costs.thumbnails import thumbnail
@@ -24,7 +25,6 @@ from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.localization.solvers.levenberg_marquardt import Descent, descend
 from bidnerf_core.moving import moved
 from bidnerf_core.se3 import SE3
@@ -57,7 +57,7 @@ def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: i
     """Return a doubtful pose refined and judged anew if the images are blurrier than what the field renders from there.
 
     Poses are returned as they are where depth was measured, part of an image is hidden, the intrinsics were corrected or differ
-    from those of the map's images, the field is itself not sharp, or the map has no surface. ``rays`` and ``seed`` are those of ``mirror_rejection``, which judges poses that
+    a little from those of the map's images, the field is itself not sharp, or the map has no surface. ``rays`` and ``seed`` are those of ``mirror_rejection``, which judges poses that
     are accepted here only.
     """
     if not _is_eligible(problem, found):
@@ -108,14 +108,7 @@ def _is_eligible(problem: Problem, found: Localization) -> bool:
     if problem.has_depth or hidden or unsuited_map or found.intrinsics is not None:
         return False
     doubtful = (found.confidence or 0.0) < TRUSTED and found.outcome not in UNSUITABLE
-    return doubtful and not _may_be_miscalibrated(problem)
-
-
-def _may_be_miscalibrated(problem: Problem) -> bool:
-    """Whether the intrinsics given are others than the map's: a blurred image hardly tells which of them are right."""
-    cameras = () if problem.matcher is None else problem.matcher.landmarks.cameras
-    known = [map_camera(view.frame.intrinsics, cameras) for view in problem.views]
-    return any(camera is not None and bool(camera.differs.any()) for camera in known)
+    return doubtful and not may_be_miscalibrated(problem)
 
 
 def _cost(problem: Problem, about: Pivot) -> ImageCost:

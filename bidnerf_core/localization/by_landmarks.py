@@ -51,7 +51,7 @@ POINTS = 2000
 """Largest number of measured points that are fused."""
 FUSION_STEPS = 2
 """Number of second-order steps on the sum of all terms."""
-THOROUGHLY = 2
+THOROUGHLY = 4
 """How many times as many rays and steps poses get that landmarks leave doubtful; rendering has the square of it as weight.
 
 Both were chosen together on tuning frames.

@@ -15,7 +15,7 @@ from importlib.resources import files
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
 from bidnerf_core.localization.result import Outcome, Verdict
 
-ACCEPTED = 0.6
+ACCEPTED = 0.8
 """Least confidence with which a pose is accepted."""
 TRUSTED = 0.95
 """Confidence from which on a pose by landmarks needs no further measurements to be trusted."""

@@ -1,0 +1,32 @@
+"""Intrinsics near those of the map's images, and poses by colour alone, which hardly tell which of the two are right.
+
+A camera with a slightly longer focal length a little further away takes nearly the same image. Landmarks can tell; without
+them, an accepted pose would be wrong by the difference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, MapCamera, map_camera
+
+
+def may_be_miscalibrated(problem: Problem) -> bool:
+    """Whether the intrinsics given are others than the map's, but so near them that they may be a mistake."""
+    cameras = () if problem.matcher is None else problem.matcher.landmarks.cameras
+    known = [map_camera(view.frame.intrinsics, cameras) for view in problem.views]
+    return any(_differs_a_little(camera) for camera in known if camera is not None)
+
+
+def _differs_a_little(camera: MapCamera) -> bool:
+    return bool(camera.differs.any()) and camera.is_near(OTHER_CAMERA)
+
+
+def without_the_miscalibrated(found: Localization, problem: Problem) -> Localization:
+    """Reject an accepted pose by colour alone where ``may_be_miscalibrated``."""
+    if not found.converged or not may_be_miscalibrated(problem):
+        return found
+    why = "the intrinsics given are near those of the map's images, and without landmarks nothing tells which are right"
+    return replace(found, outcome=Outcome.MISCALIBRATED, reason=f"{why}; {found.reason}")
