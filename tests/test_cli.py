@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 LOCALIZE_KEYS = {
     "frame", "T_world_camera", "converged", "outcome", "reason", "steps", "seconds", "covariance", "loss", "backend",
-    "method", "focal_factor", "confidence", "error",
+    "method", "focal_factor", "intrinsics", "confidence", "error",
 }  # fmt: skip
 QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64"]
 Edit = Callable[[Path], None]

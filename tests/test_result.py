@@ -15,6 +15,7 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.localization import Localization, Outcome, pose_from_matrix
 from bidnerf_core.localization.result import Verdict
 from bidnerf_core.se3 import SE3
+from bidnerf_core.serialization import from_plain
 
 T = SE3.exp(torch.tensor([0.1, -2.0, 3.0, 0.4, -0.5, 0.6], dtype=torch.float64))
 FOUND = Localization(
@@ -33,6 +34,7 @@ KEYS = [
     "loss",
     "method",
     "focal_factor",
+    "intrinsics",
     "confidence",
 ]
 
@@ -84,3 +86,6 @@ def test_a_frame_is_as_taken_with_the_intrinsics_of_the_answer() -> None:
     taken = replace(FOUND, intrinsics=corrected).frame_as_taken(frame)
     assert taken.intrinsics == corrected
     assert taken.rgb is frame.rgb
+    assert FOUND.plain()["intrinsics"] is None
+    stored = replace(FOUND, intrinsics=corrected).plain()["intrinsics"]
+    assert from_plain(Intrinsics, json.loads(json.dumps(stored)), "") == corrected

@@ -118,7 +118,7 @@ class Answers:
         failure = {
             "frame": name, "T_world_camera": None, "converged": False, "outcome": "bad input", "reason": str(error),
             "steps": 0, "seconds": 0.0, "covariance": None, "loss": None, "method": method, "focal_factor": 1.0,
-            "confidence": None, "backend": self._stored.info.backend, "error": None,
+            "intrinsics": None, "confidence": None, "backend": self._stored.info.backend, "error": None,
         }  # fmt: skip
         self._objects.append(failure)
         if self._spec.json:

@@ -15,6 +15,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.files import write_file
 from bidnerf_core.frames import Frame
 from bidnerf_core.se3 import SE3
+from bidnerf_core.serialization import to_plain
 
 
 class Outcome(StrEnum):
@@ -105,6 +106,7 @@ class Localization:
             "loss": self.loss if self.loss == self.loss and abs(self.loss) != float("inf") else None,
             "method": self.method,
             "focal_factor": self.focal_factor,
+            "intrinsics": None if self.intrinsics is None else to_plain(self.intrinsics),
             "confidence": self.confidence,
         }
 
