@@ -6,9 +6,8 @@ import io
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,8 @@ from bidnerf_core import InputError, Tracker, View
 from bidnerf_core.cli.following import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.datasets.trajectories import read_trajectory
+from bidnerf_core.map_cameras import StoredCamera, stored_cameras
+from bidnerf_core.storage import MapInfo
 from commands import Run
 from flights import covered, flight
 from textured_field import CAMERA, MapWithLandmarks, textured_map
@@ -31,9 +32,11 @@ FRAMES = 6
 class StoredGround(MapWithLandmarks):
     """The textured ground with the description that stored maps have."""
 
+    cameras: tuple[StoredCamera, ...] = ()
+
     @property
-    def info(self) -> Any:
-        return SimpleNamespace(backend="ground", weights="ground")
+    def info(self) -> MapInfo:
+        return MapInfo("ground", {}, self.bounds, 1, True, "data", weights="ground", cameras=self.cameras)
 
 
 @pytest.fixture(autouse=True)
@@ -64,6 +67,22 @@ def test_accepted_poses_are_written_as_a_trajectory(bidnerf: Run, data: Path, tm
         assert word in out
     assert "5 (83.3%)" in out
     assert "tracking again after 1 frame" in err
+
+
+def test_frames_that_trained_the_map_are_counted(
+    bidnerf: Run, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = open_dataset(data).views("test")
+    known = textured_map(surface=True)
+    elsewhere = stored_cameras([replace(views[2], T_ref_camera=views[1].T_ref_camera)])
+    ground = StoredGround(
+        known.field, known.bounds, known.landmarks, known.surface,
+        cameras=(*stored_cameras(views[:2]), *elsewhere),  # the third has the name of a frame, but another pose
+    )  # fmt: skip
+    track = ("track", "MAP", data, "--out", tmp_path / "path.txt")
+    assert "training" not in bidnerf(*track).out
+    monkeypatch.setattr(track_module, "load_map", lambda folder: ground)
+    assert "2 frames; errors of frames that trained the map are no test" in bidnerf(*track).out
 
 
 def test_json_holds_all_frames(bidnerf: Run, data: Path, tmp_path: Path) -> None:

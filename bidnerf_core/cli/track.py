@@ -110,7 +110,7 @@ def run(arguments: list[str]) -> None:
             given = replace(given, sensor=given_sensor(sequence, registration))
         begin, settings = None if start is None else read_pose(start), AutoConfig(depth_sensor=depth_sensor)
         stored = load_map(map)
-        path = TrackedPath(stored.info.backend)
+        path = TrackedPath(stored.info)
         tracker = Tracker(Localizer(stored, config=settings), config, begin)
         drawn = nullcontext() if video is None else TrackingVideo(video, stored)
         began = clocks.perf_counter()

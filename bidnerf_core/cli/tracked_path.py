@@ -21,9 +21,13 @@ from bidnerf_core.evaluation.trials import plain_localization
 from bidnerf_core.files import write_file
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import Localization
+from bidnerf_core.map_cameras import as_given
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
+from bidnerf_core.storage import MapInfo
 
+SAME_PLACE = 1e-4
+"""Difference of two poses' matrices (metres) that rounding in files may make."""
 BOUND = 12.59
 """The 95 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 
@@ -40,9 +44,10 @@ class TrackedFrame:
 class TrackedPath:
     """The frames tracked so far. Their images are not kept."""
 
-    def __init__(self, backend: str) -> None:
+    def __init__(self, map: MapInfo) -> None:
         self.frames: list[TrackedFrame] = []
-        self._backend = backend
+        self._backend = map.backend
+        self._trained_on = {camera.name: camera.pose for camera in as_given(map.cameras)}
 
     def add(self, frame: Frame, time: float | None, found: Localization, truth: SE3 | None = None) -> None:
         intrinsics = found.frame_as_taken(frame).intrinsics
@@ -110,7 +115,19 @@ class TrackedPath:
         table.add_row("lost", f"{len(lost)} times, longest {longest} frames" if lost else "never")
         for name, text in self._error_rows():
             table.add_row(name, text)
+        if seen := sum(map(self._is_of_training, self.frames)):
+            table.add_row(
+                "of the training",
+                f"{amount(seen, 'frame')}; errors of frames that trained the map are no test",
+            )
         return table
+
+    def _is_of_training(self, frame: TrackedFrame) -> bool:
+        """Whether the map was trained on an image of this name, taken from the same place."""
+        given = self._trained_on.get(frame.posed.name)
+        if given is None or frame.truth is None:
+            return False
+        return torch.allclose(given.matrix(), frame.truth.matrix(), rtol=0, atol=SAME_PLACE)
 
     def _error_rows(self) -> list[tuple[str, str]]:
         errors = self.errors()
