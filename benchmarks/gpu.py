@@ -51,7 +51,7 @@ from bidnerf_core.localization.method_settings import (
 from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.solvers.adam import AdamSteps
-from bidnerf_core.localization.solvers.cuda_graph import recorded
+from bidnerf_core.localization.solvers.cuda_graph import captured
 from bidnerf_core.waiting import without_waiting
 
 TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
@@ -105,14 +105,14 @@ def timed_steps(steps: AdamSteps, device: torch.device, generator: torch.Generat
             torch.cuda.set_sync_debug_mode("default")
         found = operations(steps)
         began = time.perf_counter()
-        replay = recorded(steps, device, generator)
-        recording = time.perf_counter() - began
+        replay = captured(steps, device, generator)
+        capturing = time.perf_counter() - began
         timed(replay, WARM_UP)
         graph = timed(replay, TIMED)
     return {
         "graph_ms": graph[0],
         "graph_ms_most": graph[1],
-        "recording_ms": 1000 * recording,
+        "capture_ms": 1000 * capturing,
         "launched_ms": launched[0],
         "launched_ms_most": launched[1],
         "is_graph": replay is not steps,

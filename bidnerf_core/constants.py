@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
+_notes: list[list[Tensor]] = []
+
 
 def constant(values: tuple[float, ...], like: Tensor) -> Shaped[Tensor, "n"]:
     """Return ``values`` in the type and on the device of ``like``. Do not write into the result: it is shared."""
-    return _constant(values, like.dtype, like.device)
+    found = _constant(values, like.dtype, like.device)
+    for notes in _notes:
+        notes.append(found)
+    return found
+
+
+@contextmanager
+def noted() -> Iterator[list[Tensor]]:
+    """Note all constants that are asked for meanwhile, in any thread: who keeps the notes keeps the constants."""
+    notes: list[Tensor] = []
+    _notes.append(notes)
+    try:
+        yield notes
+    finally:
+        _notes.remove(notes)
 
 
 @lru_cache(maxsize=256)

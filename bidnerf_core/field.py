@@ -6,7 +6,7 @@ Directions are always unit, so distance along the ray is the only length.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -77,12 +77,14 @@ def levels(field: RadianceField) -> tuple[RadianceField, ...]:
 
 
 def device_of(field: RadianceField) -> torch.device:
-    """Return the device of a field's parameters or buffers, or of the first field that it wraps; else the CPU."""
+    """Return the device of a field's parameters or buffers, or of the first field in a dataclass that wraps one; else the CPU."""
     for kind in ("parameters", "buffers"):
         first = next(iter(getattr(field, kind, tuple)()), None)
         if isinstance(first, torch.Tensor):
             return first.device
-    wrapped: list[object] = list(vars(field).values()) if is_dataclass(field) else []
+    wrapped: list[object] = (
+        [getattr(field, part.name) for part in fields(field)] if is_dataclass(field) else []
+    )
     inner = next((part for part in wrapped if isinstance(part, RadianceField)), None)
     return torch.device("cpu") if inner is None else device_of(inner)
 

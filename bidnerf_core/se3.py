@@ -70,10 +70,7 @@ class SE3:
         return _matvec(self.rotation, vectors)
 
     def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
-        """Return ``retract`` to first order in ``tangent``: at 0 it has the same value and derivative, of few operations.
-
-        Elsewhere it is not rigid.
-        """
+        """Return ``retract`` to first order in ``tangent``: cheaper, with the same value and derivative at 0; not rigid elsewhere."""
         rho, phi = tangent[..., :3], tangent[..., 3:]
         return SE3(self.rotation + self.rotation @ skew(phi), self.translation + _matvec(self.rotation, rho))
 

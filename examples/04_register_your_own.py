@@ -17,7 +17,7 @@ import torch
 from bidnerf_core import Intrinsics, Localizer, Map, list_backends, load_backend
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import FieldValues
+from bidnerf_core.field import FieldValues, device_of
 from bidnerf_core.localization import settings_of
 from bidnerf_core.rendering import render
 from bidnerf_core.sampling import Stratified
@@ -56,7 +56,7 @@ class BallsBackend:
     summary, config_type, build = "soft coloured balls", BallsConfig, staticmethod(Balls)
 
     def train(self, field, views, config, report):
-        bank = RayBank(views, field.bounds)
+        bank = RayBank(views, field.bounds, device_of(field))
 
         def outcome(step, generator):
             batch = bank.draw(256, generator)

@@ -13,8 +13,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import AutoConfig, Localization
+from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_intrinsics
 from bidnerf_core.localization.by_colour import without_the_imprecise
-from bidnerf_core.localization.colour_calibration import without_the_miscalibrated
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.search.matching import LandmarkMatcher
@@ -118,12 +118,12 @@ def test_an_answer_far_less_certain_than_those_of_the_map_is_rejected(typical: f
 
 @pytest.mark.parametrize(("factor", "kept"), [(1.0, True), (1.05, False), (0.96, False), (1.5, True)])
 def test_a_pose_by_colour_with_intrinsics_near_the_maps_own_is_rejected(factor: float, kept: bool) -> None:
-    """Other intrinsics, as another camera has them, are taken at their word."""
+    """Intrinsics that differ as those of another camera do are not questioned."""
     points, camera = Points(), baked.CAMERA
     cameras = (replace(camera, fx=factor * camera.fx, fy=factor * camera.fy),)
     matcher = LandmarkMatcher(replace(build_landmarks(ring(points), points), cameras=cameras))
     query = replace(problem(photograph(UNSEEN[0])), matcher=matcher)
-    found = without_the_miscalibrated(accepted(), query)
+    found = without_ambiguous_intrinsics(accepted(), query)
     assert found.converged == kept
     if not kept:
         assert found.outcome is Outcome.MISCALIBRATED

@@ -16,7 +16,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 import tiny
-from bidnerf_core.field import FieldValues, Rays, RaySamples, SceneBounds
+from bidnerf_core.field import FieldValues, Rays, RaySamples, SceneBounds, device_of
 from bidnerf_core.frames import View
 from bidnerf_core.rendering import render
 from bidnerf_core.sampling import Stratified
@@ -71,7 +71,7 @@ class WaveBackend:
             return self.field_type(config, bounds)
 
     def train(self, field: Any, views: Sequence[View], config: Any, report: Report) -> None:
-        bank = RayBank(views, field.bounds)
+        bank = RayBank(views, field.bounds, device_of(field))
 
         def outcome(step: int, generator: Generator) -> StepOutcome:
             batch = bank.draw(256, generator)

@@ -13,19 +13,20 @@ from torch import Tensor
 import baked
 import module_fields
 import tiny
-from bidnerf_core import Localizer
+from bidnerf_core import Localizer, constants
 from bidnerf_core.backend import quick_config
 from bidnerf_core.cli import main
+from bidnerf_core.constants import constant
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.field import FieldValues, SceneBounds, device_of, levels
 from bidnerf_core.localization import settings_of
 from bidnerf_core.localization.solvers import adam
-from bidnerf_core.localization.solvers.cuda_graph import recorded
+from bidnerf_core.localization.solvers.cuda_graph import captured
 from bidnerf_core.registry import load_backend
 from bidnerf_core.rendering import render_image
 from bidnerf_core.storage import load_map
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views
-from bidnerf_core.training import Progress, Silent
+from bidnerf_core.training import Progress, Silent, TrainingState, TrainingStopped
 from problems import FieldMap
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
@@ -33,7 +34,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is 
 BUNDLED = ("hashgrid", "vanilla", "adanerf")
 
 
-class Reading(torch.nn.Module):
+class Synchronizing(torch.nn.Module):
     """A field that reads a number from the device in each query, as no step may."""
 
     def __init__(self, field: torch.nn.Module) -> None:
@@ -49,45 +50,74 @@ class Reading(torch.nn.Module):
         return self.field.query(positions, directions)  # type: ignore[no-any-return]
 
 
-def descent(field: Any, bounds: SceneBounds, device: str, steps: int = 50) -> Tensor:
-    """Return the poses (s 4 4) of a short descent of ``bid``."""
+def descent(field: Any, bounds: SceneBounds, method: str = "bid", steps: int = 50) -> Tensor:
+    """Return the poses (s 4 4) of a short descent on the GPU."""
     view = rgbd_views(coverage=False)[0]
-    config = settings_of("bid", {"max_steps": steps, "rays": 256})
-    found = Localizer(FieldMap(field, bounds, None), "bid", config, device=device)(
-        view.frame, perturb(view.T_ref_camera, 0.1, 3.0, seed=0)
-    )
-    assert found.poses is not None
-    return found.poses.matrix()
+    config = settings_of(method, {"max_steps": steps, "rays": 256})
+    localizer = Localizer(FieldMap(field, bounds, None), method, config, device="cuda")
+    return localizer(view.frame, perturb(view.T_ref_camera, 0.1, 3.0, seed=0)).poses.matrix()
 
 
-@pytest.mark.parametrize("name", BUNDLED)
-def test_replayed_steps_are_those_that_are_launched(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = load_backend(name)
-    field = backend.build(backend.config_type(), BOUNDS)
-    graphs: list[bool] = []
+@pytest.fixture
+def captures(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Whether each step that was to be captured could be."""
+    found: list[bool] = []
 
     def noted(step: Any, *rest: Any) -> Any:
-        found = recorded(step, *rest)
-        graphs.append(found is not step)
-        return found
+        replay = captured(step, *rest)
+        found.append(replay is not step)
+        return replay
 
-    monkeypatch.setattr(adam, "recorded", noted)
-    replayed = descent(field, BOUNDS, "cuda")
-    assert graphs == [True]
-    monkeypatch.setattr(adam, "recorded", lambda step, *_: step)
-    launched = descent(field, BOUNDS, "cuda")
+    monkeypatch.setattr(adam, "captured", noted)
+    return found
+
+
+@pytest.mark.parametrize("method", ["bid", "inerf"])
+@pytest.mark.parametrize("name", BUNDLED)
+def test_replayed_steps_are_those_that_are_launched(
+    name: str, method: str, captures: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = load_backend(name)
+    field = backend.build(backend.config_type(), BOUNDS)
+    replayed = descent(field, BOUNDS, method)
+    assert captures == [True]
+    monkeypatch.setattr(adam, "captured", lambda step, *_: step)
+    launched = descent(field, BOUNDS, method)
     assert len(replayed) == len(launched) == 51
     torch.testing.assert_close(replayed, launched, rtol=0, atol=1e-4)
 
 
-def test_steps_of_a_field_that_reads_from_the_device_are_launched(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_captured_step_keeps_the_constants_that_it_reads(captures: list[bool]) -> None:
+    field, device = module_fields.field().to("cuda"), torch.device("cuda")
+    expected, start = descent(field, baked.BOUNDS), torch.zeros(3, device=device)
+    step_result = torch.zeros(3, device=device)
+
+    def step() -> None:
+        step_result.copy_(start + constant((1.25, -2.5, 3.75), start))
+
+    step()
+    replay = captured(step, device, torch.Generator(device))
+    constants.forget()
+    _ = [torch.full((3,), -1.0, device=device) for _ in range(1000)]  # would take its place
+    step_result.zero_()
+    replay()
+    assert step_result.tolist() == [1.25, -2.5, 3.75]
+    torch.testing.assert_close(descent(field, baked.BOUNDS), expected, rtol=0, atol=1e-4)
+
+
+def test_steps_of_a_field_that_reads_from_the_device_are_launched(captures: list[bool]) -> None:
     field = module_fields.field()
-    plain = descent(field, baked.BOUNDS, "cuda")
-    reading = descent(Reading(field), baked.BOUNDS, "cuda")
-    torch.testing.assert_close(reading, plain, rtol=0, atol=1e-4)
+    plain = descent(field, baked.BOUNDS)
+    with pytest.warns(UserWarning, match="cannot be captured"):
+        reading = descent(Synchronizing(field), baked.BOUNDS)
+    again = descent(field, baked.BOUNDS)
+    assert captures == [True, False, True]
+    assert torch.cuda.current_stream() == torch.cuda.default_stream()
+    for found in (reading, again):
+        torch.testing.assert_close(found, plain, rtol=0, atol=1e-4)
 
 
-class Noted(Silent):
+class LossRecorder(Silent):
     """A report that keeps the losses."""
 
     def __init__(self) -> None:
@@ -97,21 +127,57 @@ class Noted(Silent):
         self.losses.append(progress.loss)
 
 
+class Interrupted(Silent):
+    """A report that stops a training at a step and keeps its state, or begins with such a state."""
+
+    def __init__(self, stop: int = 0, begin: TrainingState | None = None) -> None:
+        self.stop, self.begin, self.stopping = stop, begin, False
+        self.saved: TrainingState | None = None
+
+    def resume(self) -> TrainingState | None:
+        return self.begin
+
+    def step(self, progress: Progress) -> None:
+        self.stopping = progress.step == self.stop
+
+    def save(self, state: TrainingState) -> None:
+        parts = (
+            {name: value.clone() for name, value in part.items()} for part in (state.field, state.optimizer)
+        )
+        self.saved = TrainingState(state.step, *parts)
+
+
 @pytest.mark.parametrize("name", BUNDLED)
-def test_training_there_learns_what_it_learns_here(name: str) -> None:
+def test_training_on_a_gpu_learns_what_it_learns_on_a_cpu(name: str) -> None:
     backend, losses = load_backend(name), []
     config = replace(quick_config(backend), steps=60)
     for device in ("cpu", "cuda"):
         field: Any = backend.build(config, BOUNDS)
-        report = Noted()
+        report = LossRecorder()
         backend.train(field.to(device), rgbd_views(), config, report)
         losses.append(torch.tensor(report.losses))
-    here, there = losses
-    torch.testing.assert_close(there[:5], here[:5], rtol=1e-3, atol=1e-5)
-    assert float(there[-5:].mean()) < 1.1 * float(here[-5:].mean())
+    on_cpu, on_gpu = losses
+    torch.testing.assert_close(on_gpu[:5], on_cpu[:5], rtol=1e-3, atol=1e-5)
+    assert float(on_gpu[-5:].mean()) < 1.1 * float(on_cpu[-5:].mean())
 
 
-def test_a_map_that_was_made_there_serves_here(tmp_path: Path) -> None:
+def test_a_training_goes_on_on_another_device() -> None:
+    backend = load_backend("hashgrid")
+    config, views = replace(quick_config(backend), steps=12), rgbd_views()
+    finished = []
+    for second in ("cpu", "cuda"):
+        half = Interrupted(stop=6)
+        with pytest.raises(TrainingStopped):
+            backend.train(backend.build(config, BOUNDS), views, config, half)  # on the CPU
+        field: Any = backend.build(config, BOUNDS)
+        backend.train(field.to(second), views, config, Interrupted(begin=half.saved))
+        finished.append(field.cpu().state_dict())
+    for name, value in finished[0].items():
+        if value.is_floating_point() and not name.endswith(("peak", "density")):
+            torch.testing.assert_close(finished[1][name], value, rtol=0, atol=2e-3)
+
+
+def test_a_map_that_was_made_on_a_gpu_serves_on_a_cpu(tmp_path: Path) -> None:
     data, map = tiny.write_dataset(tmp_path / "data"), tmp_path / "map"
     assert main(["train", str(data), "--out", str(map), "--device", "cuda", *tiny.options()]) == 0
     assert main(["bake", str(map), "--device", "cuda", "--opacity", "0.01", "--agreement", "0"]) == 0

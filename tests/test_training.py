@@ -18,6 +18,7 @@ from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.pixels import all_pixels, observe
 from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.testing.elsewhere import DEVICE, Elsewhere
 from bidnerf_core.training import (
     Progress,
     RayBank,
@@ -345,3 +346,16 @@ def test_the_same_generator_draws_the_same_rays(generator: torch.Generator) -> N
     assert torch.equal(one.observed.rgb, again.observed.rgb)
     assert torch.equal(one.background, again.background)
     assert not torch.equal(one.observed.rgb, other.observed.rgb)
+
+
+def test_a_batch_on_another_device_is_that_of_the_cpu() -> None:
+    views = random_views(3, True, True)
+    here = RayBank(views, BOUNDS).draw(64, torch.Generator().manual_seed(3))
+    with Elsewhere():
+        there = RayBank(views, BOUNDS, DEVICE).draw(64, torch.Generator().manual_seed(3))
+        for name in ("rays", "observed"):
+            for part in vars(getattr(there, name)).values():
+                assert part.device == DEVICE
+        assert {there.background.device, there.image.device, there.deviation.device} == {DEVICE}
+        assert torch.equal(there.rays.directions.cpu(), here.rays.directions)
+        assert torch.equal(there.observed.rgb.cpu(), here.observed.rgb)

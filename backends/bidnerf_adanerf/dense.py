@@ -25,7 +25,11 @@ def dense_samples(
     if room is None:
         return samples, torch.zeros_like(samples.valid)
     held = room.holds(rays.at(samples.middles))
-    probed = samples.valid & ~held & (torch.rand(held.shape, generator=generator) < PROBED).to(held.device)
+    probed = (
+        samples.valid
+        & ~held
+        & (torch.rand(held.shape, generator=generator, device=generator.device) < PROBED).to(held.device)
+    )
     return replace(samples, valid=samples.valid & held | probed), probed
 
 

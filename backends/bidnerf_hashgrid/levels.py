@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
@@ -16,8 +15,8 @@ from bidnerf_hashgrid.threads import slices
 
 # The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
-MOST_ENTRIES = 2**31
-"""Entries of tables laid end to end that an int32 tells apart."""
+MOST_ENTRIES = 2**23
+"""Entries of the tables that are laid end to end, which copies them: some tens of megabytes. An int32 could address 2^31."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class LevelGroup:
         """The places of these levels among all."""
         return slice(self.first, self.first + len(self))
 
-    @cached_property
+    @property
     def entries(self) -> list[int]:
         return [level.entries for level in self.levels]
 
@@ -73,15 +72,15 @@ class LevelGroup:
         # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
         last = constant(tuple(level.resolution - 1 for level in self.levels), lower)[:, None]
         torch.minimum(lower, last, out=lower)
-        strides = constant(tuple(s for axis in zip(*self._strides, strict=True) for s in axis), lower)
+        by_axis = zip(*(level.strides for level in self.levels), strict=True)
+        strides = constant(tuple(stride for axis in by_axis for stride in axis), lower)
         terms = lower.new_empty(3, 2, *lower.shape[1:])
         torch.mul(lower, strides.view(3, -1, 1), out=terms[:, 0])
         torch.add(terms[:, 0], strides.view(3, -1, 1), out=terms[:, 1])
         if self.levels[0].hashed:
             terms.bitwise_and_(self.entries[0] - 1)
-        if (
-            len(self) > 1
-        ):  # where each table begins: above all bits of a hash, which the others leave as they are
+        if len(self) > 1:
+            # Where each table begins is above all bits of a hash, so that the terms of the other axes leave it as it is.
             terms[0] += constant(self._offsets, lower)[:, None]
         return terms, scaled.sub_(lower)
 
@@ -91,27 +90,23 @@ class LevelGroup:
         x, y, z = terms.unbind()
         return combine(combine(z[:, None], y)[:, :, None], x).view(-1)
 
-    @cached_property
-    def _strides(self) -> list[tuple[int, int, int]]:
-        return [level.strides for level in self.levels]
-
-    @cached_property
+    @property
     def _offsets(self) -> tuple[int, ...]:
         return tuple(sum(self.entries[:k]) for k in range(len(self)))
 
 
-def one_by_one(levels: Sequence[Level]) -> list[LevelGroup]:
+@lru_cache(maxsize=64)
+def one_by_one(levels: tuple[Level, ...]) -> list[LevelGroup]:
     """Return each level as a group of its own: its table stays in the cache of a core."""
     return [LevelGroup((level,), number) for number, level in enumerate(levels)]
 
 
-def together(levels: Sequence[Level]) -> list[LevelGroup]:
+@lru_cache(maxsize=64)
+def together(levels: tuple[Level, ...]) -> list[LevelGroup]:
     """Return as few groups as possible: on a GPU, each operation takes a launch, however few points it has."""
     groups = []
     dense = sum(not level.hashed for level in levels)  # the coarse ones, which come first
     for first, kind in ((0, levels[:dense]), (dense, levels[dense:])):
         most = MOST_ENTRIES // max((level.entries for level in kind), default=1)
-        groups += [
-            LevelGroup(tuple(kind[part]), first + part.start) for part in slices(len(kind), max(1, most))
-        ]
+        groups += [LevelGroup(kind[part], first + part.start) for part in slices(len(kind), max(1, most))]
     return groups

@@ -22,6 +22,7 @@ from bidnerf_core.localization.acceptance import (
     SurfaceThresholds,
     landmark_verdict,
 )
+from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_intrinsics
 from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
@@ -40,7 +41,6 @@ from bidnerf_core.localization.by_landmarks import (
     is_sharp,
     localization_by_landmarks,
 )
-from bidnerf_core.localization.colour_calibration import without_the_miscalibrated
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
@@ -85,7 +85,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     and there is no start.
     """
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
-    found = _found(problem, config, seed)
+    found = without_ambiguous_intrinsics(_found(problem, config, seed), problem)
     if config.fused_rays:
         found = refined_if_blurred(problem, found, config.fused_rays, seed)
     if _is_settled(found) or found.outcome in FINAL or problem.surface is None:
@@ -132,7 +132,7 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     else:
         found = _by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
-        found = without_the_miscalibrated(without_the_imprecise(found, typical), problem)
+        found = without_the_imprecise(found, typical)
     if matcher is None:
         return found
     found = _compared_with_landmarks(found, problem, matcher, config, seed, began)

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.localization.ambiguous_intrinsics import may_be_miscalibrated
 from bidnerf_core.localization.by_landmarks import is_sharp
-from bidnerf_core.localization.colour_calibration import may_be_miscalibrated
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.costs.images import ColourScales, ImageCost, render_view, uniform_cost
 from bidnerf_core.localization.costs.thumbnails import thumbnail

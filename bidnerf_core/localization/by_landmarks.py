@@ -52,10 +52,7 @@ POINTS = 2000
 FUSION_STEPS = 2
 """Number of second-order steps on the sum of all terms."""
 THOROUGHLY = 4
-"""How many times as many rays and steps poses get that landmarks leave doubtful; rendering has the square of it as weight.
-
-Both were chosen together on tuning frames.
-"""
+"""How many times as many rays and steps poses get that landmarks leave doubtful; each ray then counts so many times as much."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
 DEPTH_SCALE_NOISE = 0.01

@@ -35,7 +35,7 @@ def descended(
     )
     history = History([start])
     finite, reason = follow_gradient(
-        loss, pivot(rays.pivot, problem), adam, history, device, generator if loss.repeats else None
+        loss, pivot(rays.pivot, problem), adam, history, device, generator if loss.is_capturable else None
     )
     T, mean = history.answer(adam.answer)
     verdict = descent_verdict(mean, adam.converged_loss, finite, reason)

@@ -46,7 +46,7 @@ class Pivot:
         return (T @ self.T_camera_pivot).retract(delta) @ self.T_camera_pivot.inverse()
 
     def moved_linearly(self, T: SE3, delta: Float[Tensor, "*h 6"]) -> SE3:
-        """Return ``moved`` to first order in ``delta``: at 0 it has the same value and derivative, of few operations."""
+        """Return ``moved`` to first order in ``delta``: cheaper, with the same value and derivative at 0."""
         if self.T_camera_pivot is None:
             return SE3.identity(device=delta.device).retract_linearly(delta) @ T
         return (T @ self.T_camera_pivot).retract_linearly(delta) @ self.T_camera_pivot.inverse()

@@ -48,10 +48,10 @@ def fit(
 ) -> None:
     """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` of Adam.
 
-    The generator is one of the CPU wherever the field lies, so that a training draws the same everywhere.
-
     ``beside`` is what is learned with the field and not kept with it; its parameters are among the groups. Training resumes from ``report.resume()``, saves when ``report.due`` says so and, when ``report.stopping`` is set, saves
-    and raises ``TrainingStopped``. A resumed run computes what an uninterrupted one would have. Raises ``InputError`` where
+    and raises ``TrainingStopped``. A resumed run computes what an uninterrupted one would have; on a GPU,
+    where sums have no fixed order, but for rounding. The generator is on the CPU whatever the field's device, so that the same
+    rays are drawn everywhere. Raises ``InputError`` where
     the loss is not finite.
     """
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
@@ -112,8 +112,11 @@ def _restore(
         beside.load_state_dict(found)
     for number, parameter in enumerate(_parameters(optimizer)):
         prefix = f"{number}."
-        found = {k[len(prefix) :]: v.clone() for k, v in state.optimizer.items() if k.startswith(prefix)}
-        found = {name: value.to(parameter.device) for name, value in found.items()}
+        found = {
+            name.removeprefix(prefix): value.to(parameter.device, copy=True)
+            for name, value in state.optimizer.items()
+            if name.startswith(prefix)
+        }
         if found:
             optimizer.state[parameter] = found
     return state.step

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from bidnerf_core.constants import constant
 from bidnerf_core.field import Rays, SceneBounds
 from bidnerf_core.frames import SPARSE, View
 from bidnerf_core.moving import moved
@@ -37,7 +36,7 @@ class TrainingBatch:
 
 
 class RayBank:
-    """All pixels of the training views, from which batches are drawn. Pixels and batches lie on ``device``.
+    """All pixels of the training views, from which batches are drawn. Pixels stay in the host's memory; batches lie on ``device``.
 
     Where an image has an alpha channel, each batch has its background replaced by random colours, so that a field cannot
     explain the background by matter of one colour (as in the code of Mueller et al. 2022).
@@ -69,39 +68,32 @@ class RayBank:
         starts = torch.tensor([0, *[len(grid) for grid in grids]]).cumsum(0)
         self._camera_rays = torch.cat(grids)  # z = 1
         self._camera_start = torch.stack([starts[kinds.index(frame.intrinsics)] for frame in frames])
-        for name, part in vars(self).items():
-            if isinstance(part, torch.Tensor | _LandmarkPixels):
-                setattr(self, name, moved(part, self.device))
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         """Return the rays of ``count`` pixels, drawn uniformly from all views; a fixed part of them from pixels with depth, where
-        only few have any. The generator's device does not matter.
+        only few have any.
         """
-        index = self._numbers(self.count, count, generator)
+        index = torch.randint(self.count, (count,), generator=generator)
         if len(self._few):
             some = round(MEASURED_SHARE * count)
-            index[:some] = self._few[self._numbers(len(self._few), some, generator)]
-        deviation, seen = index.new_zeros(count, dtype=torch.float32), self._rgb.new_zeros(0)
+            index[:some] = self._few[torch.randint(len(self._few), (some,), generator=generator)]
+        deviation, seen = torch.zeros(count), torch.zeros(0)
         if len(self._landmarks):
             some = round(LANDMARK_SHARE * count)
-            chosen = self._numbers(len(self._landmarks), some, generator)
+            chosen = torch.randint(len(self._landmarks), (some,), generator=generator)
             index[:some] = self._landmarks.pixel[chosen]
             seen, deviation[:some] = self._landmarks.distance[chosen], self._landmarks.deviation[chosen]
         view = torch.searchsorted(self.offsets, index, right=True) - 1
         ray = self._camera_rays[self._camera_start[view] + index - self.offsets[view]]
         length = torch.linalg.vector_norm(ray, dim=-1)
         directions = (self._rotation[view] @ (ray / length[:, None])[..., None])[..., 0]
-        distance = self._depth[index] * length if self.has_depth else torch.zeros_like(length)
+        distance = self._depth[index] * length if self.has_depth else torch.zeros(count)
         distance[: len(seen)] = seen
         rgb, background = self._coloured(index, generator)
-        origins, coloured = self._origin[view], torch.ones_like(view, dtype=torch.bool)
+        origins, coloured = self._origin[view], torch.ones(count, dtype=torch.bool)
         observed = Observations(origins, directions, rgb, distance, coloured)
         rays = self.bounds.rays(origins, directions)
-        return TrainingBatch(rays, observed, background, view, deviation)
-
-    def _numbers(self, below: int, count: int, generator: Generator) -> Int[Tensor, "r"]:
-        """Draw whole numbers from 0 to ``below``, exclusive."""
-        return torch.randint(below, (count,), generator=generator, device=generator.device).to(self.device)
+        return moved(TrainingBatch(rays, observed, background, view, deviation), self.device)
 
     def _few_measured(self) -> Int[Tensor, "m"]:
         """Return the indices of the pixels with depth where it is sparse (structure from motion), and none otherwise."""
@@ -112,10 +104,10 @@ class RayBank:
 
     def _coloured(self, index: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
         """Return the pixels' colours and the background colours that they are composed over."""
-        usual = constant(self.bounds.background, self._rgb).expand(len(index), 3)
+        usual = torch.tensor(self.bounds.background).expand(len(index), 3)
         if not self.has_alpha:
             return self._rgb[index], usual
-        background = torch.rand(usual.shape, generator=generator, device=generator.device).to(usual)
+        background = torch.rand((len(index), 3), generator=generator)
         return self._rgb[index] + (1 - self._alpha[index])[:, None] * (background - usual), background
 
 

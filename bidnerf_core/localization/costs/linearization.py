@@ -20,7 +20,7 @@ from bidnerf_core.sampling import rows_of
 from bidnerf_core.se3 import SE3
 from bidnerf_core.waiting import may_wait
 
-MOST_AT_ONCE = 2**20
+MOST_AT_ONCE = 2**18
 """Number of samples, copies included, up to which all channels are differentiated in one pass."""
 
 BackgroundColour = tuple[float, float, float]
@@ -106,15 +106,15 @@ def _ray_gradients(
     found = residual(rendering, seen).unflatten(0, (copies, -1))
     # Each pass is of one channel of each copy of the rays.
     passes = [channels] if copies > 1 else [(channel,) for channel in channels]
-    for wanted in passes:
+    for number, wanted in enumerate(passes, start=1):
         total = sum((found[copy, :, c].sum() for copy, c in enumerate(wanted)), start=found.new_zeros(()))
-        gradients = torch.autograd.grad(
-            total, leaves, retain_graph=wanted is not passes[-1], allow_unused=True
+        gradients: tuple[Tensor | None, ...] = torch.autograd.grad(
+            total, leaves, retain_graph=number < len(passes), allow_unused=True
         )
         for result, gradient in zip(results, gradients, strict=True):
-            for channel, part in zip(
-                wanted, () if gradient is None else gradient.chunk(copies), strict=False
-            ):
+            if gradient is None:
+                continue
+            for channel, part in zip(wanted, gradient.chunk(copies), strict=True):
                 result[busy, channel] = part
     return results[0], results[1]
 
@@ -122,7 +122,7 @@ def _ray_gradients(
 def _all_at_once(samples: RaySamples, channels: int) -> bool:
     """Return whether to differentiate all channels in one pass, over as many copies of the rays.
 
-    A CPU would have more to compute. On a GPU, passes over a few thousand samples take the time to launch them.
+    A CPU would have more to compute. On a GPU, a pass takes the time to launch it, unless its samples are many.
     """
     return samples.valid.device.type != "cpu" and channels * samples.valid.numel() <= MOST_AT_ONCE
 

@@ -55,7 +55,7 @@ class SampledLoss:
         return sum(others, start=first)
 
     @property
-    def repeats(self) -> bool:
+    def is_capturable(self) -> bool:
         """Whether each call computes the same, but for the random numbers; a blur fades from call to call."""
         return self.reach.blur == 0
 

@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from bidnerf_core.constants import constant
 from bidnerf_core.localization.method_settings import AdamSettings
 from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.localization.solvers.cuda_graph import WARM_UP, recorded
+from bidnerf_core.localization.solvers.cuda_graph import WARM_UP, captured
 from bidnerf_core.localization.solvers.history import WINDOW, History
 from bidnerf_core.se3 import SE3
 from bidnerf_core.waiting import without_waiting
@@ -28,7 +28,7 @@ class AdamSteps:
 
     Each step writes the pose as an update delta of the current one about ``pivot``, takes the gradient by delta at 0, and
     moves by what Adam makes of it. A step that is not finite leaves the pose where it is. What a step changes lies in
-    tensors that it writes in place, so that a step recorded as a CUDA graph is the next one whenever it is replayed.
+    tensors that it writes in place, so that a step captured as a CUDA graph is the next one whenever it is replayed.
     """
 
     def __init__(self, loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3) -> None:
@@ -68,14 +68,14 @@ class AdamSteps:
             self._row.add_(1).remainder_(WINDOW)
             self._steps += 1
 
-    def block(self) -> tuple[SE3, Float[Tensor, "s"], Float[Tensor, "s"]]:
+    def block(self) -> tuple[SE3, Float[Tensor, "s"], Bool[Tensor, "s"]]:
         """Return the poses after the last ``WINDOW`` steps, on the CPU, the loss before each, and whether each was finite.
 
         It is for the end of each ``WINDOW`` steps; rows of steps that were not taken are those of earlier ones.
         """
         log = self._log.cpu()
         self._row.zero_()
-        return SE3(log[:, :9].unflatten(1, (3, 3)), log[:, 9:12]), log[:, 12], log[:, 13]
+        return SE3(log[:, :9].unflatten(1, (3, 3)), log[:, 9:12]), log[:, 12], log[:, 13] > 0
 
     @torch.no_grad()
     def _update(self, gradient: Float[Tensor, "6"]) -> Float[Tensor, "6"]:
@@ -98,8 +98,8 @@ def follow_gradient(
     """Take steps from ``history.T``, record them, and return whether they stayed finite and why they ended.
 
     Steps are taken on ``device``, ``WINDOW`` at a time; the host reads them after each block. If a reason to stop arose
-    within a block, the steps after it are forgotten. With ``generator``, from which the loss draws and beside which it is
-    the same in each call, steps on a GPU are replayed as a CUDA graph.
+    within a block, the steps after it are forgotten. Give the ``generator`` from which the loss draws if each call computes
+    the same but for these numbers: on a GPU, a step is then captured once and replayed.
     """
     steps = AdamSteps(loss, pivot, config, history.T.to(device))
     take: Callable[[], None] = steps
@@ -108,10 +108,10 @@ def follow_gradient(
         with without_waiting():
             for step in range(count):
                 if generator is not None and first + step == WARM_UP:
-                    take = recorded(steps, device, generator)
+                    take = captured(steps, device, generator)
                 take()
         poses, losses, finite = steps.block()
-        reason = _recorded(history, config, poses[:count], losses[:count], finite[:count] > 0)
+        reason = _recorded(history, config, poses[:count], losses[:count], finite[:count])
         if reason is not None:
             return reason
     return True, f"reached {config.max_steps} steps"

@@ -1,41 +1,57 @@
 """Steps as CUDA graphs: all operations of a step in one launch.
 
 A step of a few thousand rays is some hundreds of short operations. Launching each from Python takes longer than it computes;
-a graph of them takes the device's time only. What may be recorded is what runs without waiting for the device (see
-``waiting``), in the same shapes each time, on tensors that it writes in place.
+a graph of them takes the device's time only. What may be captured is what runs without waiting for the device (see
+``waiting``), in the same shapes each time, on tensors that it writes in place. Values that Python computes are captured as they are.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from threading import Lock
 
 import torch
 from torch import Generator
 
+from bidnerf_core.constants import noted
+
 WARM_UP = 3
-"""Steps to take before one is recorded: caches are filled and kernels loaded in these, which a recording does not allow."""
+"""Steps to take before one is captured: caches are filled and kernels loaded in these, which a capture does not allow."""
+_capturing = Lock()
+"""One capture at a time: it begins with waiting for all that the device does, which another capture forbids."""
 
 
-_recording = Lock()
-"""One recording at a time: it begins with waiting for all that the device does, which another recording forbids."""
+def captured(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
+    """Return a function that does what ``step`` would: on a GPU, the replay of a graph of it, if it can be captured.
 
-
-def recorded(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
-    """Return a function that does what ``step`` would: on a GPU, the replay of a graph of it, if it can be recorded.
-
-    ``generator`` is that from which the step draws. Recording takes no step.
+    ``generator`` is that from which the step draws. Capturing takes no step. A step that cannot be captured is returned with a warning.
     """
     if device.type != "cuda":
         return step
     graph, before = torch.cuda.CUDAGraph(), generator.clone_state()
     graph.register_generator_state(generator)
-    with _recording, torch.cuda.device(device):
+    # Where a capture fails, torch leaves the thread on the stream of the capture; the outer context sets it back.
+    with _capturing, torch.cuda.device(device), torch.cuda.stream(torch.cuda.current_stream(device)):
         try:
-            # Other threads may go on launching.
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            # Each device has a stream of its own. Other threads may go on launching.
+            stream = torch.cuda.Stream(device)
+            with (
+                noted() as constants,
+                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+            ):
                 step()
-        except RuntimeError:  # it waits for the device somewhere, as a third party's field may
-            generator.graphsafe_set_state(before)  # the other one expects to be recorded still
+        except RuntimeError as error:  # it waits for the device somewhere, as a third party's field may
+            generator.graphsafe_set_state(before)  # the registered one still expects a capture
+            why = str(error).partition("\n")[0]
+            warnings.warn(
+                f"steps are launched one operation after the other, since one cannot be captured: {why}",
+                stacklevel=2,
+            )
             return step
-    return graph.replay
+
+    def replay() -> None:
+        graph.replay()
+
+    replay.constants = constants  # type: ignore[attr-defined]  # the graph reads them, wherever else they are forgotten
+    return replay

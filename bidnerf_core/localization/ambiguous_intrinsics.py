@@ -1,13 +1,14 @@
-"""Intrinsics near those of the map's images, and poses by colour alone, which hardly tell which of the two are right.
+"""Rejects poses by colour alone whose intrinsics differ slightly from those of the map's images.
 
-A camera with a slightly longer focal length a little further away takes nearly the same image. Landmarks can tell; without
-them, an accepted pose would be wrong by the difference.
+Focal length and distance can hardly be separated without landmarks: a camera with a slightly longer focal length a little
+further away takes nearly the same image. If the intrinsics are wrong, the pose is off by the difference.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome
 from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, MapCamera, map_camera
@@ -24,9 +25,10 @@ def _differs_a_little(camera: MapCamera) -> bool:
     return bool(camera.differs.any()) and camera.is_near(OTHER_CAMERA)
 
 
-def without_the_miscalibrated(found: Localization, problem: Problem) -> Localization:
-    """Reject an accepted pose by colour alone where ``may_be_miscalibrated``."""
-    if not found.converged or not may_be_miscalibrated(problem):
+def without_ambiguous_intrinsics(found: Localization, problem: Problem) -> Localization:
+    """Reject an accepted pose that neither landmarks nor depth determine where ``may_be_miscalibrated``."""
+    by_colour = not problem.has_depth and not isinstance(found.diagnostics, LandmarkDiagnostics)
+    if not (found.converged and by_colour and may_be_miscalibrated(problem)):
         return found
     why = "the intrinsics given are near those of the map's images, and without landmarks nothing tells which are right"
     return replace(found, outcome=Outcome.MISCALIBRATED, reason=f"{why}; {found.reason}")
