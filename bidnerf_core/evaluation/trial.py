@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 import torch
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.evaluation.closed_form_data import is_closed_form
 from bidnerf_core.evaluation.errors import PoseError
 from bidnerf_core.evaluation.fingerprint import InputDigests
@@ -106,6 +107,7 @@ class TrialResult:
     trial: Trial  # with folders' names instead of paths
     outcome: str = ""  # the kind of the method's judgement; empty in results of earlier versions
     focal_factor: float = 1.0  # true focal length over the given one, where it was estimated along
+    intrinsics: Intrinsics | None = None  # with which the pose was found, where other than those given
     confidence: float | None = None  # probability that the pose is right, where a model of it was learned
     inputs: InputDigests | None = None  # none in results of earlier versions
 
