@@ -187,13 +187,14 @@ def _compared_with_landmarks(
     near = confirm(matcher, problem.views, found.T_world_camera)
     if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
+        confidence = answer.confidence or 0.0
+        supported = found.converged and confidence >= SUPPORTED
+        answer = replace(answer, verdict=verdict) if supported else answer
         refined = localization_by_landmarks(problem, answer, began)
         evidence = unguided_log10_nfa(matcher, problem.views, near.pose.T_world_camera)
         twin = mirror_rejection(corrected(problem, near.pose), matcher, evidence, config.fused_rays, seed)
         if twin is not None:
             return _rejected_by_mirror(refined, twin)
-        confidence = answer.confidence or 0.0
-        supported = found.converged and confidence >= SUPPORTED
         if found.converged and _leaves_surface(problem, found, answer):
             return replace(found, seconds=time.perf_counter() - began)
         if (
@@ -203,8 +204,7 @@ def _compared_with_landmarks(
             and _keeps_points(problem, near.pose)
         ):
             return replace(found, seconds=time.perf_counter() - began)
-        outcome = Outcome.CONVERGED if supported else refined.outcome
-        return replace(refined, outcome=outcome, reason=f"found on the surface; {refined.reason}")
+        return replace(refined, reason=f"found on the surface; {refined.reason}")
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
