@@ -484,6 +484,20 @@ def no_space(*_: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+def test_a_gpu_without_memory_left_is_said_in_a_line(
+    bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_memory(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nSee the notes")
+
+    monkeypatch.setattr("bidnerf_core.cli.train.build_field", no_memory)
+    trained = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options(2))
+    assert trained.status == 1
+    assert trained.err.splitlines()[-1].startswith(
+        "bidnerf train: the GPU's memory is full, try --device cpu"
+    )
+
+
 def test_a_full_disk_leaves_nothing_behind(
     bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

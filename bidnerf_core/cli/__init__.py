@@ -64,6 +64,12 @@ def _guarded(name: str, given: list[str]) -> int:
         return _failed(name, f"{where}{error.strerror or error}", BAD_INPUT)
     except InputError as error:
         return _failed(name, str(error), getattr(error, "status", BAD_INPUT))
+    except RuntimeError as error:
+        if (
+            type(error).__name__ != "OutOfMemoryError"
+        ):  # of torch, which is not imported here, so that --help is quick
+            raise
+        return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
 
 
 def _dispatch(given: list[str]) -> int:
