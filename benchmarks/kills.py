@@ -129,7 +129,7 @@ def copy_map(source: Path, to: Path) -> None:
     to.mkdir(parents=True)
     (to / info.weights).write_bytes((source / info.weights).read_bytes())
     plain = json.loads((source / "map.json").read_text())
-    (to / "map.json").write_text(json.dumps(plain | {"surface": None, "landmarks": None}))
+    (to / "map.json").write_text(json.dumps(plain | {"surface": None, "landmarks": None, "capture": None}))
 
 
 def map_is_whole(folder: Path) -> int:
@@ -142,7 +142,8 @@ def map_is_whole(folder: Path) -> int:
 def map_numbers(folder: Path, parts: tuple[str, ...]) -> object:
     """Return the bytes of the map's files, and check that there are no others."""
     info = load_info(folder / "map")
-    named = {"map.json", info.weights, info.training, info.surface, info.landmarks} - {None}
+    parts_named = (info.weights, info.training, info.surface, info.landmarks, info.capture)
+    named = {"map.json", *parts_named} - {None}
     others = {file.name for file in (folder / "map").iterdir()} - named
     if others:
         raise Broken(f"files that map.json does not name: {sorted(others)}")

@@ -17,6 +17,8 @@ from bidnerf_core.localization.result import Outcome, Verdict
 
 ACCEPTED = 0.8
 """Least confidence with which a pose is accepted."""
+ACCEPTED_ESTIMATED = 0.6
+"""The same where the intrinsics were estimated along: that takes evidence of its own, which the model does not count."""
 TRUSTED = 0.95
 """Confidence from which on a pose by landmarks needs no further measurements to be trusted."""
 
@@ -46,7 +48,9 @@ class LogisticModel:
 def judged(verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> Judgement:
     """Return the confidence in a pose, and the verdict, which it can turn into a rejection."""
     value = confidence(diagnostics)
-    if value is not None and verdict.accepted and value < ACCEPTED:
+    estimated = isinstance(diagnostics, LandmarkDiagnostics) and diagnostics.estimated_calibration
+    least = ACCEPTED_ESTIMATED if estimated else ACCEPTED
+    if value is not None and verdict.accepted and value < least:
         verdict = Verdict(Outcome.UNCERTAIN, f"only {value:.0%} likely to be right; {verdict.reason}")
     return Judgement(verdict, value)
 
