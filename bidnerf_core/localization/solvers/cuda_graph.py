@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from threading import Lock
 
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
 from bidnerf_core.constants import noted
 
@@ -20,6 +21,15 @@ WARM_UP = 3
 """Steps to take before one is captured: caches are filled and kernels loaded in these, which a capture does not allow."""
 _capturing = Lock()
 """One capture at a time: it begins with waiting for all that the device does, which another capture forbids."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Replay:
+    graph: torch.cuda.CUDAGraph
+    constants: list[Tensor]  # which the graph reads, wherever else they are forgotten
+
+    def __call__(self) -> None:
+        self.graph.replay()
 
 
 def captured(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
@@ -50,8 +60,4 @@ def captured(step: Callable[[], None], device: torch.device, generator: Generato
             )
             return step
 
-    def replay() -> None:
-        graph.replay()
-
-    replay.constants = constants  # type: ignore[attr-defined]  # the graph reads them, wherever else they are forgotten
-    return replay
+    return _Replay(graph, constants)
