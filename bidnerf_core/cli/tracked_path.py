@@ -26,7 +26,7 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import MapInfo
 
-SAME_PLACE = 1e-4
+SAME_POSE = 1e-4
 """Difference of two poses' matrices (metres) that rounding in files may make."""
 BOUND = 12.59
 """The 95 % quantile of the chi-squared distribution with 6 degrees of freedom."""
@@ -127,7 +127,7 @@ class TrackedPath:
         given = self._trained_on.get(frame.posed.name)
         if given is None or frame.truth is None:
             return False
-        return torch.allclose(given.matrix(), frame.truth.matrix(), rtol=0, atol=SAME_PLACE)
+        return torch.allclose(given.matrix(), frame.truth.matrix(), rtol=0, atol=SAME_POSE)
 
     def _error_rows(self) -> list[tuple[str, str]]:
         errors = self.errors()

@@ -18,7 +18,7 @@ from bidnerf_core.localization.result import Outcome, Verdict
 ACCEPTED = 0.8
 """Least confidence with which a pose is accepted."""
 ACCEPTED_ESTIMATED = 0.6
-"""The same where the intrinsics were estimated along: that takes evidence of its own, which the model does not count."""
+"""Least confidence of a pose whose intrinsics were estimated along, which takes evidence of its own that the model does not count."""
 TRUSTED = 0.95
 """Confidence from which on a pose by landmarks needs no further measurements to be trusted."""
 

@@ -37,9 +37,7 @@ class AdamSteps:
         turning = config.learning_rate / pivot.reach
         self._rate = torch.tensor([config.learning_rate] * 3 + [turning] * 3, dtype=torch.float64).to(device)
         self._T = SE3(start.rotation.clone(), start.translation.clone())
-        self._steps, self._updates, self._row = (
-            torch.zeros((), dtype=dtype, device=device) for dtype in (torch.float64, torch.float64, torch.long)
-        )  # fmt: skip
+        self._steps, self._updates = (torch.zeros((), dtype=torch.float64, device=device) for _ in range(2))
         self._mean, self._square = (torch.zeros(6, dtype=torch.float64, device=device) for _ in range(2))
         # Pose, loss before the step, and whether the step was finite.
         self._log = torch.zeros(WINDOW, 14, dtype=torch.float64, device=device)
@@ -64,8 +62,7 @@ class AdamSteps:
                 now.copy_(torch.where(finite, then, now))
             pose = torch.cat([self._T.rotation.flatten(), self._T.translation])
             row = torch.cat([pose, torch.stack([value.detach().to(pose), finite.to(pose)])])
-            self._log.index_copy_(0, self._row[None], row[None])
-            self._row.add_(1).remainder_(WINDOW)
+            self._log.index_copy_(0, (self._steps % WINDOW).long()[None], row[None])
             self._steps += 1
 
     def block(self) -> tuple[SE3, Float[Tensor, "s"], Bool[Tensor, "s"]]:
@@ -74,7 +71,6 @@ class AdamSteps:
         It is for the end of each ``WINDOW`` steps; rows of steps that were not taken are those of earlier ones.
         """
         log = self._log.cpu()
-        self._row.zero_()
         return SE3(log[:, :9].unflatten(1, (3, 3)), log[:, 9:12]), log[:, 12], log[:, 13] > 0
 
     @torch.no_grad()
