@@ -47,6 +47,8 @@ REACH: dict[str, Settings] = {
     "opacity": {"opacity_weight": 0.3},
     "free space": {"free_space_weight": 1.0},
     "points in the box": {"box_weight": 1.0},
+    "points in the box, pixels on matter": {"box_weight": 1.0, "candidates": 3},
+    "points in the box, weakly": {"box_weight": 0.2},
 }
 DEPTH: dict[str, Settings] = {
     "distance, fine": {"level": None},
