@@ -11,6 +11,7 @@ import torch
 import baked
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
+from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization import AutoConfig, Localization
 from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_intrinsics
@@ -63,6 +64,24 @@ def test_no_start_is_needed() -> None:
     assert found.steps == len(found.losses) == len(found.poses.translation) - 1
     assert found.covariance is not None
     assert float(normalized_error_squared(found.T_world_camera, truth, found.covariance)) < 16.8
+
+
+def test_the_second_round_leaves_out_what_hides_the_scene() -> None:
+    """Nothing suggests that the pose is right, however, where a third of the image cannot be explained."""
+    truth = UNSEEN[0]
+    hidden = faulty(photograph(truth), "occluder:0.3", seed=1)
+    found = [localize(problem(hidden), "auto", replace(QUICK, rounds=rounds)) for rounds in (1, 2)]
+    off = [float(pose_error(answer.T_world_camera, truth).translation) for answer in found]
+    assert off[0] > 0.3
+    assert off[1] < 0.03
+    assert all(answer.outcome is Outcome.RENDERING_MISMATCH for answer in found)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_other_exposures_are_found(factor: float) -> None:
+    """At twice the exposure many colours are clipped."""
+    view = faulty(photograph(UNSEEN[1]), f"exposure:{factor}", seed=0)
+    assert_right(localize(problem(view), "auto", QUICK), UNSEEN[1])
 
 
 def test_measured_depth_that_is_too_little_does_no_harm() -> None:

@@ -101,7 +101,7 @@ def test_bid_is_inerf_with_other_settings(problem: Problem) -> None:
     few = {"rays": 64, "max_steps": 4, "pixels": "interest-regions"}
     same = {
         **few, "learning_rate": 0.01, "decay": 0.8, "decay_steps": 100, "colour_loss": "l2", "pivot": "world",
-        "level": None, "depth_weight": 0.0,
+        "level": None, "depth_weight": 0.0, "candidates": 1, "box_weight": 0.0,
     }  # fmt: skip
     one, other = localize(problem, "inerf", few), localize(problem, "bid", same)
     assert torch.equal(one.poses.matrix(), other.poses.matrix())

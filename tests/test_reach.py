@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -94,6 +96,12 @@ def test_a_start_from_which_nothing_is_met_has_a_gradient_towards_the_box_only_b
     torch.testing.assert_close(plain, boxed)  # all measured points lie in the box
 
 
+def test_points_beyond_the_box_are_right_where_the_scene_goes_on_there(frame: Frame) -> None:
+    away = problem_at(frame, 3.0)
+    problem = replace(away, bounds=replace(BOX, contracted=True))
+    assert float(gradient(loss_of(problem, box_weight=1.0), problem).abs().max()) < 1e-9
+
+
 def test_a_blurred_field_is_the_field_convolved_with_a_gaussian() -> None:
     """The convolution of a plane wave ``cos(k x)`` is ``exp(-k^2 sigma^2 / 2) cos(k x)``."""
 
@@ -120,8 +128,19 @@ def test_the_papers_settings_are_presets() -> None:
     assert (paper["rays"], paper["max_steps"], paper["level"], paper["depth_weight"]) == (2048, 1000, 0, 1.0)
     assert (paper["pivot"], ours["pivot"]) == ("camera", "scene")
     assert {name for name in paper if paper[name] != ours[name]} == {"pivot"}
+    assert (paper["candidates"], paper["box_weight"]) == (1, 0.0)  # nothing is added to the paper's objective
     inerf = to_flat(METHODS["inerf"].settings("paper"))
     assert (inerf["rays"], inerf["max_steps"], inerf["learning_rate"]) == (2048, 1000, 0.01)
+
+
+def test_bid_finds_the_ball_where_the_papers_objective_does_not(frame: Frame) -> None:
+    """The pose is free to turn about the ball, so that the loss tells whether it is seen as it was."""
+    losses = [
+        float(localize(problem_at(frame, 1.5), "bid", {"rays": 64, "max_steps": 100} | reach).losses[-1])
+        for reach in ({}, {"candidates": 1, "box_weight": 0.0})
+    ]
+    assert losses[0] < 0.05
+    assert losses[1] > 0.2
 
 
 def test_a_preset_can_be_changed_and_is_checked() -> None:

@@ -11,9 +11,6 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
-import torch
-from torch import Generator
-
 from bidnerf_core.depth_sensor import find_depth_sensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.acceptance import (
@@ -27,18 +24,15 @@ from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
 from bidnerf_core.localization.by_colour import (
-    ColourAnswer,
-    localization_of,
-    refine_by_colour,
     without_the_imprecise,
 )
 from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface
+from bidnerf_core.localization.by_image_search import localized_by_images
 from bidnerf_core.localization.by_landmarks import (
     LandmarkAnswer,
     answer_by_landmarks,
     corrected,
     fused_answer,
-    is_sharp,
     localization_by_landmarks,
 )
 from bidnerf_core.localization.confidence import TRUSTED
@@ -46,16 +40,11 @@ from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.by_images import ImageSearch
-from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import unguided_log10_nfa
 from bidnerf_core.localization.search.occluders import nearest_piece
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.se3 import SE3
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
 """Reasons for which landmarks reject a pose that nothing else can put right: with wrong intrinsics, the surface is not found at
@@ -69,8 +58,6 @@ FEWER = 0.05
 """Share of the measured points by which landmarks may take a pose off the surface."""
 IN_FRONT = 0.9
 """Least share of the points of an occluder that must lie before the surface."""
-MANY_LANDMARKS = 500
-"""The number of landmarks from which on a scene is textured."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
 SUPPORTED, MOVING = 0.5, 0.8
@@ -130,7 +117,7 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         ):
             return localization_by_landmarks(problem, answer, began)
     else:
-        found = _by_images(problem.without_depth(), problem.surface, config, seed)
+        found = localized_by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
         found = without_the_imprecise(found, typical)
     if matcher is None:
@@ -251,46 +238,6 @@ def _measured_points(problem: Problem) -> int:
     images = [view.frame.depth for view in problem.views if view.frame.depth is not None]
     pixels = sum(int(((depth > 0) & depth.isfinite()).sum()) for depth in images)
     return pixels + (0 if problem.depth_rays is None else len(problem.depth_rays))
-
-
-def _by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
-    """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer."""
-    began, generator = time.perf_counter(), Generator().manual_seed(seed)
-    search, answers = ImageSearch.on_surface(problem, surface), list[ColourAnswer]()
-    keyframes = SE3.from_matrix(surface.keyframes).to("cpu")
-    known = Surroundings(keyframes, surface.extent, torch.zeros(3), search.middle)
-    while True:
-        with torch.no_grad():
-            found = search(hypotheses_for_images(known, problem.start, config.hypotheses, generator))
-        if config.landmarks and _is_hopeless(problem):
-            return _unrecognised(problem, found, began)
-        answers.append(refine_by_colour(problem, found, config.by_colour, generator))
-        best = min(answers, key=lambda answer: answer.refined.loss)
-        if best.verdict.accepted or len(answers) == config.rounds:
-            return localization_of(problem, best, config.by_colour, began, "auto")
-
-
-def _is_hopeless(problem: Problem) -> bool:
-    """Whether an image without recognised landmarks cannot be found: the scene is textured, and its field blurred."""
-    textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
-    return textured and not is_sharp(problem)
-
-
-def _unrecognised(problem: Problem, found: SearchResult, began: float) -> Localization:
-    """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
-    approximate = any(view.frame.focal_is_approximate for view in problem.views)
-    focal = "; give the camera's calibration instead of an approximate focal length" if approximate else ""
-    return Localization(
-        T_world_camera=found.T[0].normalized(),
-        outcome=Outcome.TOO_FEW_MATCHES,
-        reason=f"too few landmarks were recognised, and the field is too blurred to compare images with its renderings{focal}",
-        steps=len(found.losses),
-        seconds=time.perf_counter() - began,
-        loss=float(found.scores[0]),
-        method="auto",
-        poses=found.path,
-        losses=found.losses,
-    )
 
 
 def _descended(problem: Problem, seed: int, why: str) -> Localization:

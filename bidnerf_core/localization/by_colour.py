@@ -50,6 +50,8 @@ class ByColourConfig(Settings):
 
 TYPICAL_ERRORS = 4.5
 """Largest standard deviation of a position, in median errors of the map's own images, with which a pose is accepted."""
+ROBUST_RAYS = 4
+"""How many times as many rays are rendered where something may hide part of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +64,24 @@ class ColourAnswer:
 
 
 def refine_by_colour(
-    problem: Problem, search: SearchResult, config: ByColourConfig, generator: Generator
+    problem: Problem,
+    search: SearchResult,
+    config: ByColourConfig,
+    generator: Generator,
+    robust: bool = False,
 ) -> ColourAnswer:
-    """Refine the poses found by a search, on colour alone, and judge the result."""
+    """Refine the poses found by a search, on colour alone, and judge the result.
+
+    ``robust`` leaves out what may hide part of the scene, which would mislead steps on few rays or at a coarse level.
+    """
     s, scale, sigma = config.steps, config.colour.colour_scale, config.refinement.surface_sigma
     count = len(search.T.translation)
-    stages = (
-        RefinementStage(s.coarse_steps, s.coarse_rays, count, 0, 2, scale, surface_sigma=sigma),
-        RefinementStage(s.fine_steps, s.fine_rays, 1, None, 1, scale, surface_sigma=sigma / 2),
-    )
+    coarse = RefinementStage(s.coarse_steps, s.coarse_rays, count, 0, 2, scale, surface_sigma=sigma)
+    fine = RefinementStage(s.fine_steps, s.fine_rays, 1, None, 1, scale, surface_sigma=sigma / 2)
+    stages: tuple[RefinementStage, ...] = (coarse, fine)
+    if robust:
+        config = replace(config, colour=replace(config.colour, colour_loss="geman-mcclure"))
+        stages = (replace(fine, rays=ROBUST_RAYS * s.fine_rays, colour_scale=scale / 2),)
     settings = RenderedCostSettings(config.colour, None, config.refinement)
     refined = refine(problem, search.T, stages, settings, generator)
     return ColourAnswer(search, refined, rendered_verdict(refined, config.thresholds, search))

@@ -95,7 +95,7 @@ class DescentSettings(Settings):
 
 @dataclass(frozen=True)
 class ReachSettings(Settings):
-    """Settings that widen the reach of first-order steps. By default nothing is added to the paper's objective."""
+    """Settings that widen the reach of first-order steps. Without any, nothing is added to the paper's objective."""
 
     # number of pixels drawn for each ray; those that show matter, then those that may meet it, come first
     candidates: Annotated[int, Range(1, 64), EXPERT] = 1
@@ -106,7 +106,7 @@ class ReachSettings(Settings):
     blur_steps: Annotated[int, Range(1, 10**7), EXPERT] = (
         200  # number of steps in which the blur falls by half
     )
-    # weight of the distance between measured points and the box of the scene
+    # weight of the distance between measured points and the box of the scene, unless there is matter beyond the box
     box_weight: Annotated[float, Range(0.0), EXPERT] = 0.0
 
 

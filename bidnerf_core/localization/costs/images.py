@@ -24,17 +24,16 @@ from bidnerf_core.se3 import SE3
 
 UNKNOWN_COST = 0.7
 """Cost of a pixel for which the map renders nothing."""
-IMAGE_EXPOSURE_ROUNDS = 2
-"""Rounds of robust reweighting in which the exposure is fitted."""
 
 
 @dataclass(frozen=True)
 class ColourScales:
-    """Scales of the comparison of colours, and priors on an image's exposure relative to the map."""
+    """Scales of the comparison of colours, and how an image's exposure relative to the map is fitted."""
 
     colour: float = 0.2  # norm of the difference over the three channels at which a pixel is half an inlier
     gain: float = 0.2  # standard deviation of the prior about 1
     bias: float = 0.1  # standard deviation of the prior about 0
+    rounds: int = 2  # of robust reweighting, from a gain of 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +172,7 @@ def exposed(
     if not (scales.gain and scales.bias):
         return seen.rgb
     exposure: Exposure | None = None
-    for _ in range(IMAGE_EXPOSURE_ROUNDS):
+    for _ in range(scales.rounds):
         rgb = seen.rgb if exposure is None else exposure.applied(seen.rgb)
         near = geman_mcclure_inlier(((measured - rgb) ** 2).sum(1, keepdim=True), scales.colour)
         weights = (seen.known[:, None] * near**2 / scales.colour**2) * ~clipped(rgb, measured)

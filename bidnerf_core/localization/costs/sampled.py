@@ -71,8 +71,9 @@ class SampledLoss:
 
     def _loss(self, scene: RadianceField, observed: Observations, T_world_last: SE3) -> Float[Tensor, ""]:
         rays = self._rays(observed, T_world_last)
-        loss = self.objective.loss(render(scene, rays, self.problem.bounds.background), observed)
-        return loss + self.reach.box_weight * self._outside(rays, observed) if self.reach.box_weight else loss
+        bounds, weight = self.problem.bounds, self.reach.box_weight
+        loss = self.objective.loss(render(scene, rays, bounds.background), observed)
+        return loss + weight * self._outside(rays, observed) if weight and not bounds.contracted else loss
 
     def _rays(self, observed: Observations, T_world_last: SE3) -> Rays:
         rays = observed.rays(T_world_last, self.problem.bounds)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -37,13 +37,25 @@ class ImageStage:
     keep: int
 
 
-IMAGE_STAGES = (
+IMAGE_STAGES: tuple[ImageStage, ...] = (
     ImageStage(16, 0, 48),
     ImageStage(16, 8, 12),
     ImageStage(24, 8, 4),
     ImageStage(48, 8, 2),
     ImageStage(96, 5, 2),
 )
+DETAILED_STAGES: tuple[ImageStage, ...] = (
+    ImageStage(32, 0, 64),
+    ImageStage(32, 6, 16),
+    ImageStage(48, 8, 6),
+    ImageStage(96, 6, 2),
+    ImageStage(192, 4, 2),
+)
+"""Stages for images that something hides part of: every pixel of a smaller thumbnail would show some of it."""
+SCALES = ColourScales(gain=1.0, rounds=5)
+"""Scales of the search, which finds images that are exposed twice or half as long."""
+DETAILED_SCALES = ColourScales(colour=0.07)
+"""Scales for images that something hides part of: with wider ones, poses that explain its colours a little look better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +66,7 @@ class ImageSearch:
     renderer: ViewRenderer
     middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of what it sees; on the CPU
     extent: float  # metres: size of the scene
-    scales: ColourScales = field(default_factory=ColourScales)
+    scales: ColourScales = SCALES
 
     @staticmethod
     def on_surface(problem: Problem, surface: SurfaceMap) -> ImageSearch:
@@ -86,6 +98,11 @@ class ImageSearch:
         device = self.renderer.device
         return search(T, self._stages(stages), distinct, keep_runner_up=True, device=device)
 
+    @torch.no_grad()
+    def cost(self, T: SE3, width: int = IMAGE_STAGES[-1].width) -> float:
+        """Return the cost of one pose."""
+        return float(self._cost(width)(T[None].to(self.renderer.device)).cost[0])
+
     def thumbnails(self, width: int) -> list[Thumbnail]:
         return [moved(thumbnail(view, width), self.renderer.device) for view in self.views]
 
@@ -95,10 +112,11 @@ class ImageSearch:
 
     def _stages(self, stages: Sequence[ImageStage]) -> Iterator[SearchStage]:
         for stage in stages:
-            cost = ImageCost(
-                self.renderer, self.thumbnails(stage.width), self.scales, self.middle.to(self.renderer.device)
-            )
-            yield SearchStage(cost, self.pivot, stage.steps, stage.keep, damping=1e-2)
+            yield SearchStage(self._cost(stage.width), self.pivot, stage.steps, stage.keep, damping=1e-2)
+
+    def _cost(self, width: int) -> ImageCost:
+        middle = self.middle.to(self.renderer.device)
+        return ImageCost(self.renderer, self.thumbnails(width), self.scales, middle)
 
 
 def _from_keyframes(surface: SurfaceMap, small: Thumbnail, most: int = 16) -> Cast:

@@ -9,8 +9,8 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import FLAT
-from bidnerf_core.localization.auto import MANY_LANDMARKS
 from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
+from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.problem import SceneMap, rig
