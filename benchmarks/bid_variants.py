@@ -25,7 +25,7 @@ from bidnerf_core.evaluation.bench import Plan, planned
 from bidnerf_core.evaluation.provenance import write_record
 
 WITHOUT_REACH: Settings = {"candidates": 1, "box_weight": 0.0}
-"""Nothing is added to the paper's objective; the defaults of ``bid`` do."""
+"""The paper's objective alone; the defaults of ``bid`` add to it."""
 PAPER = {
     "rays": 512,
     "max_steps": 1000,

@@ -77,13 +77,6 @@ def test_the_second_round_leaves_out_what_hides_the_scene() -> None:
     assert all(answer.outcome is Outcome.RENDERING_MISMATCH for answer in found)
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_other_exposures_are_found(factor: float) -> None:
-    """At twice the exposure many colours are clipped."""
-    view = faulty(photograph(UNSEEN[1]), f"exposure:{factor}", seed=0)
-    assert_right(localize(problem(view), "auto", QUICK), UNSEEN[1])
-
-
 def test_measured_depth_that_is_too_little_does_no_harm() -> None:
     view = photograph(UNSEEN[2], depth=True)
     assert view.frame.depth is not None

@@ -17,7 +17,7 @@ from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames import View
-from bidnerf_core.localization import AutoConfig, settings_of
+from bidnerf_core.localization import AutoConfig, by_image_search, settings_of
 from bidnerf_core.localization.problem import on_device, rig
 from bidnerf_core.localization.search import matching
 from bidnerf_core.localization.search.by_images import ImageSearch, ImageStage
@@ -88,11 +88,17 @@ def test_auto_by_depth() -> None:
     assert float(pose_error(here.T_world_camera, view.T_ref_camera).translation) < 0.01
 
 
-def test_auto_by_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_auto_by_colour(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
+    """The second round follows if the first is not accepted, which a part of the image in one colour prevents."""
     (view,) = module_fields.shown(1, seed=5)
-    whole, few = ImageSearch.__call__, (ImageStage(16, 0, 8), ImageStage(16, 3, 2), ImageStage(24, 2, 1))
-    monkeypatch.setattr(ImageSearch, "__call__", lambda search, T: whole(search, T, few))
-    here = on_both(blobs(), without_depth(view), **BY_COLOUR)
+    frame = without_depth(view)
+    rgb = frame.rgb.clone()
+    rgb[: rgb.shape[0] // 3] = 0.5
+    few = (ImageStage(16, 0, 8), ImageStage(16, 3, 2), ImageStage(24, 2, 1))
+    monkeypatch.setattr(by_image_search, "IMAGE_STAGES", few)
+    monkeypatch.setattr(by_image_search, "DETAILED_STAGES", few)
+    here = on_both(blobs(), replace(frame, rgb=rgb), **BY_COLOUR | {"rounds": rounds})
     assert "fresh rays" in here.reason
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -24,6 +25,7 @@ from bidnerf_core.localization.costs.images import (
 from bidnerf_core.localization.costs.thumbnails import Thumbnail, thumbnail
 from bidnerf_core.localization.costs.view_renderers import FieldRenderer, SurfaceRenderer, ViewRenderer
 from bidnerf_core.localization.normal_equations import NormalEquations
+from bidnerf_core.localization.search.by_images import WIDE_SCALES
 from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
@@ -151,6 +153,20 @@ def test_the_exposure_is_what_a_general_solver_finds(generator: Generator) -> No
     g, b = minimize(cost, [0.0, 0.0], tol=1e-12).x
     torch.testing.assert_close(found[0, 0].double(), (1 + g) * rgb[0, 0].double() + b, rtol=0, atol=1e-3)
     assert exposed(seen, wanted, PLAIN) is rgb
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_the_scales_of_the_search_allow_for_twice_and_half_the_exposure(factor: float) -> None:
+    frame = baked.unseen()[0].frame
+    exposed_frame = replace(frame, rgb=(factor * frame.rgb).clamp(max=1))
+    small, T = of_toy(24)
+    other = thumbnail(View(exposed_frame, SE3.identity()), 24)
+    plain, exact, here = (
+        float(compared(on_surface(), [image], scales, T[None]).cost[0])
+        for image, scales in ((other, ColourScales()), (small, WIDE_SCALES), (other, WIDE_SCALES))
+    )
+    assert here < 0.8 * plain
+    assert here < 2.6 * exact  # colours that are clipped at twice the exposure tell less
 
 
 def test_another_exposure_costs_little(generator: Generator) -> None:

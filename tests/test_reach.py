@@ -141,6 +141,23 @@ def test_bid_finds_the_ball_where_the_papers_objective_does_not(frame: Frame) ->
     ]
     assert losses[0] < 0.05
     assert losses[1] > 0.2
+    usual = METHODS["bid"].settings().reach
+    assert (usual.candidates, usual.box_weight) == (3, 1.0)
+
+
+def test_candidates_are_not_drawn_where_every_pixel_shows_matter(frame: Frame) -> None:
+    everywhere = replace(frame, rgb=frame.rgb.clamp(min=0.5), depth=None)
+    assert loss_of(problem_at(frame, 0.0), candidates=3)._candidates == 3
+    assert loss_of(problem_at(everywhere, 0.0), candidates=3)._candidates == 1
+
+
+def test_depth_that_has_no_weight_is_not_used(frame: Frame) -> None:
+    problem = problem_at(frame, 3.0)
+    loss = replace(
+        loss_of(problem, box_weight=1.0),
+        objective=objective_of(ColourSettings(), DepthSettings(depth_weight=0.0)),
+    )
+    assert float(gradient(loss, problem).abs().max()) < 1e-9
 
 
 def test_a_preset_can_be_changed_and_is_checked() -> None:

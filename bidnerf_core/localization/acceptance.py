@@ -220,4 +220,5 @@ def descent_verdict(mean_loss: float, threshold: float, finite: bool, reason: st
     """Judge a first-order descent by the mean loss of its last steps; ``reason`` says why it ended."""
     if not finite or not math.isfinite(mean_loss):
         return Verdict(Outcome.DIVERGED, reason)
+    reason = f"{reason}; mean loss {mean_loss:.3g}, accepted below {threshold:.3g}"
     return Verdict(Outcome.CONVERGED if mean_loss < threshold else Outcome.HIGH_LOSS, reason)

@@ -29,6 +29,7 @@ from bidnerf_core.localization.by_colour import (
 from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface
 from bidnerf_core.localization.by_image_search import localized_by_images
 from bidnerf_core.localization.by_landmarks import (
+    MOSTLY,
     LandmarkAnswer,
     answer_by_landmarks,
     corrected,
@@ -52,8 +53,6 @@ the right place either.
 """
 UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
 """Reasons for which a pose that landmarks determine is rejected: it is not accurate, or not probable, enough."""
-MOSTLY = 0.5
-"""Least share of the measured points on the surface with which a scene is not taken to be partly hidden."""
 FEWER = 0.05
 """Share of the measured points by which landmarks may take a pose off the surface."""
 IN_FRONT = 0.9

@@ -17,8 +17,8 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.settings import Settings
 
-FAR_STARTS = ReachSettings(candidates=3, box_weight=1.0)
-"""Pixels on matter and measured points in the box of the scene: of what was tried from 0.9, 1.7 and 3.4 units, it helped most."""
+WIDE_REACH = ReachSettings(candidates=3, box_weight=1.0)
+"""Pixels on matter and measured points in the box of the scene. On Lego this helped most (``benchmarks/bid_variants.py``)."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class BidConfig(Settings):
     adam: AdamSettings = AdamSettings(learning_rate=0.04, decay=0.4, decay_steps=80)
     colour: ColourSettings = ColourSettings()
     depth: DepthSettings = DepthSettings()
-    reach: ReachSettings = FAR_STARTS
+    reach: ReachSettings = WIDE_REACH
 
 
 PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -35,7 +36,8 @@ class ColourRefinementSettings(Settings):
     # number of rays rendered for each of the coarse steps
     coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256
     fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
-    fine_rays: Annotated[int, Range(7, 10**7)] = 1024  # number of rays rendered for each of the fine steps
+    # number of rays rendered for each of the fine steps; four times as many where something may hide the scene
+    fine_rays: Annotated[int, Range(7, 10**7)] = 1024
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,6 @@ class ByColourConfig(Settings):
 
 TYPICAL_ERRORS = 4.5
 """Largest standard deviation of a position, in median errors of the map's own images, with which a pose is accepted."""
-ROBUST_RAYS = 4
-"""How many times as many rays are rendered where something may hide part of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,23 +68,22 @@ def refine_by_colour(
     search: SearchResult,
     config: ByColourConfig,
     generator: Generator,
-    robust: bool = False,
+    stages: Sequence[RefinementStage] = (),
 ) -> ColourAnswer:
-    """Refine the poses found by a search, on colour alone, and judge the result.
-
-    ``robust`` leaves out what may hide part of the scene, which would mislead steps on few rays or at a coarse level.
-    """
-    s, scale, sigma = config.steps, config.colour.colour_scale, config.refinement.surface_sigma
-    count = len(search.T.translation)
-    coarse = RefinementStage(s.coarse_steps, s.coarse_rays, count, 0, 2, scale, surface_sigma=sigma)
-    fine = RefinementStage(s.fine_steps, s.fine_rays, 1, None, 1, scale, surface_sigma=sigma / 2)
-    stages: tuple[RefinementStage, ...] = (coarse, fine)
-    if robust:
-        config = replace(config, colour=replace(config.colour, colour_loss="geman-mcclure"))
-        stages = (replace(fine, rays=ROBUST_RAYS * s.fine_rays, colour_scale=scale / 2),)
+    """Refine the poses found by a search, on colour alone, and judge the result; ``stages`` replace the usual ones."""
+    stages = stages or usual_stages(config, len(search.T.translation))
     settings = RenderedCostSettings(config.colour, None, config.refinement)
     refined = refine(problem, search.T, stages, settings, generator)
     return ColourAnswer(search, refined, rendered_verdict(refined, config.thresholds, search))
+
+
+def usual_stages(config: ByColourConfig, count: int) -> tuple[RefinementStage, ...]:
+    """Return a stage at the coarsest level from each of ``count`` poses, and one in full detail from the best."""
+    s, scale, sigma = config.steps, config.colour.colour_scale, config.refinement.surface_sigma
+    return (
+        RefinementStage(s.coarse_steps, s.coarse_rays, count, 0, 2, scale, surface_sigma=sigma),
+        RefinementStage(s.fine_steps, s.fine_rays, 1, None, 1, scale, surface_sigma=sigma / 2),
+    )
 
 
 def localization_of(

@@ -3,54 +3,97 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Generator
 
+from bidnerf_core.localization.acceptance import FLAT
 from bidnerf_core.localization.auto_config import AutoConfig
-from bidnerf_core.localization.by_colour import ColourAnswer, localization_of, refine_by_colour
+from bidnerf_core.localization.by_colour import (
+    ByColourConfig,
+    ColourAnswer,
+    localization_of,
+    refine_by_colour,
+    usual_stages,
+)
 from bidnerf_core.localization.by_landmarks import is_sharp
+from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.refinement import refine
 from bidnerf_core.localization.result import Localization, Outcome
 from bidnerf_core.localization.search.by_images import (
+    COMPARED_SCALES,
     DETAILED_SCALES,
     DETAILED_STAGES,
     IMAGE_STAGES,
     ImageSearch,
+    ImageStage,
 )
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
+COMPARED_WIDTH = 96
+"""Pixels of the longer side of thumbnails on which the answers of different rounds are compared: finer ones compare noise."""
+MANY_RAYS = 4
+"""How many times as many rays are rendered where something may hide part of the scene."""
 MANY_LANDMARKS = 500
 """The number of landmarks from which on a scene is textured."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """A search by images, and what refines and judges the poses that it leaves."""
+
+    search: ImageSearch
+    stages: Sequence[ImageStage]
+    refined: Callable[[Problem, SearchResult, ByColourConfig, Generator], ColourAnswer]
 
 
 def localized_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfig, seed: int) -> Localization:
     """Compare the images with renderings of the surface, in rounds until an answer is accepted, and refine each answer.
 
-    From the second round on, the comparison is more detailed and leaves out what may hide part of the scene.
+    The first round is quick. The others suppose that something hides part of the scene. If no answer is accepted, the one that
+    explains most of the images is returned.
     """
     began, generator = time.perf_counter(), Generator().manual_seed(seed)
-    search, stages, answers = ImageSearch.on_surface(problem, surface), IMAGE_STAGES, list[ColourAnswer]()
-    detailed = replace(search, scales=DETAILED_SCALES)
-    keyframes = SE3.from_matrix(surface.keyframes).to("cpu")
-    known = Surroundings(keyframes, surface.extent, torch.zeros(3), search.middle)
-    while True:
+    search = ImageSearch.on_surface(problem, surface)
+    first = _Round(search, IMAGE_STAGES, refine_by_colour)
+    detailed = _Round(replace(search, scales=DETAILED_SCALES), DETAILED_STAGES, _refined_robustly)
+    known = Surroundings(
+        SE3.from_matrix(surface.keyframes).to("cpu"), surface.extent, torch.zeros(3), search.middle
+    )
+    answers: list[ColourAnswer] = []
+    for this in (first, *(config.rounds - 1) * (detailed,)):
         with torch.no_grad():
             many = hypotheses_for_images(known, problem.start, config.hypotheses, generator)
-            found = search(many, stages)
+            found = this.search(many, this.stages)
         if config.landmarks and _is_hopeless(problem):
             return _unrecognised(problem, found, began)
-        answers.append(
-            refine_by_colour(problem, found, config.by_colour, generator, robust=search is detailed)
-        )
-        best = min(answers, key=lambda answer: detailed.cost(answer.refined.T))
-        if best.verdict.accepted or len(answers) == config.rounds:
-            return localization_of(problem, best, config.by_colour, began, "auto")
-        search, stages = detailed, DETAILED_STAGES
+        answers.append(this.refined(problem, found, config.by_colour, generator))
+        if answers[-1].verdict.accepted or answers[-1].refined.contrast < FLAT:
+            return localization_of(problem, answers[-1], config.by_colour, began, "auto")
+    judge = replace(search, scales=COMPARED_SCALES)
+    best = min(answers, key=lambda answer: judge.cost(answer.refined.T, COMPARED_WIDTH))
+    return localization_of(problem, best, config.by_colour, began, "auto")
+
+
+def _refined_robustly(
+    problem: Problem, search: SearchResult, config: ByColourConfig, generator: Generator
+) -> ColourAnswer:
+    """Refine the best pose of a search on many rays, with a loss that ignores outliers, and judge it as any other pose.
+
+    Few rays, or rays at a coarse level, lead it away where half of them are outliers.
+    """
+    *_, fine = usual_stages(config, 1)
+    many = replace(fine, rays=MANY_RAYS * fine.rays, colour_scale=fine.colour_scale / 2)
+    robust = replace(config.colour, colour_loss="geman-mcclure")
+    settings = RenderedCostSettings(robust, None, config.refinement)
+    T = refine(problem, search.T[:1], (many,), settings, generator).T
+    return refine_by_colour(problem, replace(search, T=T[None]), config, generator, (replace(fine, steps=0),))
 
 
 def _is_hopeless(problem: Problem) -> bool:

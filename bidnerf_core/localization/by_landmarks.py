@@ -57,6 +57,8 @@ SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
 DEPTH_SCALE_NOISE = 0.01
 """Relative standard deviation of the depth scale that a few landmarks give."""
+MOSTLY = 0.5
+"""Least share of the measured points on the surface with which a scene is not taken to be partly hidden."""
 PRIOR_WIDTH = 2.0
 """Standard deviation of the prior of the depth scale over that of the sensor's scale, since single sensors are off by far more."""
 
@@ -250,6 +252,9 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
     if problem.start is not None:
         poses = [problem.start, *poses]
     fused = f", fused with {' and '.join(answer.terms)}" if answer.terms else ""
+    there = answer.diagnostics.on_surface
+    if there is not None and there < MOSTLY:
+        fused += f", although only {there:.0%} of the measured points lie on the surface"
     return Localization(
         T_world_camera=answer.T,
         outcome=answer.verdict.outcome,

@@ -95,9 +95,9 @@ class DescentSettings(Settings):
 
 @dataclass(frozen=True)
 class ReachSettings(Settings):
-    """Settings that widen the reach of first-order steps. Without any, nothing is added to the paper's objective."""
+    """Settings that widen the reach of first-order steps. The defaults add nothing to the paper's objective."""
 
-    # number of pixels drawn for each ray; those that show matter, then those that may meet it, come first
+    # number of pixels drawn for each ray, where images show background; those that show matter, then those that may meet it, come first
     candidates: Annotated[int, Range(1, 64), EXPERT] = 1
     # number of equal intervals of each ray, whether or not they may hold matter; 0: the field's own
     samples: Annotated[int, Range(0, 4096), EXPERT] = 0

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.localization.bid import BidConfig
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
@@ -20,7 +21,6 @@ from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
     DescentSettings,
-    ReachSettings,
     RefinementSettings,
     RefinementStage,
     objective_of,
@@ -95,7 +95,7 @@ def _first_order(problem: Problem, level: int, mode: Elsewhere | None) -> Tensor
     objective = objective_of(ColourSettings(), DepthSettings())
     settings, generator = DescentSettings(level=level), torch.Generator(device).manual_seed(0)
     loss = SampledLoss(
-        problem.on_device(), objective, RayCounts(CHECKED_RAYS), settings, ReachSettings(), generator
+        problem.on_device(), objective, RayCounts(CHECKED_RAYS), settings, BidConfig().reach, generator
     )
     steps = AdamSteps(loss, pivot("scene", problem), AdamSettings(), start.to(device))
     with without_waiting():

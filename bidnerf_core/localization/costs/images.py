@@ -33,7 +33,7 @@ class ColourScales:
     colour: float = 0.2  # norm of the difference over the three channels at which a pixel is half an inlier
     gain: float = 0.2  # standard deviation of the prior about 1
     bias: float = 0.1  # standard deviation of the prior about 0
-    rounds: int = 2  # of robust reweighting, from a gain of 1
+    exposure_rounds: int = 2  # number of rounds of robust reweighting, which begin at a gain of 1; at least 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,7 @@ def exposed(
     if not (scales.gain and scales.bias):
         return seen.rgb
     exposure: Exposure | None = None
-    for _ in range(scales.rounds):
+    for _ in range(scales.exposure_rounds):
         rgb = seen.rgb if exposure is None else exposure.applied(seen.rgb)
         near = geman_mcclure_inlier(((measured - rgb) ** 2).sum(1, keepdim=True), scales.colour)
         weights = (seen.known[:, None] * near**2 / scales.colour**2) * ~clipped(rgb, measured)

@@ -10,7 +10,8 @@ from torch import Generator, Tensor
 
 from bidnerf_core.blurring import Blurred
 from bidnerf_core.constants import constant
-from bidnerf_core.field import RadianceField, Rays, widened
+from bidnerf_core.field import RadianceField, Rays, SceneBounds, widened
+from bidnerf_core.frames import Frame
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import DescentSettings, ReachSettings
 from bidnerf_core.localization.problem import Problem
@@ -24,6 +25,8 @@ from bidnerf_core.se3 import SE3
 
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""
+FEW = 0.02
+"""Share of an image's pixels that show no matter up to which it is not worth while to draw pixels that do."""
 BOX_SCALE = 0.1
 """Distance (metres) between a measured point and the box of the scene at which outliers begin."""
 
@@ -41,9 +44,12 @@ class SampledLoss:
     _drawer: PixelDrawer = field(init=False)
     _batches: list[Observations] | None = field(default=None, init=False)
     _calls: int = field(default=0, init=False)
+    _candidates: int = field(default=1, init=False)
 
     def __post_init__(self) -> None:
         self._drawer = drawer(self.rays.pixels)
+        if any(_share_of_background(view.frame, self.problem.bounds) > FEW for view in self.problem.views):
+            self._candidates = self.reach.candidates
 
     def __call__(self, T_world_last: SE3) -> Float[Tensor, ""]:
         """Return the loss; differentiable in the pose of the last view's camera."""
@@ -73,7 +79,8 @@ class SampledLoss:
         rays = self._rays(observed, T_world_last)
         bounds, weight = self.problem.bounds, self.reach.box_weight
         loss = self.objective.loss(render(scene, rays, bounds.background), observed)
-        return loss + weight * self._outside(rays, observed) if weight and not bounds.contracted else loss
+        boxed = weight > 0 and self.objective.uses_depth and not bounds.contracted
+        return loss + weight * self._outside(rays, observed) if boxed else loss
 
     def _rays(self, observed: Observations, T_world_last: SE3) -> Rays:
         rays = observed.rays(T_world_last, self.problem.bounds)
@@ -91,9 +98,9 @@ class SampledLoss:
     def _drawn(self, T_world_last: SE3) -> list[Observations]:
         """Draw pixels (views, pixels a view) and, where there are any, rays of depth (1, rays)."""
         problem, device = self.problem, self.problem.device
-        many = self.counts.pixels * self.reach.candidates
+        many = self.counts.pixels * self._candidates
         pixels = draw(problem.views, many, self._drawer, self.generator, device=device)
-        if self.reach.candidates > 1:
+        if self._candidates > 1:
             count = max(1, self.counts.pixels // len(problem.views))
             order = self._rank(pixels, T_world_last).sort(dim=-1, descending=True, stable=True).indices
             pixels = pixels.gathered(order[:, :count])
@@ -110,3 +117,9 @@ class SampledLoss:
         shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
         sampler = self.problem.level(self.rays.level).sampler
         return 2 * shows.int() + sampler(self._rays(pixels, T_world_last)).valid.any(-1).int()
+
+
+def _share_of_background(frame: Frame, bounds: SceneBounds) -> float:
+    """Return the share of the pixels that have the background's colour and no measured depth."""
+    plain = ((frame.rgb - constant(bounds.background, frame.rgb)).abs() <= DIFFERENT).all(-1)
+    return float((plain if frame.depth is None else plain & (frame.depth <= 0)).float().mean())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -51,11 +51,16 @@ DETAILED_STAGES: tuple[ImageStage, ...] = (
     ImageStage(96, 6, 2),
     ImageStage(192, 4, 2),
 )
-"""Stages for images that something hides part of: every pixel of a smaller thumbnail would show some of it."""
-SCALES = ColourScales(gain=1.0, rounds=5)
-"""Scales of the search, which finds images that are exposed twice or half as long."""
+"""Stages for images that something hides part of: nearly every pixel of a smaller thumbnail would show some of it."""
+WIDE_SCALES = ColourScales(gain=1.0, exposure_rounds=5)
+"""Scales with which images that are exposed twice or half as long are found."""
 DETAILED_SCALES = ColourScales(colour=0.07)
-"""Scales for images that something hides part of: with wider ones, poses that explain its colours a little look better."""
+"""Scales for images that something hides part of: with wider ones, poses that explain its colours a little look better.
+
+They suppose about the map's exposure. With wider priors, more of what hides the scene is explained.
+"""
+COMPARED_SCALES = replace(WIDE_SCALES, colour=0.07, exposure_rounds=10)
+"""Scales with which few poses are compared, whatever the exposure and whatever hides part of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +71,7 @@ class ImageSearch:
     renderer: ViewRenderer
     middle: Float[Tensor, "3"]  # metres, last camera's frame: the middle of what it sees; on the CPU
     extent: float  # metres: size of the scene
-    scales: ColourScales = SCALES
+    scales: ColourScales = field(default_factory=ColourScales)
 
     @staticmethod
     def on_surface(problem: Problem, surface: SurfaceMap) -> ImageSearch:
@@ -79,7 +84,7 @@ class ImageSearch:
         has_background = float(seen.met.float().mean()) < 1 - OPEN
         renderer = SurfaceRenderer(surface, problem.bounds.background if has_background else None)
         middle = torch.tensor([0.0, 0.0, away])
-        return ImageSearch(problem.views, renderer, middle, surface.extent)
+        return ImageSearch(problem.views, renderer, middle, surface.extent, WIDE_SCALES)
 
     @staticmethod
     def in_field(problem: Problem, start: SE3) -> ImageSearch:
@@ -99,8 +104,8 @@ class ImageSearch:
         return search(T, self._stages(stages), distinct, keep_runner_up=True, device=device)
 
     @torch.no_grad()
-    def cost(self, T: SE3, width: int = IMAGE_STAGES[-1].width) -> float:
-        """Return the cost of one pose."""
+    def cost(self, T: SE3, width: int) -> float:
+        """Return the cost of one pose, with thumbnails of that width."""
         return float(self._cost(width)(T[None].to(self.renderer.device)).cost[0])
 
     def thumbnails(self, width: int) -> list[Thumbnail]:

@@ -70,7 +70,7 @@ class AdamSteps:
 
         It is for the end of each ``WINDOW`` steps; rows of steps that were not taken are those of earlier ones.
         """
-        log = self._log.cpu()
+        log = self._log.to("cpu", copy=True)  # later steps overwrite it
         return SE3(log[:, :9].unflatten(1, (3, 3)), log[:, 9:12]), log[:, 12], log[:, 13] > 0
 
     @torch.no_grad()
