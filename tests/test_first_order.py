@@ -26,6 +26,7 @@ from bidnerf_core.localization.method_settings import (
 )
 from bidnerf_core.localization.pivots import Pivot, PivotName, pivot
 from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.history import WINDOW
 from bidnerf_core.pixels import DrawerName, draw, uniform
@@ -80,6 +81,15 @@ def test_inerf_uses_no_depth(problem: Problem) -> None:
         for depth in (None, wrong)
     ]
     assert torch.equal(answers[0].poses.matrix(), answers[1].poses.matrix())
+
+
+def test_an_image_of_a_single_colour_determines_nothing() -> None:
+    """From where no ray meets anything, the loss of a plain background is 0."""
+    plain = Frame("plain", torch.ones((CAMERA.height, CAMERA.width, 3)), CAMERA)
+    away = SE3(TRUTH.rotation, TRUTH.translation + 10)
+    found = localize(single(FIELD, BOUNDS, plain, away), "bid", {"rays": 64, "max_steps": 2})
+    assert found.outcome is Outcome.UNDETERMINED
+    assert "single colour" in found.reason
 
 
 def test_inerf_takes_one_image() -> None:

@@ -22,7 +22,7 @@ COMMANDS = {
     "render": "render images and depth of a map from a dataset's poses",
     "localize": "find the poses of photos, or of a dataset's frames, in a map",
     "track": "find the poses of a sequence's frames in a map, in the order of time",
-    "evaluate": "localize many frames from wrong starts, one JSON line a trial",
+    "evaluate": "localize many frames from perturbed starts, one JSON line per trial",
     "compare": "try the same starts in several maps: success, steps, time, memory",
     "report": "make one page of tables, figures and tests of an evaluation",
 }

@@ -160,7 +160,7 @@ def _ending(path: Path) -> str:
 def show_in_full(answer: Answer) -> None:
     """Print an answer in some lines: its errors where the truth is known, its uncertainty, the matrix."""
     found = answer.found
-    show(f"{answer.query.name}: {'converged' if found.converged else 'NOT converged'} ({found.reason})")
+    show(f"{answer.query.name}: {_verdict(found)} ({found.reason})")
     if answer.error is not None:
         start = "no start" if answer.start_error is None else _shown(answer.start_error)
         show(f"  start error  {start}")
@@ -175,10 +175,15 @@ def show_in_full(answer: Answer) -> None:
         show("    " + " ".join(f"{value: .6f}" for value in row))
 
 
+def _verdict(found: Localization) -> str:
+    """Return whether an answer is accepted; the outcome is what the page of troubleshooting explains."""
+    return "converged" if found.converged else f"NOT converged: {found.outcome.value}"
+
+
 def show_in_short(answer: Answer) -> None:
     """Print an answer in a line."""
     found, error = answer.found, answer.error
-    verdict = "converged" if found.converged else f"NOT converged ({found.reason})"
+    verdict = "converged" if found.converged else f"{_verdict(found)} ({found.reason})"
     known = "" if error is None else f"error {_shown(error)}; "
     show(f"{answer.query.name}: {known}{verdict}; {amount(found.steps, 'step')}, {found.seconds:.2f} s")
 

@@ -107,7 +107,7 @@ def run(arguments: list[str]) -> None:
         preset: Preset = None,
         config: Any = settings,
     ) -> None:
-        """Localize many frames from wrong starts, or from none, and write one JSON line a trial.
+        """Localize many frames from perturbed starts, or from none, and write one JSON line per trial.
 
         Finished trials are kept whatever happens: the same command goes on where it stopped. 'bidnerf report' makes tables
         and figures of the results.

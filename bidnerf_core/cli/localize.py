@@ -113,7 +113,7 @@ def run(arguments: list[str]) -> None:
             Path | None, option("DIR", "draw each photo beside the map rendered from the pose found", "")
         ] = None,
         seed: Annotated[int, option("N", "seed of every random choice")] = 0,
-        json: Annotated[Flag, option(None, "print one JSON object a query, each on a line", "")] = False,
+        json: Annotated[Flag, option(None, "print one JSON object per query, each on a line", "")] = False,
         model_points: SparseChoice = SparseChoice(),
         preset: Preset = None,
         config: Any = settings,

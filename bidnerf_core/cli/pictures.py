@@ -51,6 +51,6 @@ class Painter:
         tiles: Sequence[tuple[object, str]] = (
             (left, left_caption),
             (rendered, caption),
-            (blend(self.observed, rendered), "edges: observed green, found pink"),
+            (blend(self.observed, rendered), "edges: photo green, map pink"),
         )
         return np.concatenate([tile(image, text) for image, text in tiles], axis=1)  # type: ignore[arg-type]

@@ -144,7 +144,7 @@ def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable
             now = time.monotonic()
             began, spoke = (began, spoke) if done else (now, now)
             each = (now - began) / max(1, done)
-            rate = f"{each:.1f} s each" if each >= 1 else f"{1 / max(each, 1e-9):.1f} a second"
+            rate = f"{each:.1f} s each" if each >= 1 else f"{1 / max(each, 1e-9):.1f} per second"
             bar.update(task, completed=done, total=of, rate=rate)
             last_of_a_long_run = done == of and spoke > began
             if not console.is_terminal and of > 1 and (now - spoke > LINE_EVERY or last_of_a_long_run):

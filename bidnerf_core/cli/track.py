@@ -85,7 +85,7 @@ def run(arguments: list[str]) -> None:
             Flag,
             option(
                 None,
-                "answer frames as they come, one JSON object a line on stdout, until Ctrl-C or the end",
+                "answer frames as they come, one JSON object per line on stdout, until Ctrl-C or the end",
                 "",
             ),
         ] = False,

@@ -109,10 +109,13 @@ class TrackedPath:
         """Return the summary of a run that took ``seconds``."""
         table = Table(show_header=False, box=None, pad_edge=False)
         total, lost = len(self.frames), self.lost
-        table.add_row("frames", f"{total}, {total / max(seconds, 1e-9):.1f} a second")
+        table.add_row("frames", f"{total}, {total / max(seconds, 1e-9):.1f} per second")
         table.add_row("tracked", f"{len(self.accepted)} ({len(self.accepted) / max(1, total):.1%})")
         longest = max((last - first + 1 for first, last in lost), default=0)
-        table.add_row("lost", f"{len(lost)} times, longest {longest} frames" if lost else "never")
+        table.add_row(
+            "lost",
+            f"{amount(len(lost), 'time')}, at most for {amount(longest, 'frame')}" if lost else "never",
+        )
         for name, text in self._error_rows():
             table.add_row(name, text)
         if seen := sum(map(self._is_of_training, self.frames)):

@@ -101,7 +101,7 @@ def _draw_cameras(panel: Any, cameras: Float[np.ndarray, "v 2"], report: Capture
     for start, step in zip(cameras, ahead - cameras, strict=True):
         panel.plot(*np.stack([start, start + length * step]).T, color="#555", linewidth=0.7, zorder=2)
     worst = [photo.problems[0] if photo.problems else None for photo in report.photos]
-    _mark(panel, cameras[[w is None for w in worst]], SOUND, "o", "nothing found", 18)
+    _mark(panel, cameras[[w is None for w in worst]], SOUND, "o", "without a finding", 18)
     for problem, (colour, marker) in LOOKS.items():
         _mark(panel, cameras[[w == problem for w in worst]], colour, marker, problem, 55)
     _label(panel, cameras, report)

@@ -50,8 +50,8 @@ def overlay(
     below = [chequered(images[0], images[2]), blend(images[0], images[1]), blend(images[0], images[2])]
     notes = [
         "observed / found, chequered",
-        "edges: observed green, start pink",
-        "edges: observed green, found pink",
+        "edges: photo green, start pink",
+        "edges: photo green, map pink",
     ]
     rows = [
         np.concatenate([tile(image, caption) for image, caption in zip(row, text, strict=True)], axis=1)

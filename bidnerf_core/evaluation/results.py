@@ -1,4 +1,4 @@
-"""A file of results: one JSON line a trial, each on the disk before its trial counts as done."""
+"""A file of results: one JSON line per trial, each on the disk before its trial counts as done."""
 
 from __future__ import annotations
 

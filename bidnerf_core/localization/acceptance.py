@@ -11,6 +11,7 @@ from dataclasses import astuple, dataclass
 
 import torch
 
+from bidnerf_core.frames import Frame
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
@@ -29,6 +30,7 @@ IMAGE_MARGIN = 0.01
 """Least relative difference in cost between the best and the next best answer of a search by images."""
 FLAT = 0.02
 """Standard deviation of an image's colours, in [0, 1], below which a gain and a bias make any view fit it."""
+BLANK = Verdict(Outcome.UNDETERMINED, "the image is of a single colour, as if the lens were covered")
 AMBIGUOUS = Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
 
 
@@ -185,6 +187,11 @@ def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> 
     return motion > most and (probability > thresholds.alternative or probability * motion > most)
 
 
+def is_blank(frame: Frame) -> bool:
+    """Return whether the image is of a single colour, as if the lens were covered, or the frame has no colours at all."""
+    return not frame.has_colour or float(frame.rgb.flatten(0, 1).std(0).max()) < FLAT
+
+
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
     """Return the share of lines of sight that meet the surface well before the point that was measured."""
     some, surface = cost.cloud.first(SIGHT_LINES), cost.surface
@@ -204,7 +211,7 @@ def rendered_verdict(
     if not bool(found.covariance.isfinite().all()):
         return Verdict(Outcome.UNDETERMINED, "what was measured does not determine the pose")
     if found.contrast < FLAT:
-        return Verdict(Outcome.UNDETERMINED, "the image is of a single colour, as if the lens were covered")
+        return BLANK
     share = f"{found.inliers:.0%} of fresh rays agree with what was measured"
     if not found.inliers >= thresholds.converged_inliers:
         return Verdict(Outcome.RENDERING_MISMATCH, f"{share}, expected {thresholds.converged_inliers:.0%}")

@@ -26,7 +26,8 @@ class AutoConfig(Settings):
     refine_steps: Annotated[int, Range(0, 1000)] = 2
     refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for each of these steps
     landmarks: bool = True  # match image features with the map's landmarks first, where it has some
-    # number of rendered rays that are fused with landmarks; 0: none, nor any to tell cameras or mirror images apart
+    # number of rendered rays that are fused with landmarks; 0: nothing is rendered, neither for that nor to tell cameras or mirror
+    # images apart
     fused_rays: Annotated[int, Range(0, 10**6)] = 1024
     # what measured the depth: unknown, kinect, realsense, lidar or rendered
     depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"

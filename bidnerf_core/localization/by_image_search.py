@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Generator
 
-from bidnerf_core.localization.acceptance import FLAT
+from bidnerf_core.localization.acceptance import BLANK, FLAT, is_blank
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.by_colour import (
     ByColourConfig,
@@ -22,7 +22,7 @@ from bidnerf_core.localization.by_landmarks import is_sharp
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import refine
-from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.by_images import (
     COMPARED_SCALES,
     DETAILED_SCALES,
@@ -106,10 +106,13 @@ def _unrecognised(problem: Problem, found: SearchResult, began: float) -> Locali
     """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
     approximate = any(view.frame.focal_is_approximate for view in problem.views)
     focal = "; give the camera's calibration instead of an approximate focal length" if approximate else ""
+    why = f"too few landmarks were recognised, and the field is too blurred to compare images with its renderings{focal}"
+    blank = all(is_blank(view.frame) for view in problem.views)
+    verdict = BLANK if blank else Verdict(Outcome.TOO_FEW_MATCHES, why)
     return Localization(
         T_world_camera=found.T[0].normalized(),
-        outcome=Outcome.TOO_FEW_MATCHES,
-        reason=f"too few landmarks were recognised, and the field is too blurred to compare images with its renderings{focal}",
+        outcome=verdict.outcome,
+        reason=verdict.reason,
         steps=len(found.losses),
         seconds=time.perf_counter() - began,
         loss=float(found.scores[0]),

@@ -6,7 +6,7 @@ import time
 
 import torch
 
-from bidnerf_core.localization.acceptance import descent_verdict
+from bidnerf_core.localization.acceptance import BLANK, descent_verdict, is_blank
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import AdamSettings, DescentSettings, ReachSettings
@@ -39,6 +39,9 @@ def descended(
     )
     T, mean = history.answer(adam.answer)
     verdict = descent_verdict(mean, adam.converged_loss, finite, reason)
+    by_depth = objective.uses_depth and problem.has_depth
+    if verdict.accepted and not by_depth and all(is_blank(view.frame) for view in problem.views):
+        verdict = BLANK
     return Localization(
         T_world_camera=T,
         outcome=verdict.outcome,

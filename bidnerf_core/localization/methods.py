@@ -39,7 +39,8 @@ class Method:
             return self.config_type()
         if preset not in self.presets:
             offered = ", ".join(self.presets) or "none"
-            raise InputError(f"preset {preset!r} is unknown, this method offers {offered}")
+            others = "" if self.presets else "; 'bid' and 'inerf' have presets"
+            raise InputError(f"preset {preset!r} is unknown, this method offers {offered}{others}")
         return self.presets[preset]
 
 

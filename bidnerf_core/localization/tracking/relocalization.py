@@ -8,7 +8,7 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
-from bidnerf_core.localization.acceptance import FLAT
+from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
@@ -89,11 +89,6 @@ def is_searchable(frame: Frame) -> bool:
 def has_points(frame: Frame) -> bool:
     """Return whether the frame has enough measured depth for the shape of the scene to be recognised."""
     return frame.depth is not None and int((frame.depth > 0).sum()) >= LEAST_POINTS
-
-
-def is_blank(frame: Frame) -> bool:
-    """Return whether the image is of a single colour, as if the lens were covered, or the frame has no colours at all."""
-    return not frame.has_colour or float(frame.rgb.flatten(0, 1).std(0).max()) < FLAT
 
 
 def _searched(localizer: Localizer, frame: Frame, lost: int) -> bool:
