@@ -32,7 +32,7 @@ from bidnerf_core.mapping import BakeConfig, bake
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "auto": {},
-    "bid": {"rays": 256, "max_steps": 40},
+    "bid": {"rays": 256, "max_steps": 40, "candidates": 1, "box_weight": 0.0},  # the paper's objective
     "inerf": {"rays": 256, "max_steps": 40},
     "bid-lm": {"poses": 8, "fine_rays": 256},
     "inerf-lm": {"poses": 16, "search_poses": 6, "middle_poses": 3, "fine_rays": 256, "width": 8},

@@ -5,7 +5,8 @@ rounding, in another order of sums or on another processor, within the tolerance
 those of noise-free scenes are the covariance of rounding errors. Since then only ``auto`` has another record: the surface's
 cells became finer, depth is refined against the surface and the field together, which moved its answers by up to 5e-4, and the
 exposure is estimated with depth as well, which moved those with depth by up to 2e-3, from 1 to 3 mm off in this scene of
-unchanged exposure, and before a plain background, which moved those by colour by up to 2e-4.
+unchanged exposure, and before a plain background, which moved those by colour by up to 2e-4; the search by images fits the exposure in
+more rounds, which moved them by 4e-5.
 A change of a method that is meant to change its answers
 needs a new record (``python benchmarks/pinned_poses.py record``) and a word on why.
 """
