@@ -37,7 +37,7 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
 COMPARED_WIDTH = 96
-"""Pixels of the longer side of thumbnails on which the answers of different rounds are compared: finer ones compare noise."""
+"""Pixels of the longer side of thumbnails on which the answers of different rounds are compared, as in the last stage of the first."""
 MANY_RAYS = 4
 """How many times as many rays are rendered where something may hide part of the scene."""
 MANY_LANDMARKS = 500
