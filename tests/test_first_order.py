@@ -84,7 +84,7 @@ def test_inerf_uses_no_depth(problem: Problem) -> None:
 
 
 def test_an_image_of_a_single_colour_determines_nothing() -> None:
-    """From where no ray meets anything, the loss of a plain background is 0."""
+    """The loss of a plain background is 0 wherever no ray meets anything."""
     plain = Frame("plain", torch.ones((CAMERA.height, CAMERA.width, 3)), CAMERA)
     away = SE3(TRUTH.rotation, TRUTH.translation + 10)
     found = localize(single(FIELD, BOUNDS, plain, away), "bid", {"rays": 64, "max_steps": 2})

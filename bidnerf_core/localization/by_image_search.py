@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Generator
 
-from bidnerf_core.localization.acceptance import BLANK, FLAT, is_blank
+from bidnerf_core.localization.acceptance import BLANK, is_blank
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.by_colour import (
     ByColourConfig,
@@ -66,15 +66,17 @@ def localized_by_images(problem: Problem, surface: SurfaceMap, config: AutoConfi
     known = Surroundings(
         SE3.from_matrix(surface.keyframes).to("cpu"), surface.extent, torch.zeros(3), search.middle
     )
+    blank = all(is_blank(view.frame) for view in problem.views)
+    hopeless = blank or (config.landmarks and _is_hopeless(problem))
     answers: list[ColourAnswer] = []
     for this in (first, *(config.rounds - 1) * (detailed,)):
         with torch.no_grad():
             many = hypotheses_for_images(known, problem.start, config.hypotheses, generator)
             found = this.search(many, this.stages)
-        if config.landmarks and _is_hopeless(problem):
-            return _unrecognised(problem, found, began)
+        if hopeless:
+            return _unrefined(found, BLANK if blank else _unrecognised(problem), began)
         answers.append(this.refined(problem, found, config.by_colour, generator))
-        if answers[-1].verdict.accepted or answers[-1].refined.contrast < FLAT:
+        if answers[-1].verdict.accepted:
             return localization_of(problem, answers[-1], config.by_colour, began, "auto")
     judge = replace(search, scales=COMPARED_SCALES)
     best = min(answers, key=lambda answer: judge.cost(answer.refined.T, COMPARED_WIDTH))
@@ -102,13 +104,16 @@ def _is_hopeless(problem: Problem) -> bool:
     return textured and not is_sharp(problem)
 
 
-def _unrecognised(problem: Problem, found: SearchResult, began: float) -> Localization:
-    """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
+def _unrecognised(problem: Problem) -> Verdict:
+    """Return why an image without recognised landmarks is rejected in a blurred field."""
     approximate = any(view.frame.focal_is_approximate for view in problem.views)
     focal = "; give the camera's calibration instead of an approximate focal length" if approximate else ""
     why = f"too few landmarks were recognised, and the field is too blurred to compare images with its renderings{focal}"
-    blank = all(is_blank(view.frame) for view in problem.views)
-    verdict = BLANK if blank else Verdict(Outcome.TOO_FEW_MATCHES, why)
+    return Verdict(Outcome.TOO_FEW_MATCHES, why)
+
+
+def _unrefined(found: SearchResult, verdict: Verdict, began: float) -> Localization:
+    """Return the best pose of a search by images as rejected; refining it on rendered rays would take many seconds."""
     return Localization(
         T_world_camera=found.T[0].normalized(),
         outcome=verdict.outcome,

@@ -25,7 +25,7 @@ from bidnerf_core.se3 import SE3
 
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""
-FEW = 0.02
+LITTLE_BACKGROUND = 0.02
 """Share of an image's pixels that show no matter up to which it is not worth while to draw pixels that do."""
 BOX_SCALE = 0.1
 """Distance (metres) between a measured point and the box of the scene at which outliers begin."""
@@ -48,7 +48,7 @@ class SampledLoss:
 
     def __post_init__(self) -> None:
         self._drawer = drawer(self.rays.pixels)
-        if any(_share_of_background(view.frame, self.problem.bounds) > FEW for view in self.problem.views):
+        if self.reach.candidates > 1 and _shows_background(self.problem):
             self._candidates = self.reach.candidates
 
     def __call__(self, T_world_last: SE3) -> Float[Tensor, ""]:
@@ -117,6 +117,11 @@ class SampledLoss:
         shows = pixels.measured | ((pixels.rgb - background).abs().amax(-1) > DIFFERENT)
         sampler = self.problem.level(self.rays.level).sampler
         return 2 * shows.int() + sampler(self._rays(pixels, T_world_last)).valid.any(-1).int()
+
+
+def _shows_background(problem: Problem) -> bool:
+    """Return whether pixels of an image have the background's colour and no measured depth, more than a few."""
+    return any(_share_of_background(view.frame, problem.bounds) > LITTLE_BACKGROUND for view in problem.views)
 
 
 def _share_of_background(frame: Frame, bounds: SceneBounds) -> float:
