@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json, show
-from bidnerf_core.errors import InputError
+from bidnerf_core.cli.trial_progress import duration_text
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.capture_figure import draw_capture
-from bidnerf_core.field import levels
+from bidnerf_core.field import SceneBounds, levels
 from bidnerf_core.map_cameras import pose_sentences
 from bidnerf_core.map_parts import load_capture
 from bidnerf_core.mapping.capture_advice import sentences
 from bidnerf_core.mapping.capture_report import CaptureReport
+from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.surface_map import SurfaceMap
 from bidnerf_core.serialization import to_plain
 from bidnerf_core.storage import Map, load_map
@@ -39,8 +41,8 @@ def info(
         poses = [to_plain(camera.moved) for camera in stored.info.cameras if camera.moved is not None]
         print_json(facts | {"moved": poses, "capture": None if capture is None else to_plain(capture)})
         return
-    for key, value in facts.items():
-        show(f"{key + ':':<12} {_shown(value)}")
+    for key, value in _lines(map, stored).items():
+        show(f"{key + ':':<12} {value}")
     refinement = stored.info.pose_refinement
     remarks = [] if refinement is None else pose_sentences(stored.info.cameras, refinement)
     for line in remarks if capture is None else [*remarks, *sentences(capture)]:
@@ -90,6 +92,53 @@ def describe(folder: Path, stored: Map) -> dict[str, Any]:
 def _surface_facts(surface: SurfaceMap) -> dict[str, Any]:
     """Return the side of a cell (metres), the number of cells that are stored, and the memory (MiB) of a surface."""
     return {"cell": surface.cell, "cells": surface.stored_cells, "MiB": round(surface.mebibytes, 1)}
+
+
+def _lines(folder: Path, stored: Map) -> dict[str, str]:
+    """Return what a reader wants to know first of the map in ``folder``, by the name of the part."""
+    info, sizes = stored.info, sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+    photos = amount(len(info.cameras), "image") if info.cameras else "cameras not recorded"
+    state = "complete" if info.complete else "not complete; 'bidnerf train --resume' goes on with it"
+    time = duration_text(info.seconds)
+    return {
+        "map": f"{folder}, {sizes / 2**20:.1f} MiB, written by bidnerf {info.bidnerf}",
+        "made from": f"{info.data or 'unnamed data'}, {photos}",
+        "training": f"{info.step} steps of backend {info.backend} in {time}, {state}",
+        "field": _field_line(stored),
+        "scene": _scene_line(info.bounds),
+        "distances": "known" if info.distances else "not known, since all images were taken from one place",
+        "surface": _surface_line(stored.surface),
+        "landmarks": _landmarks_line(stored.landmarks),
+        "settings": _shown(info.config),
+    }
+
+
+def _field_line(stored: Map) -> str:
+    parameters = sum(p.numel() for p in stored.field.parameters())  # type: ignore[attr-defined]
+    noise = stored.colour_noise
+    error = (
+        "" if noise is None else f", off by {noise:.1%} of the range of colours on its training images (RMS)"
+    )
+    return f"{amount(parameters, 'parameter')} in {amount(len(levels(stored.field)), 'level')}{error}"
+
+
+def _scene_line(bounds: SceneBounds) -> str:
+    beyond = "more beyond it" if bounds.contracted else "nothing beyond it"
+    box = f"a box of {' x '.join(f'{side:.3g}' for side in bounds.size)} from {_shown(list(bounds.lower))}, {beyond}"
+    return f"{box}; seen from {bounds.near:.3g} to {bounds.far:.3g} away; background {_shown(list(bounds.background))}"
+
+
+def _surface_line(surface: SurfaceMap | None) -> str:
+    if surface is None:
+        return "none; 'bidnerf bake MAP' makes one"
+    cells = f"{amount(surface.stored_cells, 'cell')} with a side of {surface.cell:.3g}"
+    return f"{amount(len(surface.surfels), 'surfel')}, indexed by {cells}, {surface.mebibytes:.1f} MiB"
+
+
+def _landmarks_line(landmarks: LandmarkMap | None) -> str:
+    if landmarks is None or len(landmarks) == 0:
+        return "none; 'bidnerf bake MAP --data DATA' builds them"
+    return str(len(landmarks))
 
 
 def _shown(value: Any) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 import time
 
 import torch
 
-from bidnerf_core.localization.acceptance import BLANK, descent_verdict, is_blank
+from bidnerf_core.localization.acceptance import descent_verdict
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import AdamSettings, DescentSettings, ReachSettings
@@ -38,10 +40,8 @@ def descended(
         loss, pivot(rays.pivot, problem), adam, history, device, generator if loss.is_capturable else None
     )
     T, mean = history.answer(adam.answer)
-    verdict = descent_verdict(mean, adam.converged_loss, finite, reason)
-    by_depth = objective.uses_depth and problem.has_depth
-    if verdict.accepted and not by_depth and all(is_blank(view.frame) for view in problem.views):
-        verdict = BLANK
+    plain = math.inf if objective.uses_depth and problem.has_depth else _plain_loss(problem, objective)
+    verdict = descent_verdict(mean, adam.converged_loss, finite, reason, plain)
     return Localization(
         T_world_camera=T,
         outcome=verdict.outcome,
@@ -52,4 +52,12 @@ def descended(
         method=method,
         poses=SE3.stack(history.poses),
         losses=torch.tensor(history.losses, dtype=torch.float64),
+    )
+
+
+def _plain_loss(problem: Problem, objective: Objective) -> float:
+    """Return the loss if each image were rendered in its mean colour; 0 without colours."""
+    images = [view.frame for view in problem.views if view.frame.has_colour]
+    return (
+        statistics.fmean(objective.plain_loss(frame.rgb.flatten(0, 1)) for frame in images) if images else 0.0
     )

@@ -83,7 +83,7 @@ def _trial(report: CaptureReport) -> Iterator[str]:
     trial = report.trial
     if not trial.images:
         return
-    errors = f", median error {trial.translation:.3g} m and {trial.rotation_deg:.2g}°" if trial.found else ""
+    errors = f", median error {trial.translation:.3g} and {trial.rotation_deg:.2g}°" if trial.found else ""
     yield (
         f"of {_photos(trial.images)} held out of the landmarks, {trial.found} {_were(trial.found)} localized by them"
         f"{errors}; expect similar results for new photos taken the same way"
