@@ -8,7 +8,7 @@ import time
 
 import torch
 
-from bidnerf_core.localization.acceptance import descent_verdict
+from bidnerf_core.localization.acceptance import BLANK, descent_verdict, is_blank
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import AdamSettings, DescentSettings, ReachSettings
@@ -40,8 +40,12 @@ def descended(
         loss, pivot(rays.pivot, problem), adam, history, device, generator if loss.is_capturable else None
     )
     T, mean = history.answer(adam.answer)
-    plain = math.inf if objective.uses_depth and problem.has_depth else _plain_loss(problem, objective)
-    verdict = descent_verdict(mean, adam.converged_loss, finite, reason, plain)
+    by_depth, limit = objective.uses_depth and problem.has_depth, adam.converged_loss
+    given = limit != AdamSettings().converged_loss  # a limit that the user chose counts alone
+    plain = math.inf if by_depth or given else _plain_loss(problem, objective)
+    verdict = descent_verdict(mean, limit, finite, reason, plain)
+    if verdict.accepted and not by_depth and all(is_blank(view.frame) for view in problem.views):
+        verdict = BLANK
     return Localization(
         T_world_camera=T,
         outcome=verdict.outcome,
