@@ -41,7 +41,7 @@ def info(
         poses = [to_plain(camera.moved) for camera in stored.info.cameras if camera.moved is not None]
         print_json(facts | {"moved": poses, "capture": None if capture is None else to_plain(capture)})
         return
-    for key, value in _lines(map, stored).items():
+    for key, value in _lines(facts, stored).items():
         show(f"{key + ':':<12} {value}")
     refinement = stored.info.pose_refinement
     remarks = [] if refinement is None else pose_sentences(stored.info.cameras, refinement)
@@ -94,17 +94,17 @@ def _surface_facts(surface: SurfaceMap) -> dict[str, Any]:
     return {"cell": surface.cell, "cells": surface.stored_cells, "MiB": round(surface.mebibytes, 1)}
 
 
-def _lines(folder: Path, stored: Map) -> dict[str, str]:
-    """Return what a reader wants to know first of the map in ``folder``, by the name of the part."""
-    info, sizes = stored.info, sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+def _lines(facts: dict[str, Any], stored: Map) -> dict[str, str]:
+    """Return what a reader wants to know first of a map and its ``describe``, by the name of the part."""
+    info = stored.info
     photos = amount(len(info.cameras), "image") if info.cameras else "cameras not recorded"
     state = "complete" if info.complete else "not complete; 'bidnerf train --resume' goes on with it"
     time = duration_text(info.seconds)
     return {
-        "map": f"{folder}, {sizes / 2**20:.1f} MiB, written by bidnerf {info.bidnerf}",
+        "map": f"{facts['map']}, {facts['bytes'] / 2**20:.1f} MiB, written by bidnerf {info.bidnerf}",
         "made from": f"{info.data or 'unnamed data'}, {photos}",
         "training": f"{info.step} steps of backend {info.backend} in {time}, {state}",
-        "field": _field_line(stored),
+        "field": _field_line(facts, stored.colour_noise),
         "scene": _scene_line(info.bounds),
         "distances": "known" if info.distances else "not known, since all images were taken from one place",
         "surface": _surface_line(stored.surface),
@@ -113,13 +113,11 @@ def _lines(folder: Path, stored: Map) -> dict[str, str]:
     }
 
 
-def _field_line(stored: Map) -> str:
-    parameters = sum(p.numel() for p in stored.field.parameters())  # type: ignore[attr-defined]
-    noise = stored.colour_noise
+def _field_line(facts: dict[str, Any], noise: float | None) -> str:
     error = (
         "" if noise is None else f", off by {noise:.1%} of the range of colours on its training images (RMS)"
     )
-    return f"{amount(parameters, 'parameter')} in {amount(len(levels(stored.field)), 'level')}{error}"
+    return f"{amount(facts['parameters'], 'parameter')} in {amount(facts['levels'], 'level')}{error}"
 
 
 def _scene_line(bounds: SceneBounds) -> str:

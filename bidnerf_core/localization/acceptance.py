@@ -30,7 +30,7 @@ IMAGE_MARGIN = 0.01
 """Least relative difference in cost between the best and the next best answer of a search by images."""
 FLAT = 0.02
 """Standard deviation of an image's colours, in [0, 1], below which a gain and a bias make any view fit it."""
-EXPLAINED = 0.5
+PLAIN_SHARE = 0.5
 """Share of the loss that an image's mean colour has, below which a descent's loss shows that the pose explains the image."""
 BLANK = Verdict(Outcome.UNDETERMINED, "the image is of a single colour, as if the lens were covered")
 AMBIGUOUS = Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
@@ -238,6 +238,6 @@ def descent_verdict(
     reason = f"{reason}; mean loss {mean_loss:.3g}, accepted below {threshold:.3g}"
     if mean_loss >= threshold:
         return Verdict(Outcome.HIGH_LOSS, reason)
-    if mean_loss >= EXPLAINED * plain_loss:
+    if mean_loss >= PLAIN_SHARE * plain_loss:
         return Verdict(Outcome.UNDETERMINED, f"{reason}, but a single colour has {plain_loss:.3g}")
     return Verdict(Outcome.CONVERGED, reason)
