@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.depth_sensor import DepthSensorModel
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
     LandmarkThresholds,
@@ -21,10 +20,11 @@ from bidnerf_core.localization.acceptance import (
 )
 from bidnerf_core.localization.confidence import TRUSTED, judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
-from bidnerf_core.localization.costs.rendered import RenderedCostSettings
+from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
-from bidnerf_core.localization.covariance import INDEPENDENT
-from bidnerf_core.localization.fusion import FusedTerm, finest_cost, rendered_term, surface_term
+from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
+from bidnerf_core.localization.fused_pose import FusedTerms, fused_pose
+from bidnerf_core.localization.fusion import finest_cost
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
     DepthSettings,
@@ -32,8 +32,7 @@ from bidnerf_core.localization.method_settings import (
     RefinementStage,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.normal_equations import Sum
-from bidnerf_core.localization.pivots import Pivot, pivot
+from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -42,25 +41,20 @@ from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
-from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.calibration import Calibration
 from bidnerf_core.se3 import SE3
 
 POINTS = 2000
 """Largest number of measured points that are fused."""
-FUSION_STEPS = 2
-"""Number of second-order steps on the sum of all terms."""
+STEPS, MORE_STEPS = 5, 8
+"""Largest number of steps on the sum of all terms, and that from poses that landmarks leave doubtful."""
 THOROUGHLY = 4
-"""How many times as many rays and steps poses get that landmarks leave doubtful; each ray then counts so many times as much."""
+"""How many times as many rays such poses get; each ray then counts so many times as much."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
-DEPTH_SCALE_NOISE = 0.01
-"""Relative standard deviation of the depth scale that a few landmarks give."""
 MOSTLY = 0.5
 """Least share of the measured points on the surface with which a scene is not taken to be partly hidden."""
-PRIOR_WIDTH = 2.0
-"""Standard deviation of the prior of the depth scale over that of the sensor's scale, since single sensors are off by far more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,18 +151,13 @@ def fused_answer(
     if not verdict.accepted or found.estimates_calibration:
         return _judged(answer)  # the other terms would need intrinsics as exact as the landmarks'
     problem = corrected(problem, found)
-    about, generator = pivot("scene", problem), Generator().manual_seed(seed)
-    terms = dict[str, FusedTerm]()
+    generator, points = Generator().manual_seed(seed), None
     if problem.surface is not None and problem.has_depth:
-        terms["depth"], judge = _surface_term(problem, problem.surface, generator)
-        diagnostics = landmark_diagnostics(found, searched, judge, found.T_world_camera)
+        points = _measured_points(problem, problem.surface, generator)
+        diagnostics = landmark_diagnostics(found, searched, points, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
     answer = _judged(answer)
-    if rays and is_sharp(problem):
-        effort = 1 if (answer.confidence or 0.0) >= TRUSTED else THOROUGHLY
-        terms["rendering"] = _rendered_term(problem, rays, about, generator, effort)
-        return _fused(answer, terms, about, effort * FUSION_STEPS)
-    return _fused(answer, terms, about, FUSION_STEPS) if terms else answer
+    return _fused(problem, answer, points, rays if is_sharp(problem) else 0, generator)
 
 
 def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
@@ -179,7 +168,7 @@ def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
 
 def corrected(problem: Problem, found: LandmarkPose) -> Problem:
     """Return the problem from the pose found, with its intrinsics and with measured depth on the map's scale."""
-    scale, views = shrunk_depth_scale(found, problem.sensor), []
+    scale, views = DepthScale.of(found, problem.sensor).estimate, []
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
         camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics
@@ -187,62 +176,46 @@ def corrected(problem: Problem, found: LandmarkPose) -> Problem:
     return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 
-def shrunk_depth_scale(found: LandmarkPose, sensor: DepthSensorModel) -> float:
-    """Return the factor on measured depth that landmarks give, shrunk towards 1 by the prior; 1 if they give none.
-
-    The prior is that of the sensor's scale, ``PRIOR_WIDTH`` times as wide.
-    """
-    if found.depth_scale is None:
-        return 1.0
-    prior = PRIOR_WIDTH * sensor.scale
-    weight = prior**2 / (prior**2 + DEPTH_SCALE_NOISE**2)
-    return 1 + weight * (found.depth_scale - 1)
-
-
 def is_sharp(problem: Problem) -> bool:
     """Whether the field is sharp enough for rendered rays to add to what landmarks tell."""
     return problem.colour_noise is None or problem.colour_noise <= SHARPEST
 
 
-def _surface_term(
-    problem: Problem, surface: SurfaceMap, generator: Generator
-) -> tuple[FusedTerm, SurfaceCost]:
-    """Return the term of measured points on the surface, and the cost itself."""
-    cloud = PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator)
-    cost = finest_cost(surface, cloud)
-    assert problem.start is not None
-    return surface_term(cost, problem.start, len(problem.views)), cost
+def _measured_points(problem: Problem, surface: SurfaceMap, generator: Generator) -> SurfaceCost:
+    """Return the cost of measured points, which are drawn, on the surface."""
+    return finest_cost(surface, PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator))
 
 
-def _rendered_term(problem: Problem, rays: int, about: Pivot, generator: Generator, effort: int) -> FusedTerm:
-    """Return the term that compares rendered rays with the images; the loss of colours leaves out what hides the scene."""
-    stage = RefinementStage(
-        effort * FUSION_STEPS, effort * rays, depth_scale=rendered_depth_scale(problem.bounds)
-    )
-    depth = DepthSettings() if problem.has_depth else None
+def _fused(
+    problem: Problem, answer: LandmarkAnswer, points: SurfaceCost | None, rays: int, generator: Generator
+) -> LandmarkAnswer:
+    """Return the answer fused with measured points and rendered rays, as far as there are any.
+
+    Where there are points, rays compare colours alone: depth is measured once, and its scale is not exact. The errors of the
+    poses of the map's images are in its surface and its field as in its landmarks, so that no fusion makes them smaller.
+    """
+    names = (*(["depth"] if points is not None else []), *(["rendering"] if rays else []))
+    if not names:
+        return answer
+    about = pivot("scene", problem) if points is None else points.cloud.pivot
+    effort = 1 if (answer.confidence or 0.0) >= TRUSTED else THOROUGHLY
+    depth = DepthSettings() if problem.has_depth and points is None else None
+    # The loss of colours leaves out what hides the scene.
     colour = ColourSettings(colour_loss="geman-mcclure")
     settings = RenderedCostSettings(colour, depth, RefinementSettings(exposure=True))
-    cost = settings.drawn(problem, stage, about, generator)
-    assert problem.start is not None
-    term = rendered_term(cost, float(cost.cost(problem.start[None])[0]), len(problem.views))
-    return replace(term, measurements=effort**2 * term.measurements)
+    stage = RefinementStage(0, effort * rays, depth_scale=rendered_depth_scale(problem.bounds))
 
+    def draw(T: SE3, surface_sigma: float) -> RenderedCost:
+        here = replace(problem, start=T)
+        return settings.drawn(here, replace(stage, surface_sigma=surface_sigma), about, generator)
 
-def _fused(answer: LandmarkAnswer, terms: dict[str, FusedTerm], about: Pivot, steps: int) -> LandmarkAnswer:
-    """Minimize the sum of the landmarks' Gaussian prior and the other terms, and return the fused pose.
-
-    The covariance counts each additional term as only ``INDEPENDENT`` measurements, because its errors are correlated over
-    large parts of an image.
-    """
-    prior = GaussianPrior(answer.T, answer.covariance, about)
-    cost = Sum((prior, *(term.scaled for term in terms.values())))
-    done = descend(cost, answer.T[None], steps, about.moved)
-    T = done.T[0].normalized()
-    information = prior(T[None]).hessian[0]
-    for term in terms.values():
-        information = information + term.cost(T[None]).hessian[0] * (INDEPENDENT / term.variance)
-    covariance = about.at_camera(T, torch.linalg.inv(information))
-    return replace(answer, T=T, covariance=(covariance + covariance.mT) / 2, terms=tuple(terms))
+    start, scale = answer.found.T_world_camera, DepthScale.of(answer.found, problem.sensor)
+    scaled = None if points is None else ScaledPoints(points, scale, start)
+    by_map = answer.found.map_covariance
+    prior = GaussianPrior(answer.T, answer.covariance - by_map, about)
+    terms = FusedTerms(prior, len(problem.views), scaled, draw if rays else None, effort**2)
+    T, covariance = fused_pose(terms, STEPS if effort == 1 else MORE_STEPS)
+    return replace(answer, T=T, covariance=covariance + by_map, terms=names)
 
 
 def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:

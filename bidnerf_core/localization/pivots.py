@@ -60,6 +60,12 @@ class Pivot:
         carried = self.update_at_camera(T)
         return carried @ covariance @ carried.mT
 
+    def from_other(self, other: Pivot) -> Float[Tensor, "6 6"]:
+        """Return the matrix that converts an update about another point of the camera's frame to one about this point."""
+        assert self.T_camera_pivot is not None
+        assert other.T_camera_pivot is not None
+        return (self.T_camera_pivot.inverse() @ other.T_camera_pivot).adjoint()
+
     def update_at_camera(self, T: SE3) -> Float[Tensor, "*h 6 6"]:
         """Return the matrix that converts an update at the pivot to the equivalent right update of ``T``."""
         return (T.inverse() if self.T_camera_pivot is None else self.T_camera_pivot).adjoint()

@@ -34,6 +34,7 @@ def described(
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
         covariance=fit.covariance + query.landmarks.pose_covariance,
+        map_covariance=query.landmarks.pose_covariance,
         noise=fit.noise,
         correspondences=answer.correspondences,
         residuals=data.residuals(fit.T_world_rig),

@@ -24,6 +24,7 @@ class LandmarkPose:
     # Of the right update, translation (metres) first: the errors of keypoints, landmarks, calibration, and of the poses
     # of the map's own images.
     covariance: Float[Tensor, "6 6"]
+    map_covariance: Float[Tensor, "6 6"]  # the part of it that is of the poses of the map's own images
     noise: float  # pixels: standard deviation of the reprojection errors along each axis, robustly
     correspondences: LandmarkMatches  # those that the pose was refined on
     residuals: Float[Tensor, "m 2"]  # pixels, of the correspondences

@@ -183,6 +183,7 @@ def landmark_pose(
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
         covariance=fit.covariance + landmarks.pose_covariance,
+        map_covariance=landmarks.pose_covariance,
         noise=fit.noise,
         correspondences=LandmarkMatches(
             torch.zeros_like(every), every, points.landmark, torch.zeros(len(every))

@@ -13,9 +13,9 @@ from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
-from bidnerf_core.localization.by_landmarks import shrunk_depth_scale
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import INDEPENDENT
+from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
@@ -221,7 +221,7 @@ class ByLandmarks:
     def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:
         generator = Generator().manual_seed(seed)
         return measured_cloud(
-            frame, self.config.depth_points, shrunk_depth_scale(found, self.sensor), generator
+            frame, self.config.depth_points, DepthScale.of(found, self.sensor).estimate, generator
         )
 
 
