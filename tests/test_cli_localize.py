@@ -156,7 +156,7 @@ def test_without_names_each_frame_of_the_split_is_a_query(bidnerf: Run, shared: 
 def test_files_of_poses_hold_what_converged(
     bidnerf: Run, shared: Path, place: list[object], tmp_path: Path
 ) -> None:
-    sure = [*place, shared / "photos", *FOCAL, "--json", "--converged-loss", "100"]
+    sure = [*place, shared / "photos", *FOCAL, "--json", "--converged-loss", "100", "--plain-share", "1e9"]
     found = objects(bidnerf(*sure, "--out", tmp_path / "poses.tum")[1])
     rows = np.loadtxt(tmp_path / "poses.tum")
     positions = [[row[3] for row in each["T_world_camera"][:3]] for each in found]

@@ -92,6 +92,21 @@ def test_an_image_of_a_single_colour_determines_nothing() -> None:
     assert "single colour" in found.reason
 
 
+@pytest.mark.parametrize(("share", "outcome"), [(0.5, Outcome.CONVERGED), (1e-6, Outcome.UNDETERMINED)])
+def test_colours_have_to_be_explained_better_than_by_a_single_one(
+    problem: Problem, share: float, outcome: Outcome
+) -> None:
+    settings = {"rays": 256, "max_steps": 150, "plain_share": share}
+    assert localize(problem, "inerf", settings, seed=0).outcome is outcome
+
+
+def test_the_loss_of_depth_is_not_compared_with_that_of_a_colour(problem: Problem) -> None:
+    found = localize(
+        problem, "bid", {"rays": 64, "max_steps": 80, "converged_loss": 10.0, "plain_share": 0.0}
+    )
+    assert found.converged
+
+
 def test_inerf_takes_one_image() -> None:
     views = [View(photograph(T), T) for T in (orbit(4.0, 3, seed=1)[0], TRUTH)]
     with pytest.raises(InputError, match="one image, got 2; method bid"):

@@ -30,8 +30,6 @@ IMAGE_MARGIN = 0.01
 """Least relative difference in cost between the best and the next best answer of a search by images."""
 FLAT = 0.02
 """Standard deviation of an image's colours, in [0, 1], below which a gain and a bias make any view fit it."""
-PLAIN_SHARE = 0.5
-"""Share of the loss that an image's mean colour has, below which a descent's loss shows that the pose explains the image."""
 BLANK = Verdict(Outcome.UNDETERMINED, "the image is of a single colour, as if the lens were covered")
 AMBIGUOUS = Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
 
@@ -226,18 +224,18 @@ def rendered_verdict(
 
 
 def descent_verdict(
-    mean_loss: float, threshold: float, finite: bool, reason: str, plain_loss: float = math.inf
+    mean_loss: float, threshold: float, finite: bool, reason: str, plain_limit: float = math.inf
 ) -> Verdict:
     """Judge a first-order descent by the mean loss of its last steps; ``reason`` says why it ended.
 
-    ``plain_loss`` is that of images of a single colour each, and infinite where more than colours was compared: at a wrong pose
-    photos of little contrast have a small loss too, but not a smaller one than their mean colours.
+    ``plain_limit`` is a share of the loss that the images' mean colours have, and infinite where more than colours was compared: at a
+    wrong pose photos of little contrast have a small loss too, but not a much smaller one than their mean colours.
     """
     if not finite or not math.isfinite(mean_loss):
         return Verdict(Outcome.DIVERGED, reason)
     reason = f"{reason}; mean loss {mean_loss:.3g}, accepted below {threshold:.3g}"
     if mean_loss >= threshold:
         return Verdict(Outcome.HIGH_LOSS, reason)
-    if mean_loss >= PLAIN_SHARE * plain_loss:
-        return Verdict(Outcome.UNDETERMINED, f"{reason}, but a single colour has {plain_loss:.3g}")
+    if mean_loss >= plain_limit:
+        return Verdict(Outcome.UNDETERMINED, f"{reason}, but below {plain_limit:.3g} with so little contrast")
     return Verdict(Outcome.CONVERGED, reason)

@@ -14,7 +14,7 @@ from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import AdamSettings, DescentSettings, ReachSettings
 from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.result import Localization, Outcome
 from bidnerf_core.localization.solvers.adam import follow_gradient
 from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.residuals import Objective
@@ -40,11 +40,11 @@ def descended(
         loss, pivot(rays.pivot, problem), adam, history, device, generator if loss.is_capturable else None
     )
     T, mean = history.answer(adam.answer)
-    by_depth, limit = objective.uses_depth and problem.has_depth, adam.converged_loss
-    given = limit != AdamSettings().converged_loss  # a limit that the user chose counts alone
-    plain = math.inf if by_depth or given else _plain_loss(problem, objective)
-    verdict = descent_verdict(mean, limit, finite, reason, plain)
-    if verdict.accepted and not by_depth and all(is_blank(view.frame) for view in problem.views):
+    by_depth = objective.uses_depth and problem.has_depth
+    plain = math.inf if by_depth else adam.plain_share * _plain_loss(problem, objective)
+    verdict = descent_verdict(mean, adam.converged_loss, finite, reason, plain)
+    fits = verdict.outcome in (Outcome.CONVERGED, Outcome.UNDETERMINED)
+    if fits and not by_depth and all(is_blank(view.frame) for view in problem.views):
         verdict = BLANK
     return Localization(
         T_world_camera=T,
