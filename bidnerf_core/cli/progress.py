@@ -17,6 +17,8 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
+    SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -125,16 +127,18 @@ class StoredTraining(StoppableBar):
 def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable[[int, int], None]]:
     """Show how many of ``unit`` are done, their rate and the time left: a bar on a terminal, else a line now and then.
 
-    Yields a function of the number done and of the total. Nothing is shown for a total of 1. A call with 0 done begins
-    anew.
+    Yields a function of the number done and of the total. For a total of 1, a terminal shows how long it has taken, and
+    nothing else is shown. A call with 0 done begins anew.
     """
-    columns = (
+    columns: tuple[ProgressColumn, ...] = (
         TextColumn(what), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit),
         TextColumn("{task.fields[rate]}"), TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
+    if total == 1:
+        columns = (SpinnerColumn(), TextColumn(what), TimeElapsedColumn())
     began = spoke = time.monotonic()
     with Progress(
-        *columns, console=console, disable=not console.is_terminal or total == 1, transient=True,
+        *columns, console=console, disable=not console.is_terminal, transient=True,
         redirect_stdout=sys.stdout.isatty(),  # results on the same terminal go above the bar
     ) as bar:  # fmt: skip
         task = bar.add_task("", total=total, rate="")
