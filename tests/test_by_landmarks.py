@@ -31,6 +31,7 @@ from bidnerf_core.localization.by_landmarks import (
 )
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.depth_scale import DepthScale
+from bidnerf_core.localization.fused_pose import FusedPose, Measurements
 from bidnerf_core.localization.method_settings import RefinementStage
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.search.landmarks import Confirmation
@@ -188,6 +189,46 @@ def test_the_scale_of_a_depth_sensor_is_found() -> None:
     assert found.terms == ("depth",)
     assert found.found.depth_scale == pytest.approx(1 / 1.03, rel=0.01)
     assert_within(found.T, 0.015, 0.3)
+
+
+@pytest.mark.parametrize("scale", [0.001, 0.2, 0.3048, 0.8, 1.2, 1000.0])
+def test_depth_of_another_unit_is_left_out(scale: float) -> None:
+    """Millimetres, or feet, read as metres: the pose is that of the colours alone, and the reason says why."""
+    depth = unseen().frame.depth
+    assert depth is not None
+    view = replace(unseen(), frame=replace(unseen().frame, depth=scale * depth))
+    found, plain = (answer(v, rays=RAYS, map=textured_map(surface=True)) for v in (view, without_depth(view)))
+    assert found.terms == plain.terms == ("rendering",)
+    assert_within(found.T, 0.004, 0.1)
+    problem = rig(textured_map(surface=True), (view,), None, matcher=matcher())
+    reason = localization_by_landmarks(problem, found, 0.0).reason
+    assert f"without depth: it is {1 / found.found.depth_scale:.3g} times as long as by landmarks" in reason
+
+
+def test_a_pose_that_leaves_the_landmarks_far_behind_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    fused = by_landmarks_module.fused_pose
+    away = torch.tensor([0.5, 0, 0, 0, 0, 0], dtype=torch.float64)
+
+    def carried_off(measurements: Measurements, most_steps: int) -> FusedPose:
+        found = fused(measurements, most_steps)
+        return found if measurements.points is None else replace(found, T=found.T.retract(away))
+
+    monkeypatch.setattr(by_landmarks_module, "fused_pose", carried_off)
+    found = answer(unseen(), rays=RAYS, map=textured_map(surface=True))
+    assert found.terms == ("rendering",)
+    assert found.left_out == "depth, which contradicts the landmarks"
+    assert_within(found.T, 0.004, 0.1)
+
+
+def test_fusion_does_not_make_the_errors_of_the_maps_own_poses_smaller() -> None:
+    landmarks = replace(matcher().landmarks, pose_covariance=1e-4 * torch.eye(6, dtype=torch.float64))
+    scattered = LandmarkMatcher(landmarks)
+    problem = rig(textured_map(surface=True), (unseen(),), None, matcher=scattered)
+    found = answer_by_landmarks(problem, scattered, RAYS, 0)
+    assert found is not None
+    assert found.terms == ("depth", "rendering")
+    least = torch.linalg.eigvalsh(found.covariance - landmarks.pose_covariance)[0]
+    assert 0 < float(least) < 1e-4
 
 
 @pytest.mark.parametrize(

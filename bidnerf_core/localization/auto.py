@@ -141,7 +141,7 @@ def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
         return False
     if not _partly_hidden(problem) or not _keeps_points(problem, answer.found):
         return False
-    there = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
+    there = share_on_surface(corrected(problem, answer.found, answer.depth_factor), problem.surface, answer.T)
     return there < SurfaceThresholds().on_surface
 
 
@@ -208,7 +208,7 @@ def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswe
     if problem.surface is None or not _partly_hidden(problem) or _measured_points(problem) < LEAST_POINTS:
         return False
     before = share_on_surface(problem, problem.surface, found.T_world_camera)
-    after = share_on_surface(corrected(problem, answer.found), problem.surface, answer.T)
+    after = share_on_surface(corrected(problem, answer.found, answer.depth_factor), problem.surface, answer.T)
     return after < before - FEWER
 
 

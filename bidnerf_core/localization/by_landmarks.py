@@ -23,7 +23,7 @@ from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
-from bidnerf_core.localization.fused_pose import FusedTerms, fused_pose
+from bidnerf_core.localization.fused_pose import Measurements, fused_pose
 from bidnerf_core.localization.fusion import finest_cost
 from bidnerf_core.localization.method_settings import (
     ColourSettings,
@@ -32,7 +32,7 @@ from bidnerf_core.localization.method_settings import (
     RefinementStage,
     rendered_depth_scale,
 )
-from bidnerf_core.localization.pivots import pivot
+from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -49,6 +49,8 @@ POINTS = 2000
 """Largest number of measured points that are fused."""
 STEPS, MORE_STEPS = 5, 8
 """Largest number of steps on the sum of all terms, and that from poses that landmarks leave doubtful."""
+CONTRADICTORY = 30.0
+"""Squared distance from the landmarks' pose, in its standard deviations, beyond which what moved it there contradicts the landmarks."""
 THOROUGHLY = 4
 """How many times as many rays such poses get; each ray then counts so many times as much."""
 SHARPEST = 0.04
@@ -67,6 +69,8 @@ class LandmarkAnswer:
     covariance: Float[Tensor, "6 6"]
     diagnostics: LandmarkDiagnostics
     terms: tuple[str, ...] = ()  # what was fused with the landmarks
+    depth_factor: float = 1.0  # by which depths are longer with the fused pose than ``corrected`` makes them
+    left_out: str = ""  # what was not fused because it contradicts them
     confidence: float | None = None  # probability that the pose is right
 
     @property
@@ -153,7 +157,7 @@ def fused_answer(
     problem = corrected(problem, found)
     generator, points = Generator().manual_seed(seed), None
     if problem.surface is not None and problem.has_depth:
-        points = _measured_points(problem, problem.surface, generator)
+        points = _cost_of_points(problem, problem.surface, generator)
         diagnostics = landmark_diagnostics(found, searched, points, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
     answer = _judged(answer)
@@ -166,9 +170,12 @@ def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
     return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
 
 
-def corrected(problem: Problem, found: LandmarkPose) -> Problem:
-    """Return the problem from the pose found, with its intrinsics and with measured depth on the map's scale."""
-    scale, views = DepthScale.of(found, problem.sensor).estimate, []
+def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Problem:
+    """Return the problem from the pose found, with its intrinsics and with measured depth on the map's scale.
+
+    ``factor`` is what the fused pose corrects that scale by.
+    """
+    scale, views = factor * DepthScale.of(found, problem.sensor).estimate, []
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
         camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics
@@ -181,7 +188,7 @@ def is_sharp(problem: Problem) -> bool:
     return problem.colour_noise is None or problem.colour_noise <= SHARPEST
 
 
-def _measured_points(problem: Problem, surface: SurfaceMap, generator: Generator) -> SurfaceCost:
+def _cost_of_points(problem: Problem, surface: SurfaceMap, generator: Generator) -> SurfaceCost:
     """Return the cost of measured points, which are drawn, on the surface."""
     return finest_cost(surface, PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator))
 
@@ -189,33 +196,50 @@ def _measured_points(problem: Problem, surface: SurfaceMap, generator: Generator
 def _fused(
     problem: Problem, answer: LandmarkAnswer, points: SurfaceCost | None, rays: int, generator: Generator
 ) -> LandmarkAnswer:
-    """Return the answer fused with measured points and rendered rays, as far as there are any.
+    """Return the answer fused with measured points and rendered rays, as far as there are any and landmarks do not contradict.
 
     Where there are points, rays compare colours alone: depth is measured once, and its scale is not exact. The errors of the
     poses of the map's images are in its surface and its field as in its landmarks, so that no fusion makes them smaller.
     """
+    scale = DepthScale.of(answer.found, problem.sensor)
+    if points is not None and scale.by_landmarks is not None and not scale.is_plausible:
+        times = f"it is {1 / scale.by_landmarks:.3g} times as long as by landmarks"
+        return _fused(
+            problem.without_depth(), replace(answer, left_out=f"depth: {times}"), None, rays, generator
+        )
     names = (*(["depth"] if points is not None else []), *(["rendering"] if rays else []))
     if not names:
         return answer
     about = pivot("scene", problem) if points is None else points.cloud.pivot
     effort = 1 if (answer.confidence or 0.0) >= TRUSTED else THOROUGHLY
-    depth = DepthSettings() if problem.has_depth and points is None else None
-    # The loss of colours leaves out what hides the scene.
+    draw = _drawing(problem, effort * rays, about, points is None, generator) if rays else None
+    scaled = None if points is None else ScaledPoints(points, scale, answer.found.T_world_camera)
+    by_map = answer.found.map_covariance
+    prior = GaussianPrior(answer.T, answer.covariance - by_map, about)
+    measurements = Measurements(prior, len(problem.views), scaled, draw, effort**2)
+    fused = fused_pose(measurements, STEPS if effort == 1 else MORE_STEPS)
+    if not float(prior(fused.T[None]).cost[0]) <= CONTRADICTORY:
+        without = replace(answer, left_out=f"{names[0]}, which contradicts the landmarks")
+        rest = rays if points is not None else 0
+        return _fused(problem.without_depth(), without, None, rest, generator)
+    covariance = fused.covariance + by_map
+    return replace(answer, T=fused.T, covariance=covariance, terms=names, depth_factor=fused.factor)
+
+
+def _drawing(
+    problem: Problem, rays: int, about: Pivot, by_depth: bool, generator: Generator
+) -> Callable[[SE3, float], RenderedCost]:
+    """Return what draws rays about a pose, for an uncertainty of the surfaces; the loss of colours leaves out what hides the scene."""
+    depth = DepthSettings() if problem.has_depth and by_depth else None
     colour = ColourSettings(colour_loss="geman-mcclure")
     settings = RenderedCostSettings(colour, depth, RefinementSettings(exposure=True))
-    stage = RefinementStage(0, effort * rays, depth_scale=rendered_depth_scale(problem.bounds))
+    stage = RefinementStage(0, rays, depth_scale=rendered_depth_scale(problem.bounds))
 
     def draw(T: SE3, surface_sigma: float) -> RenderedCost:
         here = replace(problem, start=T)
         return settings.drawn(here, replace(stage, surface_sigma=surface_sigma), about, generator)
 
-    start, scale = answer.found.T_world_camera, DepthScale.of(answer.found, problem.sensor)
-    scaled = None if points is None else ScaledPoints(points, scale, start)
-    by_map = answer.found.map_covariance
-    prior = GaussianPrior(answer.T, answer.covariance - by_map, about)
-    terms = FusedTerms(prior, len(problem.views), scaled, draw if rays else None, effort**2)
-    T, covariance = fused_pose(terms, STEPS if effort == 1 else MORE_STEPS)
-    return replace(answer, T=T, covariance=covariance + by_map, terms=names)
+    return draw
 
 
 def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:
@@ -226,7 +250,9 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
         poses = [problem.start, *poses]
     fused = f", fused with {' and '.join(answer.terms)}" if answer.terms else ""
     there = answer.diagnostics.on_surface
-    if there is not None and there < MOSTLY:
+    if answer.left_out:
+        fused += f", without {answer.left_out}"
+    elif there is not None and there < MOSTLY:
         fused += f", although only {there:.0%} of the measured points lie on the surface"
     return Localization(
         T_world_camera=answer.T,

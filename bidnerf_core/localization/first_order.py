@@ -60,8 +60,8 @@ def descended(
 
 
 def _plain_loss(problem: Problem, objective: Objective) -> float:
-    """Return the loss if each image were rendered in its mean colour; 0 without colours."""
+    """Return the loss if each image were rendered in its mean colour; infinite without colours."""
     images = [view.frame for view in problem.views if view.frame.has_colour]
-    return (
-        statistics.fmean(objective.plain_loss(frame.rgb.flatten(0, 1)) for frame in images) if images else 0.0
-    )
+    if not images:
+        return math.inf
+    return statistics.fmean(objective.plain_loss(frame.rgb.flatten(0, 1)) for frame in images)

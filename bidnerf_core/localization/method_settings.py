@@ -125,7 +125,7 @@ class AdamSettings(Settings):
     # pose to answer with: the last, or the one after the 20 steps of least mean loss
     answer: Annotated[AnswerName, EXPERT] = "last"
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
-    # share of the loss of the image's mean colour below which it has to be too, where only colours are compared
+    # where only colours are compared, that mean loss must also be below this share of the loss of the image's mean colour
     plain_share: Annotated[float, Range(0.0), EXPERT] = 0.5
 
 

@@ -17,11 +17,14 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """A cost and its Gauss-Newton model ``cost + 2 g.xi + xi.H.xi``, for each of h poses; float64."""
+    """A cost and its Gauss-Newton model ``cost + 2 g.xi + xi.H.xi``, for each of h poses; float64.
+
+    The k unknowns are the six of a pose's update, after which others may follow.
+    """
 
     cost: Float[Tensor, "h"]
-    gradient: Float[Tensor, "h 6"]
-    hessian: Float[Tensor, "h 6 6"]
+    gradient: Float[Tensor, "h k"]
+    hessian: Float[Tensor, "h k k"]
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
         return NormalEquations(
@@ -32,6 +35,25 @@ class NormalEquations:
         """Return the equations of the cost multiplied by ``factor``."""
         return NormalEquations(factor * self.cost, factor * self.gradient, factor * self.hessian)
 
+    def of_others(self, updates: Float[Tensor, "k n"]) -> NormalEquations:
+        """Return the equations of n other unknowns, of which ``updates`` are the linear map to these."""
+        return NormalEquations(self.cost, self.gradient @ updates, updates.mT @ self.hessian @ updates)
+
+    def without_last(self) -> NormalEquations:
+        """Return the equations of the other unknowns, for each value of which the last one takes its best (Schur complement)."""
+        coupling, own, pull = self.hessian[:, :-1, -1], self.hessian[:, -1, -1], self.gradient[:, -1]
+        share = coupling / own[:, None]
+        return NormalEquations(
+            self.cost - pull**2 / own,
+            self.gradient[:, :-1] - share * pull[:, None],
+            self.hessian[:, :-1, :-1] - share[:, :, None] * coupling[:, None, :],
+        )
+
+    def best_last(self, others: Float[Tensor, "h n"]) -> Float[Tensor, "h"]:
+        """Return the best step of the last unknown for a step of the others."""
+        row = self.hessian[:, -1]
+        return -(self.gradient[:, -1] + (row[:, :-1] * others).sum(-1)) / row[:, -1]
+
     def chosen(self, which: Tensor, other: NormalEquations) -> NormalEquations:
         """Return these equations where ``which`` (h) holds, and ``other`` elsewhere."""
         return NormalEquations(
@@ -40,12 +62,12 @@ class NormalEquations:
             torch.where(which[:, None, None], self.hessian, other.hessian),
         )
 
-    def solve(self, damping: Float[Tensor, "h"]) -> Float[Tensor, "h 6"]:
+    def solve(self, damping: Float[Tensor, "h"]) -> Float[Tensor, "h k"]:
         """Return the step of ``(H + damping diag H) xi = -g``, by Cholesky; 0 where the equations cannot be solved."""
         diagonal = self.hessian.diagonal(dim1=-2, dim2=-1)
         unit = torch.where(diagonal > 0, diagonal, 1).rsqrt()  # makes the diagonal 1, whatever the units
         scaled = unit[..., None] * self.hessian * unit[..., None, :]
-        eye = torch.eye(6, dtype=scaled.dtype, device=scaled.device)
+        eye = torch.eye(scaled.shape[-1], dtype=scaled.dtype, device=scaled.device)
         factor, failed = torch.linalg.cholesky_ex(scaled + (damping[:, None, None] + ROUNDING) * eye)
         delta = -unit * torch.cholesky_solve((unit * self.gradient)[..., None], factor)[..., 0]
         sound = (failed == 0) & (diagonal >= 0).all(-1) & delta.isfinite().all(-1)

@@ -60,7 +60,7 @@ class Pivot:
         carried = self.update_at_camera(T)
         return carried @ covariance @ carried.mT
 
-    def from_other(self, other: Pivot) -> Float[Tensor, "6 6"]:
+    def adjoint_from(self, other: Pivot) -> Float[Tensor, "6 6"]:
         """Return the matrix that converts an update about another point of the camera's frame to one about this point."""
         assert self.T_camera_pivot is not None
         assert other.T_camera_pivot is not None

@@ -21,6 +21,12 @@ class GaussianPrior:
     covariance: Float[Tensor, "6 6"]  # of a right update of the mean (metres, radians); float64
     pivot: Pivot
 
+    @property
+    def at_pivot(self) -> Float[Tensor, "6 6"]:
+        """The covariance of an update of the mean about the pivot."""
+        back = torch.linalg.inv(self.pivot.update_at_camera(self.mean))
+        return back @ self.covariance @ back.mT
+
     def __call__(self, T: SE3) -> NormalEquations:
         inverse = self.mean.inverse()
         off = (SE3(inverse.rotation[None], inverse.translation[None]) @ T).log()

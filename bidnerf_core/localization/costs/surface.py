@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -44,6 +44,8 @@ class PointCloud:
     rgb: Float[Tensor, "p 3"]
     origins: Float[Tensor, "p 3"]  # metres: where each was measured from
     coloured: Bool[Tensor, "p"]  # whether a colour was measured
+    # Metres: how a unit of a factor that all depths share moves the points. With it, equations have that factor as seventh unknown.
+    growth: Float[Tensor, "p 3"] | None = None
 
     @staticmethod
     def measured(
@@ -70,8 +72,15 @@ class PointCloud:
 
     def first(self, count: int) -> PointCloud:
         """Return the first ``count`` points: a random sample, since their order is random."""
-        parts = (self.points, self.rgb, self.origins, self.coloured)
-        return PointCloud(*(part[:count] for part in parts))
+        growth = None if self.growth is None else self.growth[:count]
+        return PointCloud(
+            self.points[:count], self.rgb[:count], self.origins[:count], self.coloured[:count], growth
+        )
+
+    def scaled(self, factor: float) -> PointCloud:
+        """Return the points with depths multiplied by a factor, which becomes an unknown; the points have none so far."""
+        growth = self.points - self.origins
+        return replace(self, points=self.origins + factor * growth, growth=growth)
 
     @cached_property
     def all_coloured(self) -> bool:
@@ -83,14 +92,15 @@ class PointCloud:
         return self.points.median(0).values
 
     @cached_property
-    def basis(self) -> Float[Tensor, "p 3 6"]:
-        """Derivative of the points, in the camera's axes, by an update about their middle."""
+    def basis(self) -> Float[Tensor, "p 3 k"]:
+        """Derivative of the points, in the camera's axes, by an update about their middle, and by the factor if there is one."""
         turned = -skew(self.points - self.middle)
         eye = torch.eye(3, dtype=turned.dtype, device=turned.device)
-        return torch.cat([eye.expand_as(turned), turned], dim=-1)
+        by_pose = torch.cat([eye.expand_as(turned), turned], dim=-1)
+        return by_pose if self.growth is None else torch.cat([by_pose, self.growth[..., None]], dim=-1)
 
     @cached_property
-    def squares(self) -> Float[Tensor, "p 36"]:
+    def squares(self) -> Float[Tensor, "p kk"]:
         """``basis^T basis`` of each point: what an isotropic residual adds to the Hessian."""
         return (self.basis.mT @ self.basis).flatten(1)
 
@@ -260,10 +270,10 @@ def _distance_terms(
     spread = weight * found.beyond
     flat = weight - spread
     normal = found.normal @ found.rotation  # in the camera's axes
-    rows = torch.cat(
-        [normal, torch.linalg.cross((cloud.points - cloud.middle).expand_as(normal), normal)], -1
-    )
-    hessian = (rows * flat[..., None]).mT @ rows + (spread @ cloud.squares).unflatten(-1, (6, 6))
+    turned = torch.linalg.cross((cloud.points - cloud.middle).expand_as(normal), normal)
+    by_factor = () if cloud.growth is None else ((cloud.growth * normal).sum(-1, keepdim=True),)
+    rows = torch.cat([normal, turned, *by_factor], -1)
+    hessian = (rows * flat[..., None]).mT @ rows + (spread @ cloud.squares).unflatten(-1, rows.shape[-1:] * 2)
     pull = (weight * found.across)[..., None] * found.normal + spread[..., None] * found.along
     return _gradient(pull, found, cloud) / count, (hessian / count).double()
 
@@ -282,7 +292,7 @@ def _colour_terms(
 
 def _gradient(
     pull: Float[Tensor, "h p 3"], found: Correspondences, cloud: PointCloud
-) -> Float[Tensor, "h 6"]:
+) -> Float[Tensor, "h k"]:
     """Return the sum over points of ``basis^T R^T pull``."""
     local = (pull @ found.rotation).flatten(1)
-    return (local @ cloud.basis.reshape(-1, 6)).double()
+    return (local @ cloud.basis.flatten(0, 1)).double()
