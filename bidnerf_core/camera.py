@@ -23,6 +23,8 @@ LARGEST_SIZE = 1_000_000
 """Columns or rows of an image."""
 SMALLEST_FOCAL, LARGEST_PIXELS = 1e-6, 1e9
 """Limits of focal lengths and of the distance of the principal point, in pixels. Beyond them, float32 overflows."""
+LARGEST_FOCAL = 1000
+"""Focal length of a telescope, in sizes of the image: a field of view of 0.06 degrees."""
 LARGEST_COEFFICIENT = 1e6
 """Limit of a distortion coefficient; those of rational models reach some hundreds."""
 ASPECT_TOLERANCE = 0.005
@@ -77,6 +79,11 @@ class Intrinsics:
         """Return a camera without distortion; ``focal`` is in pixels, the principal point in the middle of the image."""
         _require_size("width", width)
         _require_size("height", height)
+        _require("focal length", focal, Real, "a number of pixels")
+        if focal > LARGEST_FOCAL * max(width, height):
+            raise InputError(
+                f"focal length is {focal} px for an image of {width}x{height}, expected at most {LARGEST_FOCAL} times its longer side"
+            )
         return Intrinsics(focal, focal, width / 2, height / 2, width, height)
 
     @staticmethod

@@ -24,7 +24,7 @@ def working_device(device: torch.device | str) -> torch.device:
         torch.ones((), device=found).item()
     except (RuntimeError, AssertionError, TypeError) as error:  # torch's own builds differ in which
         raise InputError(
-            f"no device {str(device)!r} to compute on here, expected one as cpu or cuda"
+            f"device {str(device)!r} does not work here, expected one that does, such as cpu"
         ) from error
     return found
 

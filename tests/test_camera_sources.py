@@ -156,7 +156,8 @@ def test_numbers_that_no_camera_has_are_refused(given: dict[str, float]) -> None
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        ({"focal": 1e30}, "focal length fx is 1e[+]30, expected at most 1e[+]09 pixels"),
+        ({"focal": 1e30}, "focal length is 1e[+]30 px .* expected at most 1000 times its longer side"),
+        ({"focal": 1001 * max(SIZE)}, "expected at most 1000 times its longer side"),
         ({"focal": 1e-9}, "focal length fx is 1e-09, expected at least 1e-06 pixels"),
         ({"hfov": 0.0001}, "view is 0.0001, which makes a focal .*, expected at most 1e[+]09 pixels"),
     ],
@@ -164,6 +165,10 @@ def test_numbers_that_no_camera_has_are_refused(given: dict[str, float]) -> None
 def test_the_limits_of_a_focal_length_are_stated(given: dict[str, float], expected: str) -> None:
     with pytest.raises(InputError, match=expected):
         found(**given)
+
+
+def test_the_focal_length_of_a_telescope_is_taken() -> None:
+    assert found(focal=999.0 * max(SIZE)).fx == 999.0 * max(SIZE)
 
 
 def test_a_camera_of_another_resolution_is_scaled() -> None:

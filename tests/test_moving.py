@@ -152,7 +152,7 @@ def test_a_tensor_that_is_forgotten_is_named(part: str) -> None:
 
 @pytest.mark.parametrize("device", ["mars", "cuda:99", "meta", ""])
 def test_a_device_that_does_not_work_is_named(device: str) -> None:
-    message = re.escape(f"no device {str(device)!r} to compute on here")
+    message = re.escape(f"device {str(device)!r} does not work here")
     stored = whole_map("vanilla")
     assert stored.surface is not None
     for move in (stored.to, stored.surface.to, landmarks().to):

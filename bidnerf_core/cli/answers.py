@@ -183,9 +183,9 @@ def _verdict(found: Localization) -> str:
 def show_in_short(answer: Answer) -> None:
     """Print an answer in a line."""
     found, error = answer.found, answer.error
-    verdict = _verdict(found) if found.converged else f"{_verdict(found)} ({found.reason})"
     known = "" if error is None else f"error {_shown(error)}; "
-    show(f"{answer.query.name}: {known}{verdict}; {amount(found.steps, 'step')}, {found.seconds:.2f} s")
+    took = f"{amount(found.steps, 'step')}, {found.seconds:.2f} s"
+    show(f"{answer.query.name}: {known}{_verdict(found)} ({found.reason}); {took}")
 
 
 def _shown(error: PoseError) -> str:

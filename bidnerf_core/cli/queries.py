@@ -122,6 +122,10 @@ class Photos:
         self._files, self._options, self._background, self._points = files, options, background, points
         self._names = unique_names([(*file.parts[:-1], file.stem) for file in files])
         self._depth = _depth_files(files, options.depth)
+        if options.depth_unit is not None and not options.depth:
+            raise UsageError(
+                "--depth-unit was given without --depth, expected the depth image that it belongs to"
+            )
         if options.registration and not options.depth:
             raise UsageError(
                 "--register-depth was given without --depth, expected measured depth to register"

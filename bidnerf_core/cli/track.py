@@ -60,7 +60,9 @@ def run(arguments: list[str]) -> None:
         out: Annotated[
             Path | None,
             option(
-                "TRAJECTORY", "file of poses: .txt or .tum, transforms.json, or .json with all details", ""
+                "TRAJECTORY",
+                "file of poses, needed without --follow: .txt or .tum, transforms.json, or .json with all details",
+                "",
             ),
         ] = None,
         plot: Annotated[

@@ -175,8 +175,11 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
             Outcome.IMPRECISE,
             f"{share}, but the position is uncertain by {deviation / found.distance:.1%} of the distance",
         )
-    by_map = f", with the map's intrinsics: {found.calibration.sentence}" if found.takes_map_camera else ""
-    return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{by_map}")
+    with_others = ""
+    if found.takes_map_camera or found.estimates_calibration:
+        whose = "the map's" if found.takes_map_camera else "estimated"
+        with_others = f", with {whose} intrinsics: {found.calibration.sentence}"
+    return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{with_others}")
 
 
 def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> bool:
@@ -189,7 +192,7 @@ def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> 
 
 def is_blank(frame: Frame) -> bool:
     """Return whether the image is of a single colour, as if the lens were covered, or the frame has no colours at all."""
-    return not frame.has_colour or float(frame.rgb.flatten(0, 1).std(0).max()) < FLAT
+    return not frame.has_colour or float(frame.rgb.flatten(0, 1).std(0, correction=0).max()) < FLAT
 
 
 def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
