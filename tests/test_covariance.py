@@ -17,7 +17,6 @@ from bidnerf_core.localization.covariance import (
     position_deviation,
     sandwich_covariance,
     surface_covariance,
-    without_direction,
 )
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.se3 import SE3
@@ -63,14 +62,6 @@ def test_an_uncertain_offset_of_the_depth_makes_the_way_along_the_line_of_sight_
     mean = (sight / sight.norm(dim=-1, keepdim=True)).mean(0)
     added = (uncertain - exact)[:3, :3]
     torch.testing.assert_close(added, 0.02**2 * mean[:, None] * mean, rtol=1e-6, atol=1e-12)
-
-
-def test_information_without_a_direction_is_that_of_a_larger_covariance(generator: Generator) -> None:
-    root = torch.randn((6, 6), generator=generator, dtype=torch.float64)
-    slope = torch.randn(6, generator=generator, dtype=torch.float64)
-    information = root @ root.mT
-    larger = torch.linalg.inv(information) + slope[:, None] * slope
-    torch.testing.assert_close(without_direction(information, slope), torch.linalg.inv(larger))
 
 
 def test_the_surface_covariance_grows_with_the_square_of_noise() -> None:

@@ -119,11 +119,12 @@ def test_a_sensor_without_errors_fixes_the_factor() -> None:
 
 def test_a_scale_is_plausible_as_far_as_sensor_and_landmarks_may_err() -> None:
     most = PLAUSIBLE * math.hypot(0.02, LANDMARK_SCALE_NOISE)
-    assert DepthScale(0.02).is_plausible
+    assert DepthScale(0.02).objection is None
     for sign in (-1, 1):
-        assert DepthScale(0.02, 1 + sign * 0.99 * most).is_plausible
-        assert not DepthScale(0.02, 1 + sign * 1.01 * most).is_plausible
-        assert DepthScale(0.06, 1 + sign * 1.01 * most).is_plausible
+        assert DepthScale(0.02, 1 + sign * 0.99 * most).objection is None
+        assert DepthScale(0.02, 1 + sign * 1.01 * most).objection is not None
+        assert DepthScale(0.06, 1 + sign * 1.01 * most).objection is None
+    assert DepthScale(0.02, 0.2).objection == "it is 5 times as long as by landmarks"
 
 
 def test_a_cost_of_the_pose_says_nothing_of_the_factor(generator: Generator) -> None:

@@ -11,8 +11,10 @@ import torch
 
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
+from bidnerf_core.frames import Frame
 from bidnerf_core.localization.tracking.answers import METHOD
 from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
+from bidnerf_core.se3 import SE3
 from flights import (
     FRAMES,
     INTERVAL,
@@ -129,6 +131,17 @@ def test_a_foreign_scene_is_never_accepted() -> None:
 def test_depth_may_stop_midway() -> None:
     frames = [(t, f if i < 6 else without_depth(f), T) for i, (t, f, T) in enumerate(flight())]
     assert_right(tracked(frames), frames)
+
+
+def test_depth_of_another_unit_is_left_out() -> None:
+    """Feet read as metres: each frame is tracked by its colours, and says so."""
+    frames = list[tuple[float, Frame, SE3]]()
+    for t, frame, T in flight()[:8]:
+        assert frame.depth is not None
+        frames.append((t, replace(frame, depth=3.28 * frame.depth), T))
+    answers = tracked(frames)
+    assert_right(answers, frames)
+    assert all("without depth: it is 3.2" in answer.reason for answer in answers)
 
 
 def test_repeated_frames_do_not_make_it_more_certain() -> None:

@@ -202,11 +202,9 @@ def _fused(
     poses of the map's images are in its surface and its field as in its landmarks, so that no fusion makes them smaller.
     """
     scale = DepthScale.of(answer.found, problem.sensor)
-    if points is not None and scale.by_landmarks is not None and not scale.is_plausible:
-        times = f"it is {1 / scale.by_landmarks:.3g} times as long as by landmarks"
-        return _fused(
-            problem.without_depth(), replace(answer, left_out=f"depth: {times}"), None, rays, generator
-        )
+    if points is not None and scale.objection is not None:
+        without = replace(answer, left_out=f"depth: {scale.objection}")
+        return _fused(problem.without_depth(), without, None, rays, generator)
     names = (*(["depth"] if points is not None else []), *(["rendering"] if rays else []))
     if not names:
         return answer

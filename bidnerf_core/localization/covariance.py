@@ -77,15 +77,6 @@ def offset_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
     return torch.cat([-sight.mean(0).cpu(), torch.zeros(3, dtype=torch.float64)])
 
 
-def without_direction(information: Float[Tensor, "6 6"], slope: Float[Tensor, "6"]) -> Float[Tensor, "6 6"]:
-    """Return what an information matrix says where an unknown of unit variance moves the pose along ``slope`` as well.
-
-    The covariance grows by ``slope slope^T``; this form also holds where the information is singular (Woodbury).
-    """
-    pulled = information @ slope
-    return information - pulled[:, None] * pulled / (1 + slope @ pulled)
-
-
 def position_deviation(covariance: Float[Tensor, "6 6"]) -> float:
     """Return the standard deviation (metres) of the position along its least certain direction.
 

@@ -40,10 +40,12 @@ class DepthScale:
         return DepthScale(PRIOR_WIDTH * sensor.scale, found.depth_scale)
 
     @property
-    def is_plausible(self) -> bool:
-        """Whether the sensor and the landmarks may both be right."""
+    def objection(self) -> str | None:
+        """Why sensor and landmarks cannot both be right, so that the depth should be left out; None if they can."""
         deviation = math.hypot(self.deviation, LANDMARK_SCALE_NOISE)
-        return self.by_landmarks is None or abs(self.by_landmarks - 1) <= PLAUSIBLE * deviation
+        if self.by_landmarks is None or abs(self.by_landmarks - 1) <= PLAUSIBLE * deviation:
+            return None
+        return f"it is {1 / self.by_landmarks:.3g} times as long as by landmarks"
 
     @property
     def estimate(self) -> float:

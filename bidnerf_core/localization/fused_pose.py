@@ -19,12 +19,10 @@ from bidnerf_core.localization.depth_scale import (
     residual_equations,
     with_factor,
 )
-from bidnerf_core.localization.fusion import RENDERED_MEASUREMENTS
+from bidnerf_core.localization.fusion import RENDERED_MEASUREMENTS, SCALED_MEASUREMENTS
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.se3 import SE3
 
-POINT_MEASUREMENTS = 30.0
-"""Number of independent measurements that a view's points count as in a step; more than where their scale is taken as known."""
 SETTLED = 0.3
 """Decrease that a step promises of the sum of all terms, below which it is the last."""
 DAMPING = 1e-3
@@ -49,7 +47,7 @@ class Measurements:
             cost = self.points.at(here.factor)
             equations, variance = cost.with_variance(here.T[None])
             equations = self.points.about_middle(cost, equations)
-            terms.append(WeightedTerm(cost, equations, float(variance[0]), POINT_MEASUREMENTS * self.views))
+            terms.append(WeightedTerm(cost, equations, float(variance[0]), SCALED_MEASUREMENTS * self.views))
         if self.draw is not None:
             rays = self.draw(here.T, deviation)
             equations = with_factor(rays(here.T[None]))

@@ -204,7 +204,11 @@ class ByLandmarks:
         pose, surface = self._estimate(found), self.map.surface
         if not verdict.accepted or surface is None or not frame.has_depth:
             return Measurement(pose, verdict, found.noise, state)
-        here = CloudInCamera(self._cloud(frame, found, state.frames), found.T_world_camera)
+        scale = DepthScale.of(found, self.sensor)
+        if scale.objection is not None:
+            verdict = replace(verdict, reason=f"{verdict.reason}, without depth: {scale.objection}")
+            return Measurement(pose, verdict, found.noise, state)
+        here = CloudInCamera(self._cloud(frame, scale, state.frames), found.T_world_camera)
         cloud = joined_clouds(here, state.window)
         pose = fused_with_surface(pose, surface, cloud, self.config.depth_steps, 1 + len(state.window))
         kept_clouds = (*state.window, here)[-(self.config.window - 1) :] if self.config.window > 1 else ()
@@ -215,14 +219,12 @@ class ByLandmarks:
         """Split a pose's covariance: errors that the landmarks of an image have in common are those of the next image, too."""
         landmarks = self.detector.landmarks
         correlation = landmarks.correlation_of(len(found.correspondences))
-        noise = (found.covariance - landmarks.pose_covariance) / correlation
+        noise = (found.covariance - found.map_covariance) / correlation
         return PoseEstimate(found.T_world_camera, noise, found.full_covariance - noise)
 
-    def _cloud(self, frame: Frame, found: LandmarkPose, seed: int) -> PointCloud:
+    def _cloud(self, frame: Frame, scale: DepthScale, seed: int) -> PointCloud:
         generator = Generator().manual_seed(seed)
-        return measured_cloud(
-            frame, self.config.depth_points, DepthScale.of(found, self.sensor).estimate, generator
-        )
+        return measured_cloud(frame, self.config.depth_points, scale.estimate, generator)
 
 
 def search_radius(predicted: Motion, camera: Intrinsics) -> float:
