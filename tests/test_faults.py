@@ -296,6 +296,9 @@ def test_wrong_intrinsics_leave_the_image_alone(view: View) -> None:
     assert long.rgb is view.frame.rgb
     assert (long.intrinsics.fx, long.intrinsics.fy) == (own.fx * 1.05, own.fy * 1.05)
     assert dataclasses.replace(long.intrinsics, fx=own.fx, fy=own.fy) == own
+    wide = faulty(view, "stretch:1.1", 0).frame
+    assert wide.rgb is view.frame.rgb
+    assert wide.intrinsics == dataclasses.replace(own, fx=1.1 * own.fx)
     for seed in range(3):
         camera = faulty(view, "principal-point:10", seed).frame.intrinsics
         assert math.hypot(camera.cx - own.cx, camera.cy - own.cy) == pytest.approx(10)

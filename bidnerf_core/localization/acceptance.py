@@ -169,6 +169,11 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         return Verdict(
             Outcome.MISCALIBRATED, f"{share}, but do not tell whether {choice} are right: {other.sentence}"
         )
+    if found.stretch != 1:
+        how = f"{abs(found.stretch - 1):.0%} {'wider' if found.stretch > 1 else 'narrower'}"
+        return Verdict(
+            Outcome.MISCALIBRATED, f"{share}, but far more would if the image were {how} than its camera says"
+        )
     deviation = found.position_deviation
     if not deviation <= thresholds.precision * found.distance:
         return Verdict(

@@ -23,6 +23,11 @@ def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
     return replace(frame, intrinsics=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
 
 
+def stretched(frame: Frame, factor: float, generator: Generator) -> Frame:
+    """State ``factor`` times the true focal length across, as if an image had been resized in height alone."""
+    return replace(frame, intrinsics=replace(frame.intrinsics, fx=frame.intrinsics.fx * factor))
+
+
 def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """State a principal point that is ``pixels`` away from the true one, in a random direction."""
     camera, (across, down) = frame.intrinsics, random_direction(generator)

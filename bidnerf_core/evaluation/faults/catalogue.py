@@ -73,6 +73,10 @@ FAULTS: dict[str, Fault] = {
         "stated focal lengths multiplied by a factor", "factor", FACTOR, 1.0, (0.9, 0.95, 0.98, 1.02, 1.05, 1.1),
         camera.focal_scaled,
     ),
+    "stretch": Fault(
+        "stated focal length across multiplied by a factor, as of an image that was resized to another shape", "factor",
+        FACTOR, 1.0, (0.75, 0.9, 1.1, 1.33), camera.stretched,
+    ),
     "principal-point": Fault(
         "stated principal point moved in a random direction", "pixels", Range(0.0, LARGEST_SHIFT), 0.0, (2.0, 5.0, 10.0),
         camera.principal_point_moved,

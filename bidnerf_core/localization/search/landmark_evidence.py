@@ -14,6 +14,7 @@ from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import GuidedPose
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
+from bidnerf_core.localization.search.stretch import stretch_of
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
@@ -29,7 +30,8 @@ def described(
     """Return a refined pose with the evidence for it; ``matches`` are those by descriptors alone."""
     fit, query, camera = answer.fit, answer.query, answer.taken.camera
     data = query.observed(answer.correspondences).corrected(fit.calibration)
-    off = query.observed(matches).corrected(fit.calibration).residuals(fit.T_world_rig)
+    by_descriptors = query.observed(matches).corrected(fit.calibration)
+    off = by_descriptors.residuals(fit.T_world_rig)
     agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= query.threshold).sum())
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
@@ -56,6 +58,7 @@ def described(
         miscalibration=answer.miscalibration,
         calibration_scatter=query.landmarks.calibration_scatter,
         depth_scale=depth_scale(data, fit.T_world_rig),
+        stretch=stretch_of(by_descriptors, fit.T_world_rig, query.threshold, agreeing),
         seconds=seconds,
     )
 

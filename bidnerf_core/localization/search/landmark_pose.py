@@ -49,6 +49,9 @@ class LandmarkPose:
     calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
+    stretch: float = (
+        1.0  # factor by which the images seem wider than the intrinsics say, relative to their height
+    )
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
     @property
