@@ -145,7 +145,7 @@ def _bake_surface(
     save_surface(folder, stored.info, surface)
     source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
     say(
-        f"{folder}: surface of {len(surface.surfels)} pieces from {source} views, {time.monotonic() - began:.1f} s"
+        f"{folder}: surface of {len(surface.surfels)} surfels from {source} views, {time.monotonic() - began:.1f} s"
     )
     size = f"{surface.stored_cells} cells with a side of {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
     say(f"{folder}: the surface is indexed by {size}")

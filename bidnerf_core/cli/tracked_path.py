@@ -120,7 +120,7 @@ class TrackedPath:
             table.add_row(name, text)
         if seen := sum(map(self._is_of_training, self.frames)):
             table.add_row(
-                "of the training",
+                "trained on",
                 f"{amount(seen, 'frame')}; errors of frames that trained the map are no test",
             )
         return table
@@ -140,7 +140,7 @@ class TrackedPath:
         if errors.ate is not None:
             rows.append(("ATE", f"{errors.ate:.4f} m (root mean square, rigidly aligned)"))
         if errors.rpe is not None:
-            rows.append(("RPE, a frame", _written(errors.rpe)))
+            rows.append(("RPE per frame", _written(errors.rpe)))
         inside = [_inside(frame) for frame in self.accepted]
         known = [value for value in inside if value is not None]
         if known:
