@@ -103,9 +103,9 @@ def test_shards_share_all_trials_between_them(shards: int) -> None:
         ({"map": "demo:object"}, "train one with 'bidnerf demo'"),
         ({"map": "demo:blops"}, "expected demo:blobs"),
         ({"data": "demo:rom"}, "expected demo:room"),
-        ({"device": "gpu"}, "no device 'gpu'"),
-        ({"device": "meta"}, "no device 'meta'"),
-        ({"device": "cuda:99"}, "no device 'cuda:99'"),
+        ({"device": "gpu"}, "device 'gpu' does not work"),
+        ({"device": "meta"}, "device 'meta' does not work"),
+        ({"device": "cuda:99"}, "device 'cuda:99' does not work"),
     ],
 )
 def test_what_cannot_be_planned_is_refused(change: dict[str, Any], said: str) -> None:
