@@ -21,7 +21,7 @@ PRIOR_WIDTH = 2.0
 """Standard deviation of the prior of the depth scale over that of the sensor's scale, since single sensors are off by far more."""
 PLAUSIBLE = 5.0
 """Standard deviations of the depth scale by landmarks beyond which the depth is of another unit, or otherwise wrong."""
-LEAST_DEVIATION = 1e-4
+LEAST_SCALE_DEVIATION = 1e-4
 """Least standard deviation of the factor, so that a sensor without errors can be fused."""
 
 
@@ -30,9 +30,8 @@ class DepthScale:
     """What a sensor's tolerance and landmarks say of the factor that corrects measured depth."""
 
     deviation: float  # of the factor about 1, by the sensor
-    by_landmarks: float | None = (
-        None  # from the pose at which they were matched; None if too little was measured
-    )
+    # Factor from the pose at which landmarks were matched; None if too little was measured.
+    by_landmarks: float | None = None
 
     @staticmethod
     def of(found: LandmarkPose, sensor: DepthSensorModel) -> DepthScale:
@@ -80,6 +79,10 @@ class ScaledPoints:
         """Return the cost of the points with their depths multiplied by a factor, about their own middle."""
         return replace(self.cost, cloud=self.cost.cloud.scaled(factor))
 
+    def cost_at(self, at: PoseAndFactor) -> Float[Tensor, "1"]:
+        """Return the value of that cost at a pose."""
+        return self.at(at.factor).cost(at.T[None])
+
     def about_middle(self, cost: SurfaceCost, equations: NormalEquations) -> NormalEquations:
         """Return the equations of points of some factor about the middle of those of ``self.cost``."""
         updates = torch.eye(7, dtype=torch.float64)
@@ -95,7 +98,7 @@ class ScaledPoints:
         applied = self.scale.estimate
         by_factor = torch.zeros(7, dtype=torch.float64)
         by_factor[6] = applied
-        deviation = max(self.scale.deviation, LEAST_DEVIATION)
+        deviation = max(self.scale.deviation, LEAST_SCALE_DEVIATION)
         whole = residual_equations(applied * at.factor - 1, by_factor, deviation)
         if self.scale.by_landmarks is None:
             return whole

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCost
-from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import INDEPENDENT, LEAST_VARIANCE, position_deviation
 from bidnerf_core.localization.depth_scale import (
     PoseAndFactor,
@@ -23,9 +22,9 @@ from bidnerf_core.localization.fusion import RENDERED_MEASUREMENTS, SCALED_MEASU
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.se3 import SE3
 
-SETTLED = 0.3
+LEAST_DECREASE = 0.3
 """Decrease that a step promises of the sum of all terms, below which it is the last."""
-DAMPING = 1e-3
+FIRST_DAMPING = 1e-3
 """Damping of the first step."""
 
 
@@ -47,12 +46,18 @@ class Measurements:
             cost = self.points.at(here.factor)
             equations, variance = cost.with_variance(here.T[None])
             equations = self.points.about_middle(cost, equations)
-            terms.append(WeightedTerm(cost, equations, float(variance[0]), SCALED_MEASUREMENTS * self.views))
+            terms.append(
+                WeightedTerm(
+                    self.points.cost_at, equations, float(variance[0]), SCALED_MEASUREMENTS * self.views
+                )
+            )
         if self.draw is not None:
             rays = self.draw(here.T, deviation)
             equations = with_factor(rays(here.T[None]))
             count = self.effort * RENDERED_MEASUREMENTS * self.views
-            terms.append(WeightedTerm(rays, equations, float(equations.cost[0]), count))
+            terms.append(
+                WeightedTerm(lambda at: rays.cost(at.T[None]), equations, float(equations.cost[0]), count)
+            )
         return WeightedTerms(self, self.assumed(here), tuple(terms))
 
     def assumed(self, at: PoseAndFactor) -> NormalEquations:
@@ -70,7 +75,7 @@ class Measurements:
 class WeightedTerm:
     """A cost with its equations at one pose and factor, and the variance of its residuals there."""
 
-    cost: SurfaceCost | RenderedCost
+    cost: Callable[[PoseAndFactor], Float[Tensor, "1"]]
     equations: NormalEquations
     variance: float
     measurements: float  # independent ones that it counts for in a step
@@ -108,12 +113,7 @@ class WeightedTerms:
     def cost(self, at: PoseAndFactor) -> float:
         """Return the sum of all terms elsewhere, on the same rays and with the same weights."""
         total = float(self.measurements.assumed(at).cost[0])
-        for term in self.terms:
-            cost = term.cost
-            if isinstance(cost, SurfaceCost) and self.measurements.points is not None:
-                cost = self.measurements.points.at(at.factor)
-            total += term.weight * float(cost.cost(at.T[None])[0])
-        return total
+        return total + sum(term.weight * float(term.cost(at)[0]) for term in self.terms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def fused_pose(measurements: Measurements, most_steps: int) -> FusedPose:
     """
     prior = measurements.prior
     here, covariance = PoseAndFactor(prior.mean), prior.at_pivot
-    damping = torch.full((1,), DAMPING, dtype=torch.float64)
+    damping = torch.full((1,), FIRST_DAMPING, dtype=torch.float64)
     for _ in range(most_steps):
         weighted = measurements.at(here, position_deviation(covariance))
         equations, information = weighted.equations, weighted.information
@@ -151,7 +151,7 @@ def fused_pose(measurements: Measurements, most_steps: int) -> FusedPose:
         lower = weighted.cost(there) < float(equations.cost[0])
         here = there if lower else here
         damping = damping / 4 if lower else damping * 6
-        if float(step[0] @ of_pose.hessian[0] @ step[0]) < SETTLED:
+        if float(step[0] @ of_pose.hessian[0] @ step[0]) < LEAST_DECREASE:
             break
     covariance = prior.pivot.at_camera(here.T, covariance)
     return FusedPose(here.T, (covariance + covariance.mT) / 2, here.factor)

@@ -13,7 +13,7 @@ from bidnerf_core.se3 import SE3
 SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
 """Numbers of independent measurements that a view's points on the surface and its rendered rays count as."""
 SCALED_MEASUREMENTS = 30.0
-"""The same number for points whose scale is an unknown: without it as an error in common, they may count for more."""
+"""Number of independent measurements that a view's points count as where their scale is an unknown and no error in common."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import GuidedPose
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.stretch import stretch_of
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
@@ -58,7 +57,7 @@ def described(
         miscalibration=answer.miscalibration,
         calibration_scatter=query.landmarks.calibration_scatter,
         depth_scale=depth_scale(data, fit.T_world_rig),
-        stretch=stretch_of(by_descriptors, fit.T_world_rig, query.threshold, agreeing),
+        undecided=(by_descriptors, query.threshold),
         seconds=seconds,
     )
 

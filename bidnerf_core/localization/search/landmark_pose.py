@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -12,7 +13,9 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.search.stretch import stretch_of
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
+from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 
@@ -49,10 +52,17 @@ class LandmarkPose:
     calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
-    stretch: float = (
-        1.0  # factor by which the images seem wider than the intrinsics say, relative to their height
-    )
+    # What tells the stretch: matches by descriptors alone, and the residual (pixels) up to which one agrees; None: not known.
+    undecided: tuple[ObservedPoints, float] | None = None
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
+
+    @cached_property
+    def stretch(self) -> float:
+        """The factor by which the images seem wider than the intrinsics say, relative to their height; 1 where unknown."""
+        if self.undecided is None:
+            return 1.0
+        data, limit = self.undecided
+        return stretch_of(data, self.T_world_camera, limit, self.agreeing)
 
     @property
     def focal_factor(self) -> float:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
-AGREEING = 0.8
+UNSUSPECTED = 0.8
 """Share of the matches from which on a pose is not suspected."""
 LEAST_STRETCH = math.log(1.03)
 """Smallest stretch that is told from the errors of lenses and landmarks."""
@@ -28,8 +28,10 @@ SCALES = (4.0, 1.0)
 """Residuals at which outliers begin in the fits one after the other, in limits of an inlier."""
 MOST_EVALUATIONS = 30
 """Largest number of steps of a fit."""
-BEHIND = 1e4
-"""Residual, pixels, of a point behind the camera."""
+LARGEST_RESIDUAL = 1e4
+"""Residual, pixels, of points behind the camera and of those that are farther off: fits need finite numbers."""
+LARGEST_CHANGE = 5.0
+"""Largest logarithm of a focal length's change that is tried."""
 
 
 def stretch_of(data: ObservedPoints, T_world_rig: SE3, limit: float, agreeing: int) -> float:
@@ -37,7 +39,7 @@ def stretch_of(data: ObservedPoints, T_world_rig: SE3, limit: float, agreeing: i
 
     ``data`` are matches by descriptors alone, of which ``agreeing`` have residuals within ``limit`` (pixels) at the pose.
     """
-    if not 0 < agreeing < AGREEING * len(data):
+    if not 0 < agreeing < UNSUSPECTED * len(data):
         return 1.0
     project = _Projection(data, T_world_rig)
     found = np.zeros(8)
@@ -66,9 +68,11 @@ class _Projection:
         rig = (self._points - self._rig - self._R_world_rig @ unknowns[:3]) @ turned
         local = np.einsum("mij,mj->mi", self._rotation, rig) + self._translation
         z = local[:, 2:]
-        across, down = np.exp(unknowns[6] + np.array([0.5, -0.5]) * unknowns[7])
-        projected = local[:, :2] / np.where(z > 0, z, 1) * np.array([across, down])
-        return np.where(z > 0, (projected - self._image) * self._focal, BEHIND)
+        change = unknowns[6] + np.array([0.5, -0.5]) * unknowns[7]
+        factors = np.exp(change.clip(-LARGEST_CHANGE, LARGEST_CHANGE))
+        projected = local[:, :2] / np.where(z > 0, z, 1) * factors
+        off = np.where(z > 0, (projected - self._image) * self._focal, LARGEST_RESIDUAL)
+        return off.clip(-LARGEST_RESIDUAL, LARGEST_RESIDUAL)
 
     def whitened(self, unknowns: Float[np.ndarray, "8"], scale: float) -> Float[np.ndarray, "n"]:
         """Return all residuals in units of ``scale``, and those of the prior."""
