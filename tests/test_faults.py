@@ -61,6 +61,8 @@ def same(a: Frame, b: Frame, tolerance: float = 0.0) -> bool:
     assert a.depth is not None
     assert b.depth is not None
     assert (a.alpha is None) == (b.alpha is None)
+    if a.rgb.shape != b.rgb.shape:
+        return False
     alike = [torch.allclose(a.rgb, b.rgb, rtol=0, atol=tolerance), torch.equal(a.depth, b.depth)]
     if a.alpha is not None and b.alpha is not None:
         alike.append(torch.allclose(a.alpha, b.alpha, rtol=0, atol=tolerance))
@@ -300,6 +302,16 @@ def test_wrong_intrinsics_leave_the_image_alone(view: View) -> None:
     assert wide.rgb is view.frame.rgb
     assert wide.intrinsics == dataclasses.replace(own, fx=1.1 * own.fx)
     for seed in range(3):
+        part = faulty(view, "crop:0.25", seed).frame
+        width, height = round(0.75 * own.width), round(0.75 * own.height)
+        assert part.rgb.shape == (height, width, 3)
+        assert (part.intrinsics.cx - width / 2, part.intrinsics.cy - height / 2) == (
+            own.cx - own.width / 2,
+            own.cy - own.height / 2,
+        )
+        corners = [(y, x) for y in (0, own.height - height) for x in (0, own.width - width)]
+        whole = [view.frame.rgb[y : y + height, x : x + width] for y, x in corners]
+        assert any(torch.equal(part.rgb, expected) for expected in whole)
         camera = faulty(view, "principal-point:10", seed).frame.intrinsics
         assert math.hypot(camera.cx - own.cx, camera.cy - own.cy) == pytest.approx(10)
         assert dataclasses.replace(camera, cx=own.cx, cy=own.cy) == own

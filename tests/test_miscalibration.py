@@ -9,13 +9,9 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from bidnerf_core.localization.search.miscalibration import (
-    MISTAKEN,
-    MISTAKES,
-    USUAL,
-    USUALLY,
+    MIXTURE,
     unresolved_deviations,
 )
-from bidnerf_core.mapping.calibration import CALIBRATED
 
 
 def left_open(apparent: float, deviation: float) -> float:
@@ -26,10 +22,9 @@ def left_open(apparent: float, deviation: float) -> float:
 
 def by_integration(apparent: float, deviation: float) -> float:
     """The standard deviation about zero of the posterior of the focal length, by quadrature over the prior."""
-    parts = ((CALIBRATED, 1 - USUALLY - MISTAKES), (USUAL, USUALLY), (MISTAKEN, MISTAKES))
 
     def posterior(x: float) -> float:
-        prior = sum(share * norm.pdf(x, scale=part.log_focal) for part, share in parts)
+        prior = sum(share * norm.pdf(x, scale=part.log_focal) for part, share in MIXTURE)
         return float(prior * norm.pdf(apparent, loc=x, scale=deviation))
 
     places = sorted({0.0, apparent, *(k * deviation + apparent for k in (-3, 3))})
@@ -46,9 +41,8 @@ def test_what_stays_open_is_the_spread_of_the_posterior(apparent: float, deviati
 
 
 def test_an_image_that_tells_nothing_leaves_usual_errors_open() -> None:
-    prior = (1 - USUALLY - MISTAKES, USUALLY, MISTAKES)
-    squares = (part.log_focal**2 for part in (CALIBRATED, USUAL, MISTAKEN))
-    expected = sum(share * square for share, square in zip(prior, squares, strict=True)) ** 0.5
+    assert sum(share for _, share in MIXTURE) == pytest.approx(1)
+    expected = sum(share * part.log_focal**2 for part, share in MIXTURE) ** 0.5
     assert left_open(0.0, 10.0) == pytest.approx(expected, rel=1e-2)
 
 

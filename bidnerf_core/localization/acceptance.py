@@ -18,7 +18,7 @@ from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.mapping.calibration import Calibration
+from bidnerf_core.mapping.calibration import UNSTRETCHED, Calibration
 from bidnerf_core.mapping.casting import trace
 from bidnerf_core.se3 import SE3
 
@@ -169,11 +169,11 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         return Verdict(
             Outcome.MISCALIBRATED, f"{share}, but do not tell whether {choice} are right: {other.sentence}"
         )
-    if found.stretch != 1:
-        how = f"{abs(found.stretch - 1):.0%} {'wider' if found.stretch > 1 else 'narrower'}"
-        return Verdict(
-            Outcome.MISCALIBRATED, f"{share}, but far more would if the image were {how} than its camera says"
-        )
+    if found.better_camera is not None:
+        camera = found.better_camera.sentence
+        return Verdict(Outcome.MISCALIBRATED, f"{share}, but far more would with {camera}")
+    if found.stretch != UNSTRETCHED and not found.takes_map_camera:
+        return Verdict(Outcome.MISCALIBRATED, f"{share}, but only with {found.camera_sentence}")
     deviation = found.position_deviation
     if not deviation <= thresholds.precision * found.distance:
         return Verdict(
@@ -183,7 +183,7 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     with_others = ""
     if found.takes_map_camera or found.estimates_calibration:
         whose = "the map's" if found.takes_map_camera else "estimated"
-        with_others = f", with {whose} intrinsics: {found.calibration.sentence}"
+        with_others = f", with {whose} intrinsics: {found.camera_sentence}"
     return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{with_others}")
 
 

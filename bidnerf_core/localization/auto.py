@@ -171,7 +171,8 @@ def _compared_with_landmarks(
     determine it better.
     """
     near = confirm(matcher, problem.views, found.T_world_camera)
-    if near.pose is not None and (verdict := landmark_verdict(near.pose, WITHOUT_SEARCH)).accepted:
+    verdict = None if near.pose is None else landmark_verdict(near.pose, WITHOUT_SEARCH)
+    if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
         confidence = answer.confidence or 0.0
         supported = found.converged and confidence >= SUPPORTED
@@ -191,6 +192,8 @@ def _compared_with_landmarks(
         ):
             return replace(found, seconds=time.perf_counter() - began)
         return replace(refined, reason=f"found on the surface; {refined.reason}")
+    if found.converged and verdict is not None and _is_misleading(verdict, problem):
+        return replace(found, outcome=verdict.outcome, reason=f"{verdict.reason}; {found.reason}")
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
@@ -201,6 +204,11 @@ def _compared_with_landmarks(
     ):
         return _rejected_by_mirror(found, twin)
     return replace(found, seconds=time.perf_counter() - began)
+
+
+def _is_misleading(verdict: Verdict, problem: Problem) -> bool:
+    """Whether landmarks say that the intrinsics are wrong, which colours at a wrong pose then agree with; measured depth would not."""
+    return verdict.outcome is Outcome.MISCALIBRATED and _measured_points(problem) < LEAST_POINTS
 
 
 def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:

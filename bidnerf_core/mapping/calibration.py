@@ -83,6 +83,30 @@ GIVEN = Calibration()
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """Factors of the given focal lengths: the image was resized to another shape, which its intrinsics do not tell."""
+
+    across: float = 1.0
+    down: float = 1.0
+
+    def applied(self, given: Intrinsics) -> Intrinsics:
+        """Return the intrinsics of the stretched image."""
+        return replace(given, fx=given.fx * self.across, fy=given.fy * self.down)
+
+    def sentence(self, calibration: Calibration) -> str:
+        """Return in words how a camera differs from the given one if its ``calibration`` is corrected too."""
+        factor = self.across / self.down
+        if factor == 1:
+            return calibration.sentence
+        how = f"{abs(factor - 1):.0%} {'wider' if factor > 1 else 'narrower'}"
+        return f"an image {how} than stated and {calibration.sentence}"
+
+
+UNSTRETCHED = Stretch()
+"""The shape that the intrinsics tell."""
+
+
+@dataclass(frozen=True)
 class CalibrationPrior:
     """Standard deviations of given intrinsics, in the units of ``Calibration``; a parameter with 0 is not estimated."""
 
@@ -104,7 +128,13 @@ USUAL, USUALLY = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01), 0.35
 """Standard deviations of intrinsics as many devices state them, and the share of cameras whose intrinsics are so: they belong to
 another unit of the model, or to another focus and temperature.
 """
+DOUBTED = CalibrationPrior(log_focal=0.005, shift=0.005, radial=0.005)
+"""Intrinsics that are right as far as can be told, of a camera of which others are wrong."""
 MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
 """Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
+CROPPED, CROPS = CalibrationPrior(log_focal=DOUBTED.log_focal, shift=0.1, radial=DOUBTED.radial), 0.02
+"""Standard deviations of intrinsics that take the middle of a cropped image for its principal point, and the share of such images."""
 NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
 """Intrinsics from EXIF or a field of view, without distortion."""
+ANY = CalibrationPrior(log_focal=NOMINAL.log_focal, shift=CROPPED.shift, radial=NOMINAL.radial)
+"""Intrinsics of which nothing is known but that a lens of usual distortion took the image, which may be a part of another one."""

@@ -28,6 +28,33 @@ def stretched(frame: Frame, factor: float, generator: Generator) -> Frame:
     return replace(frame, intrinsics=replace(frame.intrinsics, fx=frame.intrinsics.fx * factor))
 
 
+def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
+    """Cut a ``share`` of the width and of the height off at a random corner, and state the principal point as if nothing were cut off.
+
+    It is stated as far from the middle of what remains as it was from the middle of the whole.
+    """
+    camera = frame.intrinsics
+    columns, rows = (
+        _kept(size, share, end)
+        for size, end in zip(
+            (camera.width, camera.height), torch.rand(2, generator=generator) < 0.5, strict=True
+        )
+    )
+    width, height = columns.stop - columns.start, rows.stop - rows.start
+    cx, cy = camera.cx - (camera.width - width) / 2, camera.cy - (camera.height - height) / 2
+    stated = replace(camera, cx=cx, cy=cy, width=width, height=height)
+    images = (frame.rgb, frame.depth, frame.alpha, frame.hidden)
+    rgb, depth, alpha, hidden = (None if x is None else x[rows, columns].contiguous() for x in images)
+    assert rgb is not None
+    return replace(frame, rgb=rgb, depth=depth, alpha=alpha, hidden=hidden, intrinsics=stated)
+
+
+def _kept(size: int, share: float, end: Tensor) -> slice:
+    """Return what remains of a number of pixels without a ``share`` of them at the beginning or at the end."""
+    cut = min(round(share * size), size - 1)
+    return slice(0, size - cut) if bool(end) else slice(cut, size)
+
+
 def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> Frame:
     """State a principal point that is ``pixels`` away from the true one, in a random direction."""
     camera, (across, down) = frame.intrinsics, random_direction(generator)

@@ -77,6 +77,10 @@ FAULTS: dict[str, Fault] = {
         "stated focal length across multiplied by a factor, as of an image that was resized to another shape", "factor",
         FACTOR, 1.0, (0.75, 0.9, 1.1, 1.33), camera.stretched,
     ),
+    "crop": Fault(
+        "rows and columns cut off at a corner, which the stated principal point does not allow for",
+        "share of width and height", Range(0.0, 0.9), 0.0, (0.1, 0.25), camera.cropped,
+    ),
     "principal-point": Fault(
         "stated principal point moved in a random direction", "pixels", Range(0.0, LARGEST_SHIFT), 0.0, (2.0, 5.0, 10.0),
         camera.principal_point_moved,

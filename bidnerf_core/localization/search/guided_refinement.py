@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,10 +20,19 @@ from bidnerf_core.localization.search.miscalibration import (
     NO_EVIDENCE,
     Miscalibration,
     TakenIntrinsics,
+    probability_of_crop,
     taken_intrinsics,
 )
 from bidnerf_core.localization.search.ransac import Hypothesis
-from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration, CalibrationPrior
+from bidnerf_core.mapping.calibration import (
+    ANY,
+    CALIBRATED,
+    DOUBTED,
+    FIXED,
+    GIVEN,
+    NOMINAL,
+    CalibrationPrior,
+)
 from bidnerf_core.mapping.features import NORM
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, resect
@@ -63,15 +71,23 @@ class GuidedPose:
     miscalibration: Miscalibration
 
 
-def refined_pose(query: LandmarkQuery, inliers: LandmarkMatches, first: Hypothesis) -> GuidedPose:
-    """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change."""
+def refined_pose(
+    query: LandmarkQuery,
+    inliers: LandmarkMatches,
+    first: Hypothesis,
+    prior: CalibrationPrior | None = None,
+) -> GuidedPose:
+    """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change.
+
+    ``prior``: how uncertain the given intrinsics are before they are judged, if more than those of the query.
+    """
+    prior = query.prior if prior is None else prior
     most = usual_distance(query, inliers)
-    start = Calibration(log_focal=math.log(first.focal_factor))
     correlation = query.landmarks.correlation_of(len(inliers))
     fit = resect(
-        query.observed(inliers), first.T_world_rig, query.threshold / 2, query.prior, start, correlation
+        query.observed(inliers), first.T_world_rig, query.threshold / 2, prior, first.calibration, correlation
     )
-    return _settled(query, fit, inliers, most)
+    return _settled(query, fit, inliers, most, prior)
 
 
 def usual_distance(query: LandmarkQuery, inliers: LandmarkMatches) -> float:
@@ -87,29 +103,51 @@ def confirmed(query: LandmarkQuery, T_world_rig: SE3) -> GuidedPose | None:
         return None
     correlation = query.landmarks.correlation_of(len(found))
     fit = resect(query.observed(found), T_world_rig, radius / 2, query.prior, correlation=correlation)
-    return _settled(query, fit, found, MOST_DISTANCE)
+    return _settled(query, fit, found, MOST_DISTANCE, query.prior)
 
 
-def _settled(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches, most: float) -> GuidedPose:
-    """Refine a pose on guided matches, with the given intrinsics unless the matches contradict them for certain."""
-    fit, found = _guided(query, query.prior, fit, found, most, RADII)
-    correlation = query.landmarks.correlation_of(len(found))
-    free = resect(query.observed(found), fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
+def _settled(
+    query: LandmarkQuery,
+    fit: ReprojectionFit,
+    found: LandmarkMatches,
+    most: float,
+    prior: CalibrationPrior,
+) -> GuidedPose:
+    """Refine a pose on guided matches, with the given intrinsics unless the matches contradict them for certain.
+
+    ``prior`` says how uncertain they are before that is known.
+    """
+    fit, found = _guided(query, prior, fit, found, most, RADII)
+    free, correlation = _with_free_camera(query, fit, found), query.landmarks.correlation_of(len(found))
     evidence, approximate = query.evidence, query.prior.log_focal > 0
     taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate, evidence.map_camera)
-    wrong = Miscalibration.of(free, query.landmarks, taken, evidence.mistaken)
+    right = query.prior if approximate and taken.camera is None else CALIBRATED
+    wrong = Miscalibration.of(free, query.landmarks, taken, evidence.mistaken, right)
     certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_BY_OTHERS
-    if wrong.worst[1] > certain and not query.prior.log_focal:
+    if wrong.worst[1] > certain:
         taken = TakenIntrinsics()
-        fit, found = _guided(query, NOMINAL, free, found, most, RADII[1:])
+        prior = wrong.prior(query.prior if approximate else DOUBTED)
+        fit, found = _guided(query, prior, free, found, most, RADII[1:])
     elif taken.camera is not None:
-        query = query.seen_by(taken.camera)
+        query = query.seen_by([taken.camera.intrinsics] * len(query.images))
         fit = resect(query.observed(found), free.T_world_rig, free.noise, FIXED, GIVEN, correlation)
         fit, found = _guided(query, FIXED, fit, found, most, RADII[1:])
+    elif prior != query.prior:
+        fit = resect(query.observed(found), free.T_world_rig, free.noise, query.prior, GIVEN, correlation)
+        fit, found = _guided(query, query.prior, fit, found, most, RADII[1:])
     radius = RADII[-1] * query.threshold
     projections = projected_landmarks(query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius)
     visible, chance = sum(map(len, projections)), matches_by_chance(projections, radius, most)
     return GuidedPose(query, fit, found, visible, chance, taken, wrong)
+
+
+def _with_free_camera(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches) -> ReprojectionFit:
+    """Return a fit of the intrinsics along with the pose, with any principal point only if the image is probably a part of one."""
+    data, correlation = query.observed(found), query.landmarks.correlation_of(len(found))
+    part = resect(data, fit.T_world_rig, fit.noise, ANY, fit.calibration, correlation)
+    if probability_of_crop(part, query.landmarks) > 0.5:
+        return part
+    return resect(data, fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
 
 
 def _guided(

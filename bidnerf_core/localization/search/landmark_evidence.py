@@ -27,6 +27,7 @@ def described(
     query: LandmarkQuery, matches: LandmarkMatches, answer: GuidedPose, seconds: dict[str, float]
 ) -> LandmarkPose:
     """Return a refined pose with the evidence for it; ``matches`` are those by descriptors alone."""
+    given = query.observed(matches)
     fit, query, camera = answer.fit, answer.query, answer.taken.camera
     data = query.observed(answer.correspondences).corrected(fit.calibration)
     by_descriptors = query.observed(matches).corrected(fit.calibration)
@@ -57,7 +58,7 @@ def described(
         miscalibration=answer.miscalibration,
         calibration_scatter=query.landmarks.calibration_scatter,
         depth_scale=depth_scale(data, fit.T_world_rig),
-        undecided=(by_descriptors, query.threshold),
+        undecided=(given, query.threshold),
         seconds=seconds,
     )
 

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.covariance import position_deviation
+from bidnerf_core.localization.search.camera_fit import CameraFit, better_camera
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
-from bidnerf_core.localization.search.stretch import stretch_of
-from bidnerf_core.mapping.calibration import GIVEN, Calibration
+from bidnerf_core.mapping.calibration import GIVEN, UNSTRETCHED, Calibration, Stretch
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
@@ -52,17 +52,19 @@ class LandmarkPose:
     calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
-    # What tells the stretch: matches by descriptors alone, and the residual (pixels) up to which one agrees; None: not known.
+    # What tells another camera: matches by descriptors alone, as the given intrinsics have them, and the residual (pixels) up to
+    # which one agrees; None: not known.
     undecided: tuple[ObservedPoints, float] | None = None
+    stretch: Stretch = UNSTRETCHED  # of the given intrinsics; ``calibration`` corrects the stretched ones
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
     @cached_property
-    def stretch(self) -> float:
-        """The factor by which the images seem wider than the intrinsics say, relative to their height; 1 where unknown."""
+    def better_camera(self) -> CameraFit | None:
+        """The camera with which far more matches agree; None if there is none, or where that is not known."""
         if self.undecided is None:
-            return 1.0
+            return None
         data, limit = self.undecided
-        return stretch_of(data, self.T_world_camera, limit, self.agreeing)
+        return better_camera(data, self.T_world_camera, self.calibration, limit, self.agreeing)
 
     @property
     def focal_factor(self) -> float:
@@ -73,7 +75,14 @@ class LandmarkPose:
         """Return the intrinsics that were taken or estimated for images with the ``given`` ones; None if these were kept."""
         if self.intrinsics is not None:
             return self.intrinsics
-        return None if self.calibration == GIVEN else self.calibration.applied(given)
+        if self.calibration == GIVEN and self.stretch == UNSTRETCHED:
+            return None
+        return self.calibration.applied(self.stretch.applied(given))
+
+    @property
+    def camera_sentence(self) -> str:
+        """How the camera differs from the given one, in words."""
+        return self.stretch.sentence(self.calibration)
 
     @property
     def estimates_calibration(self) -> bool:

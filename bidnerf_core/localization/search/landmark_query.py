@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -42,15 +43,12 @@ class LandmarkQuery:
         given = {image.intrinsics for image in self.images}
         return map_camera(given.pop(), self.landmarks.cameras) if len(given) == 1 else None
 
-    def seen_by(self, camera: MapCamera) -> LandmarkQuery:
-        """Return the query with images that the map's camera took."""
+    def seen_by(self, cameras: Sequence[Intrinsics]) -> LandmarkQuery:
+        """Return the query with other intrinsics for each of its images."""
         images = [
-            replace(
-                image, intrinsics=camera.intrinsics,
-                rays=camera.intrinsics.unproject(image.keypoints.pixels.double()),
-            )
-            for image in self.images
-        ]  # fmt: skip
+            replace(image, intrinsics=camera, rays=camera.unproject(image.keypoints.pixels.double()))
+            for image, camera in zip(self.images, cameras, strict=True)
+        ]
         return replace(self, images=images)
 
     def observed(self, matches: LandmarkMatches) -> ObservedPoints:

@@ -14,10 +14,11 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
+from bidnerf_core.localization.search.other_camera import with_other_camera
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
 from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.localization.search.unguided import unguided_matches
-from bidnerf_core.mapping.calibration import FIXED, NOMINAL, CalibrationPrior
+from bidnerf_core.mapping.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.se3 import SE3
 
@@ -62,7 +63,7 @@ def propose(
     clock.lap("refinement")
     found = described(query, matches, answer, clock.seconds)
     clock.lap("assessment")
-    return found
+    return with_other_camera(query, matches, found, clock)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +136,7 @@ def _map_camera_consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: 
     camera = query.map_camera
     if camera is None or not camera.is_near(query.prior):
         return None
-    data = query.seen_by(camera).observed(matches)
+    data = query.seen_by([camera.intrinsics] * len(query.images)).observed(matches)
     found = sample_consensus(data, matches.view, query.threshold, seed)
-    return None if found is None else replace(found, focal_factor=camera.calibration.focal_factor)
+    focal = Calibration(log_focal=camera.calibration.log_focal)
+    return None if found is None else replace(found, calibration=focal)

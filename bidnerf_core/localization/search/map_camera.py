@@ -40,6 +40,8 @@ SAME_CAMERA = 0.9
 SAME_LOG_ODDS = math.log(SAME_CAMERA / (1 - SAME_CAMERA))
 OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1)
 """Standard deviations between the intrinsics of different cameras of one shape of image."""
+ALIKE, ALIKE_SHAPES = CalibrationPrior(log_focal=0.04, shift=0.04), 0.02
+"""Largest differences between intrinsics that were estimated from an image and those of the map's camera, if it took the image."""
 MOST_DEVIATIONS = 1.5
 """Differences of so many times ``OTHER_CAMERA``, or of ``NOMINAL`` where the focal length is approximate, are those of another
 camera for certain.
@@ -112,6 +114,23 @@ def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera 
     correction, camera = described[(len(described) - 1) // 2]
     spread = torch.stack([(other - correction).square() for other, _ in described]).mean(0)
     return MapCamera(correction, (CALIBRATED.deviations.square() + spread).sqrt(), camera)
+
+
+def camera_like(fitted: Intrinsics, cameras: tuple[Intrinsics, ...]) -> Intrinsics | None:
+    """Return the camera of a map's images, resized to the image of the ``fitted`` intrinsics whatever its shape; None if they differ.
+
+    These were estimated from a single image, and so closely another camera's are hardly the same.
+    """
+    resized = sorted(
+        (camera.resized(fitted.width, fitted.height) for camera in cameras), key=lambda camera: camera.fx
+    )
+    if not resized:
+        return None
+    camera = resized[(len(resized) - 1) // 2]
+    across, down = math.log(camera.fx / fitted.fx), math.log(camera.fy / fitted.fy)
+    shifts = ((camera.cx - fitted.cx) / fitted.fx, (camera.cy - fitted.cy) / fitted.fy)
+    alike = abs(across - down) <= ALIKE_SHAPES and abs(across + down) <= 2 * ALIKE.log_focal
+    return camera if alike and max(map(abs, shifts)) <= ALIKE.shift else None
 
 
 def _agree(a: Intrinsics, b: Intrinsics) -> bool:

@@ -11,7 +11,10 @@ from torch import Tensor
 
 from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, SAME_CAMERA, SAME_LOG_ODDS, MapCamera
 from bidnerf_core.mapping.calibration import (
+    ANY,
     CALIBRATED,
+    CROPPED,
+    CROPS,
     GIVEN,
     MISTAKEN,
     MISTAKES,
@@ -19,14 +22,19 @@ from bidnerf_core.mapping.calibration import (
     USUAL,
     USUALLY,
     Calibration,
+    CalibrationPrior,
 )
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import ReprojectionFit
 
-MIXTURE = ((CALIBRATED, 1 - USUALLY - MISTAKES), (USUAL, USUALLY), (MISTAKEN, MISTAKES))
+Mixture = tuple[tuple[CalibrationPrior, float], ...]
+"""Priors and their shares."""
+WRONG: Mixture = ((MISTAKEN, MISTAKES), (CROPPED, CROPS))
+"""Priors of the correction of intrinsics that are wrong, and the shares of cameras that they are of."""
+WRONGS = sum(share for _, share in WRONG)
+"""Share of cameras whose intrinsics are wrong."""
+MIXTURE: Mixture = ((CALIBRATED, 1 - USUALLY - WRONGS), (USUAL, USUALLY), *WRONG)
 """Prior of the correction of given intrinsics: they are calibrated, off as usual, or wrong."""
-LOG_SHARES = torch.tensor([share for _, share in MIXTURE], dtype=torch.float64).log()
-"""Logarithms of the shares of the parts of ``MIXTURE``."""
 LIKELY = 0.8
 """Probability from which on an image whose focal length is approximate is taken to be from the map's camera."""
 
@@ -61,7 +69,7 @@ class TakenIntrinsics:
 
         Intrinsics that are also those of the map's images are mistaken only for another camera's image.
         """
-        share = MISTAKES * (1 - SAME_CAMERA) if self.as_map else MISTAKES
+        share = WRONGS * (1 - SAME_CAMERA) if self.as_map else WRONGS
         return math.log(share / (1 - share))
 
 
@@ -90,17 +98,22 @@ class Miscalibration:
 
     @staticmethod
     def of(
-        free: ReprojectionFit, landmarks: LandmarkMap, taken: TakenIntrinsics, other_log_odds: float = 0.0
+        free: ReprojectionFit,
+        landmarks: LandmarkMap,
+        taken: TakenIntrinsics,
+        other_log_odds: float = 0.0,
+        right: CalibrationPrior = CALIBRATED,
     ) -> Miscalibration:
         """Judge the intrinsics ``taken`` by a fit in which they were free.
 
         ``other_log_odds``: logarithm of the odds that they are wrong, by other measurements; it counts for each parameter.
+        ``right``: how uncertain those are that are not wrong.
         """
         value, noise = _estimate(free, landmarks)
         value = value - _as_tensor(taken.calibration)
-        right, wrong = (noise + prior.deviations.square() for prior in (CALIBRATED, MISTAKEN))
-        log_ratio = 0.5 * (value.square() / right - value.square() / wrong + right.log() - wrong.log())
-        log_odds = log_ratio + taken.log_odds_of_mistake + other_log_odds
+        mistaken = _log_joint(WRONG, value, noise).logsumexp(0) - math.log(WRONGS)
+        (correct,) = _log_joint(((right, 1.0),), value, noise)
+        log_odds = mistaken - correct + taken.log_odds_of_mistake + other_log_odds
         return Miscalibration(
             value, free.calibration_deviations, log_odds.sigmoid(), unresolved_deviations(value, noise),
             _as_tensor(taken.alternative), value.new_tensor(taken.probability),
@@ -110,6 +123,15 @@ class Miscalibration:
     def deviations(self) -> Float[Tensor, "4"]:
         """The standard deviation of the true correction about zero."""
         return (CALIBRATED.deviations.square() + self.probability * self.apparent.square()).sqrt()
+
+    def prior(self, right: CalibrationPrior) -> CalibrationPrior:
+        """Return how uncertain the intrinsics are where those that are probably wrong are unknown, and the others ``right``."""
+        focal, u, v, radial = (self.probability > 0.5).tolist()
+        return CalibrationPrior(
+            ANY.log_focal if focal else right.log_focal,
+            ANY.shift if u or v else right.shift,
+            ANY.radial if radial else right.radial,
+        )
 
     @property
     def worst(self) -> tuple[int, float]:
@@ -154,7 +176,9 @@ def probability_of_map_camera(
     measurements.
     """
     value, noise = _estimate(free, landmarks)
-    by_given = (_log_densities(value, noise)[:, camera.differs].sum(1) + LOG_SHARES).logsumexp(0)
+    by_given = torch.stack([
+        _log_density(part, value, noise)[camera.differs].sum() + math.log(share) for part, share in MIXTURE
+    ]).logsumexp(0)  # fmt: skip
     evidence = float(_log_density_by(camera, value, noise)[camera.differs].sum() - by_given)
     return float(torch.tensor(evidence + camera.log_odds + other_log_odds, dtype=torch.float64).sigmoid())
 
@@ -179,18 +203,34 @@ def _log_density_by(
     return -0.5 * ((value - camera.correction).square() / total + total.log())
 
 
+def probability_of_crop(free: ReprojectionFit, landmarks: LandmarkMap) -> float:
+    """Return the probability that an image is a part of one, by the principal point of a fit in which it was free."""
+    value, noise = _estimate(free, landmarks)
+    part, whole = (_log_density(prior, value, noise)[1:3].sum() for prior in (CROPPED, NOMINAL))
+    return float((part - whole + math.log(CROPS / (1 - CROPS))).sigmoid())
+
+
 def unresolved_deviations(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
     """Return the standard deviations about zero of the true corrections, seen as ``apparent`` with the variances ``noise``."""
     prior = torch.stack([part.deviations.square() for part, _ in MIXTURE])
     total = prior + noise
-    weights = torch.softmax(_log_densities(apparent, noise) + LOG_SHARES[:, None], dim=0)
+    weights = torch.softmax(_log_joint(MIXTURE, apparent, noise), dim=0)
     mean, variance = apparent * prior / total, prior * noise / total
     return (weights * (mean.square() + variance)).sum(0).sqrt()
 
 
-def _log_densities(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "parts 4"]:
-    """Return the logarithm of the density of each part of the mixture at an estimate with the variances ``noise``, but for a constant."""
-    total = torch.stack([part.deviations.square() for part, _ in MIXTURE]) + noise
+def _log_joint(
+    mixture: Mixture, apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]
+) -> Float[Tensor, "parts 4"]:
+    """Return for each parameter the logarithms of the joint densities of its estimate and the parts of a mixture."""
+    return torch.stack([_log_density(part, apparent, noise) + math.log(share) for part, share in mixture])
+
+
+def _log_density(
+    prior: CalibrationPrior, apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]
+) -> Float[Tensor, "4"]:
+    """Return the logarithm of the density of each estimate with the variances ``noise``, but for a constant."""
+    total = prior.deviations.square() + noise
     return -0.5 * (apparent.square() / total + total.log())
 
 

@@ -6,6 +6,7 @@ Unknown focal length: P4Pf, which poselib provides without a RANSAC loop, so the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
@@ -33,7 +35,7 @@ class Hypothesis:
     T_world_rig: SE3
     inliers: Bool[Tensor, "m"]
     draws: int
-    focal_factor: float = 1.0
+    calibration: Calibration = GIVEN
 
 
 def sample_consensus(
@@ -123,7 +125,7 @@ def focal_consensus(data: ObservedPoints, threshold: float, seed: int) -> Hypoth
         return None
     T_camera_rig = SE3(data.rotation[0], data.translation[0])
     T = _transform(best[0]).inverse() @ T_camera_rig
-    return Hypothesis(T, torch.from_numpy(best[2]), draws, best[1])
+    return Hypothesis(T, torch.from_numpy(best[2]), draws, Calibration(log_focal=math.log(best[1])))
 
 
 def _projected(pose: poselib.CameraPose, points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 2"]:
