@@ -59,6 +59,8 @@ IN_FRONT = 0.9
 """Least share of the points of an occluder that must lie before the surface."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
 """Thresholds for landmarks that match near a pose that was not found by them."""
+MISLEADING = 0.5
+"""Probability that the intrinsics are wrong, by the landmarks near a pose by colour alone, from which on it is rejected."""
 SUPPORTED, MOVING = 0.5, 0.8
 """Least confidence of landmarks in a pose that the surface accepts, and with which they may move one by depth."""
 
@@ -192,11 +194,12 @@ def _compared_with_landmarks(
         ):
             return replace(found, seconds=time.perf_counter() - began)
         return replace(refined, reason=f"found on the surface; {refined.reason}")
-    if found.converged and verdict is not None and _is_misleading(verdict, problem):
-        return replace(found, outcome=verdict.outcome, reason=f"{verdict.reason}; {found.reason}")
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
+    if found.converged and near.pose is not None and verdict is not None and _is_misled(near.pose, problem):
+        reason = f"{verdict.reason}; {found.reason}"
+        return replace(found, outcome=Outcome.MISCALIBRATED, reason=reason, confidence=None)
     here = replace(problem, start=found.T_world_camera)
     if (
         found.converged
@@ -206,9 +209,10 @@ def _compared_with_landmarks(
     return replace(found, seconds=time.perf_counter() - began)
 
 
-def _is_misleading(verdict: Verdict, problem: Problem) -> bool:
-    """Whether landmarks say that the intrinsics are wrong, which colours at a wrong pose then agree with; measured depth would not."""
-    return verdict.outcome is Outcome.MISCALIBRATED and _measured_points(problem) < LEAST_POINTS
+def _is_misled(near: LandmarkPose, problem: Problem) -> bool:
+    """Whether landmarks say that the intrinsics are wrong, with which colours agree at a wrong pose; measured depth would not."""
+    wrong = not near.estimates_calibration and near.miscalibration.worst[1] > MISLEADING
+    return wrong and _measured_points(problem) < LEAST_POINTS
 
 
 def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:

@@ -100,7 +100,7 @@ def _with_camera_judged(
     problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, seed: int
 ) -> LandmarkPose:
     """Return a pose again with what renderings say about the camera, where landmarks do not tell which intrinsics are right."""
-    if landmark_verdict(found).outcome is not Outcome.MISCALIBRATED:
+    if landmark_verdict(found).outcome is not Outcome.MISCALIBRATED or found.has_other_camera:
         return found
     evidence, limits = NO_EVIDENCE, LandmarkThresholds()
     if doubtful_intrinsics(found, limits):

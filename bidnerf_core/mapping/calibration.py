@@ -53,10 +53,18 @@ class Calibration:
 
     @property
     def sentence(self) -> str:
-        """The considerable parts of the correction, in words."""
-        parts = torch.tensor(astuple(self), dtype=torch.float64).abs() / CALIBRATED.deviations
-        considerable = [text for text, size in zip(self.sentences, parts.tolist(), strict=True) if size > 2]
-        return " and ".join(considerable) or self.sentences[int(parts.argmax())]
+        """The considerable parts of the correction, in words; the largest if none is."""
+        return " and ".join(self.considerable) or self.sentences[int(self._sizes.argmax())]
+
+    @property
+    def considerable(self) -> list[str]:
+        """The parts of the correction that are larger than errors of a good calibration, in words."""
+        return [text for text, size in zip(self.sentences, self._sizes.tolist(), strict=True) if size > 2]
+
+    @property
+    def _sizes(self) -> Float[Tensor, "4"]:
+        """The parts in standard deviations of a good calibration."""
+        return torch.tensor(astuple(self), dtype=torch.float64).abs() / CALIBRATED.deviations
 
     @property
     def sentences(self) -> tuple[str, str, str, str]:
@@ -99,7 +107,7 @@ class Stretch:
         if factor == 1:
             return calibration.sentence
         how = f"{abs(factor - 1):.0%} {'wider' if factor > 1 else 'narrower'}"
-        return f"an image {how} than stated and {calibration.sentence}"
+        return " and ".join([f"an image {how} than stated", *calibration.considerable])
 
 
 UNSTRETCHED = Stretch()

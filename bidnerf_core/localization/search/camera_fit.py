@@ -30,13 +30,15 @@ FEW, FAR = 0.5, 0.1
 LEAST_STRETCH = math.log(1.03)
 """Smallest stretch that is told from the errors of lenses and landmarks."""
 MORE, FURTHER = 1.1, 5
-"""Factor by which, and number of matches by which, more have to agree with another camera."""
+"""Factor by which, and number of exact matches by which, the support of another camera has to exceed that of the one found."""
 DEVIATIONS = np.array([ANY.log_focal, ANY.shift, ANY.shift, ANY.log_focal])
 """Standard deviations of the logarithm of the focal length, of the principal point and of the logarithm of the stretch."""
 SCALES = (4.0, 1.0)
 """Residuals at which outliers begin in the fits one after the other, in limits of an inlier."""
-MOST_EVALUATIONS = 30
-"""Largest number of steps of a fit."""
+MOST_EVALUATIONS, ROUGH_EVALUATIONS = 30, 8
+"""Largest number of steps of a fit, and of those that choose among starts."""
+FEW_DRAWS = 500
+"""Largest number of minimal samples: enough for two inliers in five matches."""
 LARGEST_RESIDUAL = 1e4
 """Residual, pixels, of points behind the camera and of those that are farther off: fits need finite numbers."""
 LARGEST_CHANGE = 5.0
@@ -68,65 +70,82 @@ class CameraFit:
 
 
 def better_camera(
-    data: ObservedPoints, T_world_rig: SE3, calibration: Calibration, limit: float, agreeing: int
+    data: ObservedPoints,
+    T_world_rig: SE3,
+    calibration: Calibration,
+    limit: float,
+    unsuspected: float = UNSUSPECTED,
 ) -> CameraFit | None:
-    """Return the camera with which far more matches agree than with one that was found; None if there is none.
+    """Return the camera that matches agree with far better than with one that was found; None if there is none.
 
-    ``data`` are matches by descriptors alone, of which ``agreeing`` have residuals within ``limit`` (pixels) at that pose and with
-    the given intrinsics corrected by ``calibration``.
+    ``data`` are matches by descriptors alone. A match agrees with a residual within ``limit`` (pixels). The camera that was found is
+    the given one, corrected by ``calibration``, and not suspected from that share of agreeing matches on.
     """
-    if not 0 < agreeing < UNSUSPECTED * len(data):
+    here = _Projection(data, T_world_rig, calibration.radial)
+    start = _unknowns(calibration)
+    before, support = here.agreeing(start, limit), here.support(start, limit)
+    if not 0 < before < unsuspected * len(data):
         return None
-    enough = MORE * agreeing + FURTHER
-    found = _from_near(data, T_world_rig, calibration, limit)
-    if agreeing < FEW * len(data) and found.agreeing < enough:
-        fits = [found, *_from_far(data, T_world_rig, calibration, limit)]
-        found = max(fits, key=lambda fit: fit.agreeing)
-    return found if found.agreeing >= enough else None
+    fits = [_fitted(here, start, limit)]
+    if before < FEW * len(data) and fits[0][1] < MORE * support + FURTHER:
+        fits += _from_far(data, T_world_rig, calibration, limit)
+    found, best = max(fits, key=lambda fit: fit[1])
+    return found if best >= MORE * support + FURTHER else None
 
 
-def _from_near(data: ObservedPoints, T_world_rig: SE3, calibration: Calibration, limit: float) -> CameraFit:
-    """Return the fit that a pose and a camera lead to."""
-    project = _Projection(data, T_world_rig, calibration.radial)
-    found = np.array([0.0] * 6 + [calibration.log_focal, calibration.shift_u, calibration.shift_v, 0.0])
+def _unknowns(calibration: Calibration) -> Float[np.ndarray, "10"]:
+    """Return the unknowns of a fit at its start."""
+    return np.array([0.0] * 6 + [calibration.log_focal, calibration.shift_u, calibration.shift_v, 0.0])
+
+
+def _fitted(project: _Projection, start: Float[np.ndarray, "10"], limit: float) -> tuple[CameraFit, float]:
+    """Return the fit that a start leads to, and its support."""
+    found = start
     for scale in SCALES:
-        found = least_squares(
-            project.whitened, found, args=(scale * limit,), loss="cauchy", max_nfev=MOST_EVALUATIONS
-        ).x
-    within = np.linalg.norm(project.residuals(found), axis=1) <= limit
+        found = project.descended(found, scale * limit, MOST_EVALUATIONS)
     focal, u, v, log_stretch = found[6:].tolist()
-    stretch, log_focal = _told_apart(log_stretch, focal)
-    corrected = Calibration(log_focal, u / stretch.across, v / stretch.down, calibration.radial)
-    return CameraFit(project.pose(found), stretch, corrected, torch.from_numpy(within))
+    stretch, log_focal = told_apart(log_stretch, focal)
+    corrected = Calibration(log_focal, u / stretch.across, v / stretch.down, project.radial)
+    within = torch.from_numpy(project.distances(found) <= limit)
+    return CameraFit(project.pose(found), stretch, corrected, within), project.support(found, limit)
 
 
 def _from_far(
     data: ObservedPoints, T_world_rig: SE3, calibration: Calibration, limit: float
-) -> list[CameraFit]:
-    """Return the fits from principal points far off, and that of minimal samples of the matches, whose focal length is free."""
-    fits = []
+) -> list[tuple[CameraFit, float]]:
+    """Return the fit from the best of starts far off, if any is sound.
+
+    These are principal points far off, and a minimal sample of the matches, whose focal length is free.
+    """
+    starts = []
     for u, v in itertools.product((-FAR, FAR), repeat=2):
         # The principal point and this turn move the image by opposite amounts.
         turn = torch.tensor([0.0, 0.0, 0.0, v, -u, 0.0], dtype=torch.float64)
-        moved = replace(calibration, shift_u=u, shift_v=v)
-        fits.append(_from_near(data, T_world_rig.retract(turn), moved, limit))
-    one_camera = bool((data.translation == data.translation[0]).all())
-    sampled = focal_consensus(data, limit, seed=0) if one_camera else None
+        starts.append((T_world_rig.retract(turn), replace(calibration, shift_u=u, shift_v=v)))
+    parts = (data.translation, data.rotation, data.focal)
+    one_camera = all(bool((part == part[0]).all()) for part in parts)
+    sampled = focal_consensus(data, limit, seed=0, most_draws=FEW_DRAWS) if one_camera else None
     if sampled is not None:
-        fits.append(CameraFit(sampled.T_world_rig, UNSTRETCHED, sampled.calibration, sampled.inliers))
-    return fits
+        starts.append((sampled.T_world_rig, replace(sampled.calibration, radial=calibration.radial)))
+    rough = []
+    for T, camera in starts:
+        project = _Projection(data, T, calibration.radial)
+        found = project.descended(_unknowns(camera), SCALES[0] * limit, ROUGH_EVALUATIONS)
+        rough.append((project.support(found, SCALES[0] * limit), project, found))
+    _, project, found = max(rough, key=lambda fit: fit[0])
+    return [_fitted(project, found, limit)]
 
 
-def _told_apart(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
+def told_apart(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
     """Return the stretch, and what remains of the change of the focal length.
 
     An image that was resized in one direction keeps its focal length in the other, so that the least change is the most probable.
     """
     if abs(log_stretch) <= LEAST_STRETCH:
         return UNSTRETCHED, log_focal
-    parts = min((0.5, 0.0, 1.0), key=lambda across: abs(log_focal + (0.5 - across) * log_stretch))
-    stretch = Stretch(math.exp(parts * log_stretch), math.exp((parts - 1) * log_stretch))
-    return stretch, log_focal + (0.5 - parts) * log_stretch
+    across = min((0.5, 0.0, 1.0), key=lambda share: abs(log_focal + (0.5 - share) * log_stretch))
+    stretch = Stretch(math.exp(across * log_stretch), math.exp((across - 1) * log_stretch))
+    return stretch, log_focal + (0.5 - across) * log_stretch
 
 
 class _Projection:
@@ -142,12 +161,32 @@ class _Projection:
         self._rotation, self._translation = data.rotation.numpy(), data.translation.numpy()
         self._R_world_rig = T_world_rig.rotation.numpy()
         self._rig = T_world_rig.translation.numpy()
-        self._radial = radial
+        self.radial = radial
 
     def pose(self, unknowns: Float[np.ndarray, "10"]) -> SE3:
         """Return the pose of the rig."""
         rotation, position = self._moved(unknowns)
         return SE3(torch.from_numpy(rotation), torch.from_numpy(position))
+
+    def distances(self, unknowns: Float[np.ndarray, "10"]) -> Float[np.ndarray, "m"]:
+        """Return the distance of each projection from its observation, pixels."""
+        distances: Float[np.ndarray, "m"] = np.linalg.norm(self.residuals(unknowns), axis=1)
+        return distances
+
+    def agreeing(self, unknowns: Float[np.ndarray, "10"], limit: float) -> int:
+        """Return how many matches agree."""
+        return int((self.distances(unknowns) <= limit).sum())
+
+    def support(self, unknowns: Float[np.ndarray, "10"], limit: float) -> float:
+        """Return how many matches agree, each the less the farther off it is (MSAC: Torr and Zisserman 2000)."""
+        return float((1 - (self.distances(unknowns) / limit) ** 2).clip(min=0).sum())
+
+    def descended(self, start: Float[np.ndarray, "10"], scale: float, steps: int) -> Float[np.ndarray, "10"]:
+        """Return the unknowns that the loss with a ``scale`` leads to from a start."""
+        found: Float[np.ndarray, "10"] = least_squares(
+            self._whitened, start, args=(scale,), loss="cauchy", max_nfev=steps
+        ).x
+        return found
 
     def residuals(self, unknowns: Float[np.ndarray, "10"]) -> Float[np.ndarray, "m 2"]:
         """Return projection minus observation, pixels."""
@@ -158,12 +197,12 @@ class _Projection:
         change = unknowns[6] + np.array([0.5, -0.5]) * unknowns[9]
         factors = np.exp(change.clip(-LARGEST_CHANGE, LARGEST_CHANGE))
         flat = local[:, :2] / np.where(z > 0, z, 1)
-        bent = flat * (1 + self._radial * (flat**2).sum(1, keepdims=True))
+        bent = flat * (1 + self.radial * (flat**2).sum(1, keepdims=True))
         projected = bent * factors + unknowns[7:9]
         off = np.where(z > 0, (projected - self._image) * self._focal, LARGEST_RESIDUAL)
         return off.clip(-LARGEST_RESIDUAL, LARGEST_RESIDUAL)
 
-    def whitened(self, unknowns: Float[np.ndarray, "10"], scale: float) -> Float[np.ndarray, "n"]:
+    def _whitened(self, unknowns: Float[np.ndarray, "10"], scale: float) -> Float[np.ndarray, "n"]:
         """Return all residuals in units of ``scale``, and those of the prior."""
         return np.append(self.residuals(unknowns).ravel() / scale, unknowns[6:] / DEVIATIONS)
 

@@ -27,6 +27,7 @@ from bidnerf_core.localization.search.ransac import Hypothesis
 from bidnerf_core.mapping.calibration import (
     ANY,
     CALIBRATED,
+    CROPPED,
     DOUBTED,
     FIXED,
     GIVEN,
@@ -51,6 +52,10 @@ DEPTH_OFF = 0.1
 CERTAIN, CERTAIN_BY_OTHERS = 0.999, 0.98
 """Probability that the given intrinsics are wrong above which the estimated ones are taken, by keypoints alone and where other
 measurements support it.
+"""
+POSSIBLE, PROBABLE = 0.1, 0.5
+"""Probabilities that an image is a part of one from which on its principal point is free in the fit that judges the intrinsics,
+which then are doubtful, and from which on the principal point may be estimated.
 """
 MOST_DISTANCE = (0.5 * NORM) ** 2
 """Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
@@ -118,13 +123,14 @@ def _settled(
     ``prior`` says how uncertain they are before that is known.
     """
     fit, found = _guided(query, prior, fit, found, most, RADII)
-    free, correlation = _with_free_camera(query, fit, found), query.landmarks.correlation_of(len(found))
+    correlation = query.landmarks.correlation_of(len(found))
+    free, crop = _with_free_camera(query, fit, found, open_camera=prior.log_focal > 0)
     evidence, approximate = query.evidence, query.prior.log_focal > 0
     taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate, evidence.map_camera)
     right = query.prior if approximate and taken.camera is None else CALIBRATED
     wrong = Miscalibration.of(free, query.landmarks, taken, evidence.mistaken, right)
     certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_BY_OTHERS
-    if wrong.worst[1] > certain:
+    if wrong.worst[1] > certain and not POSSIBLE < crop < PROBABLE:
         taken = TakenIntrinsics()
         prior = wrong.prior(query.prior if approximate else DOUBTED)
         fit, found = _guided(query, prior, free, found, most, RADII[1:])
@@ -141,13 +147,20 @@ def _settled(
     return GuidedPose(query, fit, found, visible, chance, taken, wrong)
 
 
-def _with_free_camera(query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches) -> ReprojectionFit:
-    """Return a fit of the intrinsics along with the pose, with any principal point only if the image is probably a part of one."""
+def _with_free_camera(
+    query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches, open_camera: bool
+) -> tuple[ReprojectionFit, float]:
+    """Return a fit of the intrinsics along with the pose, and the probability that the image is a part of one.
+
+    If it may well be, its principal point is free. ``open_camera`` says that nothing is known of the focal length.
+    """
     data, correlation = query.observed(found), query.landmarks.correlation_of(len(found))
-    part = resect(data, fit.T_world_rig, fit.noise, ANY, fit.calibration, correlation)
-    if probability_of_crop(part, query.landmarks) > 0.5:
-        return part
-    return resect(data, fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation)
+    prior = ANY if open_camera else CROPPED
+    part = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation)
+    probability = probability_of_crop(part, query.landmarks)
+    if probability > POSSIBLE:
+        return part, probability
+    return resect(data, fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation), probability
 
 
 def _guided(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.covariance import position_deviation
-from bidnerf_core.localization.search.camera_fit import CameraFit, better_camera
+from bidnerf_core.localization.search.camera_fit import UNSUSPECTED, CameraFit, better_camera
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.mapping.calibration import GIVEN, UNSTRETCHED, Calibration, Stretch
@@ -53,23 +54,29 @@ class LandmarkPose:
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
     # What tells another camera: matches by descriptors alone, as the given intrinsics have them, and the residual (pixels) up to
-    # which one agrees; None: not known.
+    # which one agrees; None if another camera was taken already.
     undecided: tuple[ObservedPoints, float] | None = None
     stretch: Stretch = UNSTRETCHED  # of the given intrinsics; ``calibration`` corrects the stretched ones
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
     @cached_property
     def better_camera(self) -> CameraFit | None:
-        """The camera with which far more matches agree; None if there is none, or where that is not known."""
+        """The camera with which far more matches agree; None if there is none, or if it was taken."""
         if self.undecided is None:
             return None
         data, limit = self.undecided
-        return better_camera(data, self.T_world_camera, self.calibration, limit, self.agreeing)
+        least = 1.0 if self.estimates_calibration else UNSUSPECTED
+        return better_camera(data, self.T_world_camera, self.calibration, limit, least)
+
+    @property
+    def has_other_camera(self) -> bool:
+        """Whether the given camera was replaced by one that far more matches agree with."""
+        return self.undecided is None
 
     @property
     def focal_factor(self) -> float:
-        """True over given focal length."""
-        return self.calibration.focal_factor
+        """True over given focal length; the geometric mean of those across and down where the image was stretched."""
+        return self.calibration.focal_factor * math.sqrt(self.stretch.across * self.stretch.down)
 
     def intrinsics_of(self, given: Intrinsics) -> Intrinsics | None:
         """Return the intrinsics that were taken or estimated for images with the ``given`` ones; None if these were kept."""

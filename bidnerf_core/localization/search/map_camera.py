@@ -116,21 +116,23 @@ def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera 
     return MapCamera(correction, (CALIBRATED.deviations.square() + spread).sqrt(), camera)
 
 
-def camera_like(fitted: Intrinsics, cameras: tuple[Intrinsics, ...]) -> Intrinsics | None:
-    """Return the camera of a map's images, resized to the image of the ``fitted`` intrinsics whatever its shape; None if they differ.
+def camera_like(
+    fitted: Intrinsics, cameras: tuple[Intrinsics, ...], log_focal_deviation: float = 0.0
+) -> Intrinsics | None:
+    """Return the camera of a map's images that is like ``fitted`` intrinsics, resized to their image whatever its shape, or None.
 
-    These were estimated from a single image, and so closely another camera's are hardly the same.
+    ``log_focal_deviation``: standard deviation of the logarithm of their focal length, which was estimated from a single image.
     """
-    resized = sorted(
-        (camera.resized(fitted.width, fitted.height) for camera in cameras), key=lambda camera: camera.fx
-    )
-    if not resized:
-        return None
-    camera = resized[(len(resized) - 1) // 2]
-    across, down = math.log(camera.fx / fitted.fx), math.log(camera.fy / fitted.fy)
-    shifts = ((camera.cx - fitted.cx) / fitted.fx, (camera.cy - fitted.cy) / fitted.fy)
-    alike = abs(across - down) <= ALIKE_SHAPES and abs(across + down) <= 2 * ALIKE.log_focal
-    return camera if alike and max(map(abs, shifts)) <= ALIKE.shift else None
+
+    def differences(camera: Intrinsics) -> tuple[float, float, float]:
+        across, down = math.log(camera.fx / fitted.fx), math.log(camera.fy / fitted.fy)
+        shift = max(abs(camera.cx - fitted.cx) / fitted.fx, abs(camera.cy - fitted.cy) / fitted.fy)
+        return abs(across + down) / 2, abs(across - down), shift
+
+    resized = {camera.resized(fitted.width, fitted.height) for camera in cameras}
+    limits = (max(ALIKE.log_focal, 2 * log_focal_deviation), ALIKE_SHAPES, ALIKE.shift)
+    alike = [c for c in resized if all(x <= y for x, y in zip(differences(c), limits, strict=True))]
+    return min(alike, key=differences, default=None)
 
 
 def _agree(a: Intrinsics, b: Intrinsics) -> bool:

@@ -206,6 +206,8 @@ def _log_density_by(
 def probability_of_crop(free: ReprojectionFit, landmarks: LandmarkMap) -> float:
     """Return the probability that an image is a part of one, by the principal point of a fit in which it was free."""
     value, noise = _estimate(free, landmarks)
+    factor = free.calibration.focal_factor  # shares of the given focal length become those of the true one
+    value, noise = value / factor, noise / factor**2
     part, whole = (_log_density(prior, value, noise)[1:3].sum() for prior in (CROPPED, NOMINAL))
     return float((part - whole + math.log(CROPS / (1 - CROPS))).sigmoid())
 
