@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import astuple, dataclass, replace
 from typing import Any
 
@@ -25,8 +26,10 @@ class CorrectedCamera:
         return frame.focal_is_approximate == self.approximate
 
     def focal_factor(self, frame: Frame) -> float:
-        """Return the true over the given focal length of a frame."""
-        return self.found.fx / self.given.fx if self.applies_to(frame) else 1.0
+        """Return the true over the given focal length of a frame; the geometric mean of those across and down."""
+        if not self.applies_to(frame):
+            return 1.0
+        return math.sqrt(self.found.fx * self.found.fy / (self.given.fx * self.given.fy))
 
     def corrected(self, frame: Frame) -> Frame:
         """Return the frame with better intrinsics."""
