@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -98,10 +99,12 @@ def _unknowns(calibration: Calibration) -> Float[np.ndarray, "10"]:
     return np.array([0.0] * 6 + [calibration.log_focal, calibration.shift_u, calibration.shift_v, 0.0])
 
 
-def _fitted(project: _Projection, start: Float[np.ndarray, "10"], limit: float) -> tuple[CameraFit, float]:
+def _fitted(
+    project: _Projection, start: Float[np.ndarray, "10"], limit: float, scales: Sequence[float] = SCALES
+) -> tuple[CameraFit, float]:
     """Return the fit that a start leads to, and its support."""
     found = start
-    for scale in SCALES:
+    for scale in scales:
         found = project.descended(found, scale * limit, MOST_EVALUATIONS)
     focal, u, v, log_stretch = found[6:].tolist()
     stretch, log_focal = told_apart(log_stretch, focal)
@@ -113,27 +116,24 @@ def _fitted(project: _Projection, start: Float[np.ndarray, "10"], limit: float) 
 def _from_far(
     data: ObservedPoints, T_world_rig: SE3, calibration: Calibration, limit: float
 ) -> list[tuple[CameraFit, float]]:
-    """Return the fit from the best of starts far off, if any is sound.
-
-    These are principal points far off, and a minimal sample of the matches, whose focal length is free.
-    """
-    starts = []
+    """Return fits from principal points far off, and from a minimal sample of the matches, whose focal length is free."""
+    rough = []
     for u, v in itertools.product((-FAR, FAR), repeat=2):
         # The principal point and this turn move the image by opposite amounts.
         turn = torch.tensor([0.0, 0.0, 0.0, v, -u, 0.0], dtype=torch.float64)
-        starts.append((T_world_rig.retract(turn), replace(calibration, shift_u=u, shift_v=v)))
+        project = _Projection(data, T_world_rig.retract(turn), calibration.radial)
+        start = _unknowns(replace(calibration, shift_u=u, shift_v=v))
+        found = project.descended(start, SCALES[0] * limit, ROUGH_EVALUATIONS)
+        rough.append((project.support(found, limit), project, found))
+    _, project, found = max(rough, key=lambda fit: fit[0])
+    fits = [_fitted(project, found, limit)]
     parts = (data.translation, data.rotation, data.focal)
     one_camera = all(bool((part == part[0]).all()) for part in parts)
     sampled = focal_consensus(data, limit, seed=0, most_draws=FEW_DRAWS) if one_camera else None
     if sampled is not None:
-        starts.append((sampled.T_world_rig, replace(sampled.calibration, radial=calibration.radial)))
-    rough = []
-    for T, camera in starts:
-        project = _Projection(data, T, calibration.radial)
-        found = project.descended(_unknowns(camera), SCALES[0] * limit, ROUGH_EVALUATIONS)
-        rough.append((project.support(found, SCALES[0] * limit), project, found))
-    _, project, found = max(rough, key=lambda fit: fit[0])
-    return [_fitted(project, found, limit)]
+        project = _Projection(data, sampled.T_world_rig, 0.0)
+        fits.append(_fitted(project, _unknowns(sampled.calibration), limit, SCALES[-1:]))
+    return fits
 
 
 def told_apart(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:

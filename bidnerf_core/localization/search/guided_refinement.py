@@ -155,12 +155,12 @@ def _with_free_camera(
     If it may well be, its principal point is free. ``open_camera`` says that nothing is known of the focal length.
     """
     data, correlation = query.observed(found), query.landmarks.correlation_of(len(found))
-    prior = ANY if open_camera else CROPPED
-    part = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation)
-    probability = probability_of_crop(part, query.landmarks)
-    if probability > POSSIBLE:
-        return part, probability
-    return resect(data, fit.T_world_rig, fit.noise, NOMINAL, fit.calibration, correlation), probability
+    part, whole = (
+        resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation)
+        for prior in (ANY if open_camera else CROPPED, NOMINAL)
+    )
+    probability = probability_of_crop(part, whole, query.landmarks, len(found) / correlation, open_camera)
+    return (part if probability > POSSIBLE else whole), probability
 
 
 def _guided(

@@ -203,13 +203,35 @@ def _log_density_by(
     return -0.5 * ((value - camera.correction).square() / total + total.log())
 
 
-def probability_of_crop(free: ReprojectionFit, landmarks: LandmarkMap) -> float:
-    """Return the probability that an image is a part of one, by the principal point of a fit in which it was free."""
-    value, noise = _estimate(free, landmarks)
-    factor = free.calibration.focal_factor  # shares of the given focal length become those of the true one
+def probability_of_crop(
+    part: ReprojectionFit,
+    whole: ReprojectionFit,
+    landmarks: LandmarkMap,
+    measurements: float,
+    open_camera: bool,
+) -> float:
+    """Return the probability that an image is a part of one.
+
+    ``part`` is a fit whose principal point was free, and ``whole`` one whose focal length was, with the prior ``NOMINAL``. The prior of
+    the first is ``CROPPED``, or ``ANY`` with an ``open_camera``. ``measurements``: number of independent keypoints.
+    """
+    value, noise = _estimate(part, landmarks)
+    factor = part.calibration.focal_factor  # shares of the given focal length become those of the true one
     value, noise = value / factor, noise / factor**2
-    part, whole = (_log_density(prior, value, noise)[1:3].sum() for prior in (CROPPED, NOMINAL))
-    return float((part - whole + math.log(CROPS / (1 - CROPS))).sigmoid())
+    cropped, right = (_log_density(prior, value, noise)[1:3].sum() for prior in (CROPPED, NOMINAL))
+    against_right = float(cropped - right) + math.log(CROPS / (1 - WRONGS))
+    evidence = _log_evidence(part, ANY if open_camera else CROPPED, measurements) - _log_evidence(
+        whole, NOMINAL, measurements
+    )
+    odds = min(against_right, evidence + math.log(CROPS / MISTAKES))
+    return float(torch.tensor(odds, dtype=torch.float64).sigmoid())
+
+
+def _log_evidence(fit: ReprojectionFit, prior: CalibrationPrior, measurements: float) -> float:
+    """Return the logarithm of the marginal likelihood of a fit with a prior, but for a constant (Laplace's approximation)."""
+    scaled = _as_tensor(fit.calibration) / prior.deviations
+    narrowed = (fit.calibration_deviations / prior.deviations).clamp(min=1e-6).log()
+    return float((narrowed - 0.5 * scaled.square()).sum()) - 2 * measurements * math.log(fit.noise)
 
 
 def unresolved_deviations(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "4"]:

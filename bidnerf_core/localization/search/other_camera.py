@@ -8,14 +8,14 @@ from dataclasses import replace
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.localization.search.camera_fit import CameraFit, told_apart
+from bidnerf_core.localization.search.camera_fit import FEW, FURTHER, MORE, CameraFit, told_apart
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import LEAST_GUIDED_MATCHES, refined_pose
 from bidnerf_core.localization.search.landmark_evidence import described
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, camera_like, correction_between
-from bidnerf_core.localization.search.ransac import Hypothesis
+from bidnerf_core.localization.search.ransac import Hypothesis, sample_consensus
 from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.mapping.calibration import ANY, FIXED, Calibration, Stretch
 
@@ -37,10 +37,12 @@ def with_other_camera(
     better = found.better_camera
     clock.lap("camera")
     estimated = None if better is None else _estimated(query, matches, better, clock)
-    if estimated is None and (not found.estimates_calibration or _is_compared(query)):
-        return found
-    found = estimated or found
-    return _with_map_camera(query, matches, found, clock) or found
+    if estimated is not None or (found.estimates_calibration and not _is_compared(query)):
+        found = estimated or found
+        return _like_map_camera(query, matches, found, clock) or found
+    if found.agreeing < FEW * found.matches and not found.takes_map_camera:
+        return _sampled_with_map_camera(query, matches, found, clock) or found
+    return found
 
 
 def _is_compared(query: LandmarkQuery) -> bool:
@@ -63,28 +65,59 @@ def _estimated(
     return replace(found, stretch=better.stretch, undecided=None)
 
 
-def _with_map_camera(
+def _like_map_camera(
     query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose, clock: Stopwatch
 ) -> LandmarkPose | None:
     """Return the pose with the map's intrinsics if those found are like them and nothing refutes them."""
     given, count = query.images[-1].intrinsics, len(query.images)
     own, deviation = found.intrinsics_of(given), float(found.calibration_deviations[0])
     camera = None if own is None else camera_like(own, query.landmarks.cameras, deviation)
-    correction = None if camera is None else _correction(given, camera)
-    if own is None or camera is None or correction is None or found.takes_map_camera:
+    if own is None or camera is None or found.takes_map_camera:
         return None
     off = query.seen_by([own] * count).observed(matches).residuals(found.T_world_camera)
     first = Hypothesis(found.T_world_camera, torch.linalg.vector_norm(off, dim=-1) <= query.threshold, 0)
-    if int(first.inliers.sum()) < LEAST_GUIDED_MATCHES:
+    return _with_map_camera(query, matches, camera, first, AS_MANY * found.agreeing, clock)
+
+
+def _sampled_with_map_camera(
+    query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose, clock: Stopwatch
+) -> LandmarkPose | None:
+    """Return the pose by minimal samples with the map's intrinsics, resized to the image whatever its shape, if far more agree."""
+    given = query.images[-1].intrinsics
+    resized = sorted(
+        {camera.resized(given.width, given.height) for camera in query.landmarks.cameras}, key=lambda c: c.fx
+    )
+    if not resized:
         return None
-    seen = replace(query.seen_by([camera] * count), prior=FIXED)
-    again = described(seen, matches, refined_pose(seen, matches[first.inliers], first), clock.seconds)
+    camera = resized[(len(resized) - 1) // 2]
+    data = query.seen_by([camera] * len(query.images)).observed(matches)
+    first = sample_consensus(data, matches.view, query.threshold, seed=0)
+    enough = MORE * found.agreeing + FURTHER
+    if first is None or int(first.inliers.sum()) < enough:
+        return None
+    return _with_map_camera(query, matches, camera, first, enough, clock)
+
+
+def _with_map_camera(
+    query: LandmarkQuery,
+    matches: LandmarkMatches,
+    camera: Intrinsics,
+    first: Hypothesis,
+    enough: float,
+    clock: Stopwatch,
+) -> LandmarkPose | None:
+    """Return the pose with the map's ``camera`` if ``enough`` matches agree and nothing refutes it."""
+    correction = _correction(query.images[-1].intrinsics, camera)
+    if correction is None or int(first.inliers.sum()) < LEAST_GUIDED_MATCHES:
+        return None
+    seen = replace(query.seen_by([camera] * len(query.images)), prior=FIXED)
+    found = described(seen, matches, refined_pose(seen, matches[first.inliers], first), clock.seconds)
     clock.lap("map's camera")
-    refuted = again.estimates_calibration or again.miscalibration.worst[1] > REFUTED
-    if refuted or again.agreeing < AS_MANY * found.agreeing:
+    refuted = found.estimates_calibration or found.miscalibration.worst[1] > REFUTED
+    if refuted or found.agreeing < enough:
         return None
     stretch, calibration = correction
-    return replace(again, intrinsics=camera, calibration=calibration, stretch=stretch, undecided=None)
+    return replace(found, intrinsics=camera, calibration=calibration, stretch=stretch, undecided=None)
 
 
 def _correction(given: Intrinsics, camera: Intrinsics) -> tuple[Stretch, Calibration] | None:
