@@ -162,7 +162,8 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     if not found.estimates_calibration and wrong.worst[1] > thresholds.miscalibration:
         suggested = torch.tensor(astuple(found.calibration), dtype=torch.float64) + wrong.apparent
         suspect = Calibration(*suggested.tolist()).sentences[wrong.worst[0]]
-        return Verdict(Outcome.MISCALIBRATED, f"{share}, but they suggest {suspect}")
+        though = f" with the map's intrinsics ({found.camera_sentence})" if found.takes_map_camera else ""
+        return Verdict(Outcome.MISCALIBRATED, f"{share}{though}, but they suggest {suspect}")
     if not found.estimates_calibration and doubtful_intrinsics(found, thresholds):
         other = found.calibration if found.takes_map_camera else Calibration(*wrong.alternative.tolist())
         choice = "the given intrinsics or those of the map's images"

@@ -151,7 +151,7 @@ def fused_answer(
     ``searched`` is false if landmarks only confirm a pose that was found by other means.
     """
     diagnostics = landmark_diagnostics(found, searched)
-    answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.full_covariance, diagnostics)
+    answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.stated_covariance, diagnostics)
     if not verdict.accepted or found.estimates_calibration:
         return _judged(answer)  # the other terms would need intrinsics as exact as the landmarks'
     problem = corrected(problem, found)

@@ -168,9 +168,11 @@ class _System:
         values, vectors = np.linalg.eigh(unit[:, None] * self.curvature * unit)
         least = 0.2 * np.linalg.eigvalsh(unit[:, None] * self.hessian * unit)
         inverse = vectors @ np.diag(1 / np.maximum(values, least).clip(min=1e-12)) @ vectors.T
-        inverse = unit[:, None] * inverse * unit
-        found: Array = inverse @ self.scatter @ inverse
-        return (found + found.T) / 2
+        # What the residuals do not determine at all overflows; a covariance that is not finite says so.
+        with np.errstate(over="ignore", invalid="ignore"):
+            inverse = unit[:, None] * inverse * unit
+            found: Array = inverse @ self.scatter @ inverse
+            return (found + found.T) / 2
 
 
 @dataclass(frozen=True, eq=False)
