@@ -132,7 +132,7 @@ def _settled(
     certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_BY_OTHERS
     if wrong.worst[1] > certain and not POSSIBLE < crop < PROBABLE:
         taken = TakenIntrinsics()
-        prior = wrong.prior(query.prior if approximate else DOUBTED)
+        prior = wrong.prior(query.prior if approximate else DOUBTED, crop >= PROBABLE)
         fit, found = _guided(query, prior, free, found, most, RADII[1:])
     elif taken.camera is not None:
         query = query.seen_by([taken.camera.intrinsics] * len(query.images))

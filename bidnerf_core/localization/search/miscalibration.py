@@ -124,13 +124,17 @@ class Miscalibration:
         """The standard deviation of the true correction about zero."""
         return (CALIBRATED.deviations.square() + self.probability * self.apparent.square()).sqrt()
 
-    def prior(self, right: CalibrationPrior) -> CalibrationPrior:
-        """Return how uncertain the intrinsics are where those that are probably wrong are unknown, and the others ``right``."""
+    def prior(self, right: CalibrationPrior, cropped: bool) -> CalibrationPrior:
+        """Return how uncertain the intrinsics are where those that are probably wrong are unknown, and the others ``right``.
+
+        ``cropped`` says that the image is probably a part of one.
+        """
         focal, u, v, radial = (self.probability > 0.5).tolist()
+        unknown = ANY if cropped else NOMINAL
         return CalibrationPrior(
-            ANY.log_focal if focal else right.log_focal,
-            ANY.shift if u or v else right.shift,
-            ANY.radial if radial else right.radial,
+            unknown.log_focal if focal else right.log_focal,
+            unknown.shift if u or v else right.shift,
+            unknown.radial if radial else right.radial,
         )
 
     @property
