@@ -88,7 +88,8 @@ def test_a_part_of_an_image_is_told_from_its_principal_point(
     assert found.stretch == UNSTRETCHED
     assert (found.calibration.shift_u, found.calibration.shift_v) == pytest.approx(shift, abs=0.03)
     assert pose_error(found.T_world_rig, TRUTH).rotation_deg < 2
-    camera = found.camera(Intrinsics(FOCAL, FOCAL, 320.0, 240.0, 640, 480))
+    given = Intrinsics(FOCAL, FOCAL, 320.0, 240.0, 640, 480)
+    camera = found.calibration.applied(found.stretch.applied(given))
     assert (camera.cx - 320, camera.cy - 240) == pytest.approx((FOCAL * shift[0], FOCAL * shift[1]), abs=15)
 
 

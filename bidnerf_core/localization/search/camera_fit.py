@@ -18,7 +18,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.ransac import focal_consensus
 from bidnerf_core.mapping.calibration import ANY, UNSTRETCHED, Calibration, Stretch
 from bidnerf_core.mapping.observed_points import ObservedPoints
@@ -26,7 +25,7 @@ from bidnerf_core.se3 import SE3
 
 UNSUSPECTED = 0.8
 """Share of the matches from which on a pose is not suspected."""
-FEW, FAR = 0.5, 0.1
+SUSPECTED, FAR = 0.5, 0.1
 """Share of the matches below which a pose may be far from right, and principal points tried then, as shares of the focal length."""
 LEAST_STRETCH = math.log(1.03)
 """Smallest stretch that is told from the errors of lenses and landmarks."""
@@ -34,7 +33,7 @@ MORE, FURTHER = 1.1, 5
 """Factor by which, and number of exact matches by which, the support of another camera has to exceed that of the one found."""
 DEVIATIONS = np.array([ANY.log_focal, ANY.shift, ANY.shift, ANY.log_focal])
 """Standard deviations of the logarithm of the focal length, of the principal point and of the logarithm of the stretch."""
-SCALES = (4.0, 1.0)
+FIT_SCALES = (4.0, 1.0)
 """Residuals at which outliers begin in the fits one after the other, in limits of an inlier."""
 MOST_EVALUATIONS, ROUGH_EVALUATIONS = 30, 8
 """Largest number of steps of a fit, and of those that choose among starts."""
@@ -54,10 +53,6 @@ class CameraFit:
     stretch: Stretch  # of the given intrinsics
     calibration: Calibration  # of the stretched ones
     inliers: Bool[Tensor, "m"]  # matches that agree
-
-    def camera(self, given: Intrinsics) -> Intrinsics:
-        """Return the intrinsics of the fit."""
-        return self.calibration.applied(self.stretch.applied(given))
 
     @property
     def agreeing(self) -> int:
@@ -88,7 +83,7 @@ def better_camera(
     if not 0 < before < unsuspected * len(data):
         return None
     fits = [_fitted(here, start, limit)]
-    if before < FEW * len(data) and fits[0][1] < MORE * support + FURTHER:
+    if before < SUSPECTED * len(data) and fits[0][1] < MORE * support + FURTHER:
         fits += _from_far(data, T_world_rig, calibration, limit)
     found, best = max(fits, key=lambda fit: fit[1])
     return found if best >= MORE * support + FURTHER else None
@@ -100,7 +95,7 @@ def _unknowns(calibration: Calibration) -> Float[np.ndarray, "10"]:
 
 
 def _fitted(
-    project: _Projection, start: Float[np.ndarray, "10"], limit: float, scales: Sequence[float] = SCALES
+    project: _Projection, start: Float[np.ndarray, "10"], limit: float, scales: Sequence[float] = FIT_SCALES
 ) -> tuple[CameraFit, float]:
     """Return the fit that a start leads to, and its support."""
     found = start
@@ -123,7 +118,7 @@ def _from_far(
         turn = torch.tensor([0.0, 0.0, 0.0, v, -u, 0.0], dtype=torch.float64)
         project = _Projection(data, T_world_rig.retract(turn), calibration.radial)
         start = _unknowns(replace(calibration, shift_u=u, shift_v=v))
-        found = project.descended(start, SCALES[0] * limit, ROUGH_EVALUATIONS)
+        found = project.descended(start, FIT_SCALES[0] * limit, ROUGH_EVALUATIONS)
         rough.append((project.support(found, limit), project, found))
     _, project, found = max(rough, key=lambda fit: fit[0])
     fits = [_fitted(project, found, limit)]
@@ -132,7 +127,7 @@ def _from_far(
     sampled = focal_consensus(data, limit, seed=0, most_draws=FEW_DRAWS) if one_camera else None
     if sampled is not None:
         project = _Projection(data, sampled.T_world_rig, 0.0)
-        fits.append(_fitted(project, _unknowns(sampled.calibration), limit, SCALES[-1:]))
+        fits.append(_fitted(project, _unknowns(sampled.calibration), limit, FIT_SCALES[-1:]))
     return fits
 
 

@@ -29,11 +29,11 @@ from bidnerf_core.mapping.resection import ReprojectionFit
 
 Mixture = tuple[tuple[CalibrationPrior, float], ...]
 """Priors and their shares."""
-WRONG: Mixture = ((MISTAKEN, MISTAKES), (CROPPED, CROPS))
+MISTAKES_AND_CROPS: Mixture = ((MISTAKEN, MISTAKES), (CROPPED, CROPS))
 """Priors of the correction of intrinsics that are wrong, and the shares of cameras that they are of."""
-WRONGS = sum(share for _, share in WRONG)
+WRONG_SHARE = sum(share for _, share in MISTAKES_AND_CROPS)
 """Share of cameras whose intrinsics are wrong."""
-MIXTURE: Mixture = ((CALIBRATED, 1 - USUALLY - WRONGS), (USUAL, USUALLY), *WRONG)
+MIXTURE: Mixture = ((CALIBRATED, 1 - USUALLY - WRONG_SHARE), (USUAL, USUALLY), *MISTAKES_AND_CROPS)
 """Prior of the correction of given intrinsics: they are calibrated, off as usual, or wrong."""
 LIKELY = 0.8
 """Probability from which on an image whose focal length is approximate is taken to be from the map's camera."""
@@ -69,7 +69,7 @@ class TakenIntrinsics:
 
         Intrinsics that are also those of the map's images are mistaken only for another camera's image.
         """
-        share = WRONGS * (1 - SAME_CAMERA) if self.as_map else WRONGS
+        share = WRONG_SHARE * (1 - SAME_CAMERA) if self.as_map else WRONG_SHARE
         return math.log(share / (1 - share))
 
 
@@ -111,7 +111,7 @@ class Miscalibration:
         """
         value, noise = _estimate(free, landmarks)
         value = value - _as_tensor(taken.calibration)
-        mistaken = _log_joint(WRONG, value, noise).logsumexp(0) - math.log(WRONGS)
+        mistaken = _log_joint(MISTAKES_AND_CROPS, value, noise).logsumexp(0) - math.log(WRONG_SHARE)
         (correct,) = _log_joint(((right, 1.0),), value, noise)
         log_odds = mistaken - correct + taken.log_odds_of_mistake + other_log_odds
         return Miscalibration(
@@ -223,7 +223,7 @@ def probability_of_crop(
     factor = part.calibration.focal_factor  # shares of the given focal length become those of the true one
     value, noise = value / factor, noise / factor**2
     cropped, right = (_log_density(prior, value, noise)[1:3].sum() for prior in (CROPPED, NOMINAL))
-    against_right = float(cropped - right) + math.log(CROPS / (1 - WRONGS))
+    against_right = float(cropped - right) + math.log(CROPS / (1 - WRONG_SHARE))
     evidence = _log_evidence(part, ANY if open_camera else CROPPED, measurements) - _log_evidence(
         whole, NOMINAL, measurements
     )

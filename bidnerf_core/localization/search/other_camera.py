@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.localization.search.camera_fit import FEW, FURTHER, MORE, CameraFit, told_apart
+from bidnerf_core.localization.search.camera_fit import FURTHER, MORE, SUSPECTED, CameraFit, told_apart
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import LEAST_GUIDED_MATCHES, refined_pose
 from bidnerf_core.localization.search.landmark_evidence import described
@@ -40,7 +40,7 @@ def with_other_camera(
     if estimated is not None or (found.estimates_calibration and not _is_compared(query)):
         found = estimated or found
         return _like_map_camera(query, matches, found, clock) or found
-    if found.agreeing < FEW * found.matches and not found.takes_map_camera:
+    if found.agreeing < SUSPECTED * found.matches and not found.takes_map_camera:
         return _sampled_with_map_camera(query, matches, found, clock) or found
     return found
 
