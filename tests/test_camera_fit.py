@@ -80,7 +80,7 @@ def test_a_stretch_is_estimated_from_a_pose_that_few_matches_agree_with(
 def test_a_part_of_an_image_is_told_from_its_principal_point(
     shift: tuple[float, float], generator: Generator
 ) -> None:
-    """From a pose that is turned by as much as the principal point is off, as one that takes the middle of the part for it."""
+    """The start is turned by as much as the principal point is off, as a pose is that takes the middle of the part for it."""
     turn = torch.tensor([0.0, 0.0, 0.0, shift[1], -shift[0], 0.0], dtype=torch.float64)
     data, start = matches(generator, shift=shift), TRUTH.retract(turn)
     assert pose_error(start, TRUTH).rotation_deg > 5
@@ -118,7 +118,7 @@ def test_a_stretch_within_the_errors_of_lenses_is_not_told(generator: Generator)
 
 
 def test_a_pose_that_most_matches_agree_with_is_not_questioned(generator: Generator) -> None:
-    """Nor is one that none agrees with, which leads nowhere."""
+    """A pose that none agrees with is not questioned either, since it leads nowhere."""
     data = matches(generator, shift=(0.002, 0.0), wrong=0)
     assert agreeing(data, TRUTH) > UNSUSPECTED * len(data)
     assert better_camera(data, TRUTH, GIVEN, LIMIT) is None
@@ -149,7 +149,7 @@ def test_the_maps_camera_is_recognised_in_another_shape_only_if_it_is_alike() ->
 
 
 def test_a_focal_length_far_off_is_found_from_few_agreeing_matches(generator: Generator) -> None:
-    """From a pose that few matches agree with by chance, as a search with the wrong focal length finds it."""
+    """Few matches agree with the start by chance, as with a pose that a search with the wrong focal length finds."""
     data = matches(generator)
     wrong = replace(
         data, image=3 * data.image, focal=data.focal / 3

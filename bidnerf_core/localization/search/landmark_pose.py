@@ -21,7 +21,7 @@ from bidnerf_core.se3 import SE3
 
 ESTIMATED_INFLATION = 3.0
 """Factor on the covariance of poses whose intrinsics were estimated along: errors of landmarks and of lenses, which the right intrinsics
-hide, shift the estimate. With it, 95 % of such poses lie inside their 95 % bound, on images that served for tuning.
+hide, shift the estimate. With it, 152 of 163 such poses lie inside their 95 % bound in the record ``faults_camera``.
 """
 
 
