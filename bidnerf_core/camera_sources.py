@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median_low
 
 from bidnerf_core.camera import Intrinsics, same_aspect
 from bidnerf_core.camera_records import camera_record
@@ -85,12 +86,13 @@ def find_camera(
     camera: Intrinsics | str | Path | None = None,
     focal: float | None = None,
     hfov: float | None = None,
+    assumed: Sequence[Intrinsics] = (),
 ) -> CameraSource:
     """Return the camera of an upright photo: ``camera``, ``focal`` or ``hfov`` where one is given, else what EXIF says.
 
-    ``focal`` is in pixels of the stored image and ``hfov`` in degrees across the upright one. ``where`` opens the message
-    of the ``InputError`` that is raised where several are given, where none is and EXIF has no focal length, and where the
-    camera belongs to an image of another shape.
+    ``focal`` is in pixels of the stored image and ``hfov`` in degrees across the upright one. Where EXIF has no focal length,
+    that of the ``assumed`` cameras, if there are any, is taken. ``where`` opens the message of the ``InputError`` that is raised
+    where several are given, where none is known, and where the camera belongs to an image of another shape.
     """
     if sum(given is not None for given in (camera, focal, hfov)) > 1:
         raise InputError(f"{where}: several cameras are given, expected one of {WAYS}")
@@ -103,7 +105,9 @@ def find_camera(
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     if camera is None:
-        return replace(camera_from_exif(where, raster, exif), approximate=True)
+        known = exif.has_focal_length or not assumed
+        source = camera_from_exif(where, raster, exif) if known else _assumed(raster, assumed)
+        return replace(source, approximate=True)
     given, origin = (
         (camera, "camera as given")
         if isinstance(camera, Intrinsics)
@@ -151,6 +155,16 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
         return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
     raise InputError(f"{where}: no focal length in EXIF, expected a camera: {WAYS}")
+
+
+def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource:
+    """Return a camera with the median focal length of the ``cameras`` of images with the same shape, lying or standing, or of all."""
+    size = raster.upright_size
+    shapes = (size, size[::-1])
+    alike = [c for c in cameras if any(same_aspect((c.width, c.height), shape) for shape in shapes)]
+    per_diagonal = [math.sqrt(c.fx * c.fy) / math.hypot(c.width, c.height) for c in alike or cameras]
+    camera = Intrinsics.from_focal(median_low(per_diagonal) * math.hypot(*size), *size)
+    return _described(camera, "no focal length in EXIF, that of the map's images is assumed")
 
 
 def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> CameraSource:

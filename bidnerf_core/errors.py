@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 
 class InputError(ValueError):
@@ -29,3 +29,8 @@ def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str
 def amount(count: int, noun: str) -> str:
     """Return a number with its noun, which takes an s unless the number is 1."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def enumeration(parts: Sequence[str]) -> str:
+    """Return parts as they are listed in a sentence: a, b and c."""
+    return " and ".join([*filter(None, [", ".join(parts[:-1])]), *parts[-1:]])

@@ -30,6 +30,11 @@ class Exif:
     )
     digital_zoom: float = 1.0
 
+    @property
+    def has_focal_length(self) -> bool:
+        """Whether the tags give a focal length in pixels."""
+        return self.equivalent_mm is not None or None not in (self.focal_mm, self.pixels_per_mm)
+
 
 def read_exif(path: Path) -> Exif:
     """Read the tags of an image file; damaged ones count as missing. Raises ``InputError`` where it is not an image."""

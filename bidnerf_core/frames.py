@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -92,6 +93,7 @@ class Frame:
         camera: Intrinsics | str | Path | None = None,
         focal: float | None = None,
         hfov: float | None = None,
+        assumed: Sequence[Intrinsics] = (),
         depth_unit: float | None = None,
         background: Background = BLACK,
         largest: int | None = None,
@@ -100,7 +102,8 @@ class Frame:
 
         The camera is ``camera`` (intrinsics, or a file: ``transforms.json``, ``cameras.json``, COLMAP's ``cameras.txt``),
         or has the focal length ``focal`` (pixels of the image file), or the horizontal field of view ``hfov`` (degrees, of
-        the upright image); at most one of them. Without them it comes from the focal length in EXIF. A camera of another
+        the upright image); at most one of them. Without them it comes from the focal length in EXIF or, where there is none,
+        from the ``assumed`` cameras, say those of a map's landmarks (``map.landmarks.cameras``). A camera of another
         resolution is scaled, and one of the image as it is stored is turned with it. ``camera_source`` of the result says
         in a line where the camera comes from.
 
@@ -120,6 +123,7 @@ class Frame:
             camera=camera,
             focal=focal,
             hfov=hfov,
+            assumed=assumed,
             depth_unit=depth_unit,
             background=background,
             largest=largest,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,6 +49,7 @@ def read_photo(
     camera: Intrinsics | str | Path | None = None,
     focal: float | None = None,
     hfov: float | None = None,
+    assumed: Sequence[Intrinsics] = (),
     depth_unit: float | None = None,
     background: Background = (0.0, 0.0, 0.0),
     largest: int | None = None,
@@ -56,7 +58,7 @@ def read_photo(
     colour_behind = background_colour(background)
     header, exif = read_header(path), read_exif(path)
     raster = Raster(header.width, header.height, exif.orientation)
-    source = find_camera(str(path), raster, exif, camera, focal, hfov)
+    source = find_camera(str(path), raster, exif, camera, focal, hfov, assumed)
     measured = None if depth is None else read_depth_image(depth, depth_unit)
     source, size = _limited(source, largest)
     colour, alpha = read_image(path)

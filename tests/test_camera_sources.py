@@ -72,6 +72,22 @@ def test_without_a_focal_length_the_ways_to_give_one_are_named(exif: Exif) -> No
         found(exif)
 
 
+def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assumed() -> None:
+    small, wide = (Intrinsics.from_focal(f, 400, 300) for f in (300, 500))
+    film = Intrinsics.from_focal(90, 320, 180)
+    for raster in (PHOTO, PORTRAIT):
+        source = find_camera("a.jpg", raster, Exif(), assumed=[wide, film, small, small])
+        assert source.approximate
+        assert source.intrinsics == Intrinsics.from_focal(300 * 4032 / 400, *raster.upright_size)
+        assert "that of the map's images is assumed" in source.description
+    square = find_camera("a.jpg", Raster(250, 250, UPRIGHT), Exif(), assumed=[small])
+    assert square.intrinsics.fx == pytest.approx(300 * math.sqrt(2) * 250 / 500)
+    assert find_camera("a.jpg", PHOTO, Exif(equivalent_mm=26), assumed=[small]).intrinsics == found(
+        Exif(equivalent_mm=26)
+    )
+    assert not find_camera("a.jpg", PHOTO, Exif(), focal=3000, assumed=[small]).approximate
+
+
 def test_tags_are_read_from_the_file(tmp_path: Path) -> None:
     path = write_photo(
         tmp_path / "a.jpg",

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli.answers import Answer, Answers, OutputSpec
 from bidnerf_core.cli.camera_options import (
     CameraFile,
@@ -41,8 +43,9 @@ from bidnerf_core.cli.starts import StartSpec, read_pose
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trials import places_of
-from bidnerf_core.localization import METHODS, Localizer
+from bidnerf_core.localization import METHODS, AutoConfig, Localizer
 from bidnerf_core.localization.methods import require_use_of_depth
+from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.storage import Map, load_map
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
@@ -120,7 +123,8 @@ def run(arguments: list[str]) -> None:
     ) -> None:
         """Find the poses of photos, or of frames of a dataset, in a map.
 
-        QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given.
+        QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; where that has
+        no focal length, method auto begins with that of the map's images.
         Frames of a dataset that are named by --frame are taken as a rig: their relative poses come from the dataset, and the
         pose found is that of the last one's camera. Poses are camera to world, OpenCV axes (x right, y down, z forward); so
         are points, unless a .npz has T_camera_sensor beside them.
@@ -143,6 +147,7 @@ def run(arguments: list[str]) -> None:
         output.prepare()
         stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
+        photos = replace(photos, assumed=_assumed_cameras(stored.landmarks, config))
         source = open_queries(query, photos, frames, stored.bounds.background, points)
         if perturb is not None and isinstance(source, Photos):
             raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")
@@ -159,6 +164,13 @@ def _depth_points(path: Path, stored: Map, choice: SparseChoice) -> DepthPoints:
     sparse = SparsePoints(path, places_of(stored.info), choice)
     say(sparse.summary)
     return DepthPoints(path, sparse)
+
+
+def _assumed_cameras(landmarks: LandmarkMap | None, config: Any) -> tuple[Intrinsics, ...]:
+    """Return the cameras of a map's images if photos without a focal length may be localized: landmarks tell it."""
+    if landmarks is None or not (isinstance(config, AutoConfig) and config.landmarks):
+        return ()
+    return landmarks.cameras
 
 
 def _localize(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli.common import UsageError, read_views, require, require_different, say
 from bidnerf_core.datasets import READERS, Dataset, DepthRegistration, given_sensor, open_dataset
 from bidnerf_core.datasets.colmap import SparsePoints
@@ -64,6 +65,7 @@ class PhotoOptions:
     hfov: float | None = None  # degrees
     depth_unit: float | None = None  # metres a step
     registration: DepthRegistration | None = None
+    assumed: tuple[Intrinsics, ...] = ()  # cameras one of which probably took photos without a focal length
 
     @property
     def for_photos(self) -> list[str]:
@@ -131,7 +133,7 @@ class Photos:
                 "--register-depth was given without --depth, expected measured depth to register"
             )
         sensor = given_sensor("--register-depth", options.registration)
-        self._camera = GivenCamera(options.camera, options.focal, options.hfov, sensor)
+        self._camera = GivenCamera(options.camera, options.focal, options.hfov, sensor, options.assumed)
         self._remarks: set[str] = set()
 
     @property

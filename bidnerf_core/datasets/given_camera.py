@@ -21,13 +21,15 @@ from bidnerf_core.orientation import UPRIGHT
 class GivenCamera:
     """At most one of intrinsics or a file that holds them, a focal length (pixels), and a horizontal field of view (degrees).
 
-    Depth is registered to the images from ``sensor``, if there is one.
+    Depth is registered to the images from ``sensor``, if there is one. ``assumed``: cameras one of which probably took images
+    whose focal length nothing tells.
     """
 
     camera: Intrinsics | str | Path | None = None
     focal: float | None = None
     hfov: float | None = None
     sensor: DepthSensor | None = None
+    assumed: tuple[Intrinsics, ...] = ()
 
     @property
     def is_given(self) -> bool:
@@ -47,11 +49,11 @@ class GivenCamera:
     def read(
         self, image: Path, depth: Path | None, depth_unit: float | None, background: Background
     ) -> Frame:
-        """Read an image and its depth, upright; without a camera, that of EXIF is taken. Raises ``InputError`` as ``Frame.open``."""
+        """Read an image and its depth, upright; without a camera, that of EXIF, or else an assumed one, is taken. Raises ``InputError`` as ``Frame.open``."""
         apart = self.sensor is not None and depth is not None
         frame = Frame.open(
             image, depth=None if apart else depth, depth_unit=depth_unit, camera=self.camera, focal=self.focal,
-            hfov=self.hfov, background=background,
+            hfov=self.hfov, assumed=self.assumed, background=background,
         )  # fmt: skip
         if self.sensor is None or depth is None:
             return frame

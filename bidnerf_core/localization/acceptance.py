@@ -13,6 +13,7 @@ import torch
 
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization.costs.surface import SurfaceCost
+from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
@@ -161,9 +162,9 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     wrong = found.miscalibration
     if not found.estimates_calibration and wrong.worst[1] > thresholds.miscalibration:
         suggested = torch.tensor(astuple(found.calibration), dtype=torch.float64) + wrong.apparent
-        suspect = Calibration(*suggested.tolist()).sentences[wrong.worst[0]]
+        suspect = Calibration(*suggested.tolist()).parts[wrong.worst[0]]
         though = f" with the map's intrinsics ({found.camera_sentence})" if found.takes_map_camera else ""
-        return Verdict(Outcome.MISCALIBRATED, f"{share}{though}, but they suggest {suspect}")
+        return Verdict(Outcome.MISCALIBRATED, f"{share}{though}, but they suggest {suspect} than given")
     if not found.estimates_calibration and doubtful_intrinsics(found, thresholds):
         other = found.calibration if found.takes_map_camera else Calibration(*wrong.alternative.tolist())
         choice = "the given intrinsics or those of the map's images"
@@ -175,7 +176,7 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         return Verdict(Outcome.MISCALIBRATED, f"{share}, but far more would with {camera}")
     if found.stretch != UNSTRETCHED and not found.takes_map_camera:
         return Verdict(Outcome.MISCALIBRATED, f"{share}, but only with {found.camera_sentence}")
-    deviation = found.position_deviation
+    deviation = position_deviation(found.stated_covariance)
     if not deviation <= thresholds.precision * found.distance:
         return Verdict(
             Outcome.IMPRECISE,

@@ -23,9 +23,7 @@ from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_int
 from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
-from bidnerf_core.localization.by_colour import (
-    without_the_imprecise,
-)
+from bidnerf_core.localization.by_colour import without_the_imprecise, without_unknown_focal_length
 from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface
 from bidnerf_core.localization.by_image_search import localized_by_images
 from bidnerf_core.localization.by_landmarks import (
@@ -44,7 +42,6 @@ from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.mirrored import unguided_log10_nfa
 from bidnerf_core.localization.search.occluders import nearest_piece
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
@@ -120,11 +117,13 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     else:
         found = localized_by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
-        found = without_the_imprecise(found, typical)
+        found = without_unknown_focal_length(without_the_imprecise(found, typical), problem)
     if matcher is None:
         return found
     found = _compared_with_landmarks(found, problem, matcher, config, seed, began)
-    if answer is not None and found.outcome is Outcome.TOO_FEW_MATCHES and answer.verdict.outcome in UNSURE:
+    found = replace(found, seconds=time.perf_counter() - began)
+    hardly_known = found.outcome in (Outcome.TOO_FEW_MATCHES, Outcome.IMPRECISE)
+    if answer is not None and hardly_known and answer.verdict.outcome in UNSURE:
         return localization_by_landmarks(problem, answer, began)
     return found
 
@@ -180,19 +179,19 @@ def _compared_with_landmarks(
         supported = found.converged and confidence >= SUPPORTED
         answer = replace(answer, verdict=verdict) if supported else answer
         refined = localization_by_landmarks(problem, answer, began)
-        evidence = unguided_log10_nfa(matcher, problem.views, near.pose.T_world_camera)
-        twin = mirror_rejection(corrected(problem, near.pose), matcher, evidence, config.fused_rays, seed)
+        here, evidence = corrected(problem, near.pose), near.pose.log10_nfa
+        twin = mirror_rejection(here, matcher, evidence, config.fused_rays, seed)
         if twin is not None:
             return _rejected_by_mirror(refined, twin)
         if found.converged and _leaves_surface(problem, found, answer):
-            return replace(found, seconds=time.perf_counter() - began)
+            return found
         if (
             supported
             and confidence < MOVING
             and _is_surer(found, answer)
             and _keeps_points(problem, near.pose)
         ):
-            return replace(found, seconds=time.perf_counter() - began)
+            return found
         return replace(refined, reason=f"found on the surface; {refined.reason}")
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
@@ -206,13 +205,13 @@ def _compared_with_landmarks(
         and (twin := mirror_rejection(here, matcher, 0.0, config.fused_rays, seed)) is not None
     ):
         return _rejected_by_mirror(found, twin)
-    return replace(found, seconds=time.perf_counter() - began)
+    return found
 
 
 def _is_misled(near: LandmarkPose, problem: Problem) -> bool:
     """Whether landmarks say that the intrinsics are wrong, with which colours agree at a wrong pose; measured depth would not."""
-    wrong = not near.estimates_calibration and near.miscalibration.worst[1] > MISLEADING
-    return wrong and _measured_points(problem) < LEAST_POINTS
+    doubted = near.miscalibration.worst[1] > MISLEADING or near.better_camera is not None
+    return doubted and not near.estimates_calibration and _measured_points(problem) < LEAST_POINTS
 
 
 def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.errors import enumeration
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
     LandmarkThresholds,
@@ -246,7 +247,7 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
     poses = [found.T_world_camera, answer.T]
     if problem.start is not None:
         poses = [problem.start, *poses]
-    fused = f", fused with {' and '.join(answer.terms)}" if answer.terms else ""
+    fused = f", fused with {enumeration(answer.terms)}" if answer.terms else ""
     there = answer.diagnostics.on_surface
     if answer.left_out:
         fused += f", without {answer.left_out}"

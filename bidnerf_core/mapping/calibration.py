@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.errors import enumeration
 
 
 @dataclass(frozen=True)
@@ -53,21 +54,19 @@ class Calibration:
 
     @property
     def sentence(self) -> str:
-        """The considerable parts of the correction, in words; the largest if none is."""
-        return " and ".join(self.considerable) or self.sentences[int(self._sizes.argmax())]
+        """The considerable parts of the correction, in words."""
+        return (
+            f"{enumeration(self.considerable)} than given" if self.considerable else "hardly other than given"
+        )
 
     @property
     def considerable(self) -> list[str]:
         """The parts of the correction that are larger than errors of a good calibration, in words."""
-        return [text for text, size in zip(self.sentences, self._sizes.tolist(), strict=True) if size > 2]
+        sizes = torch.tensor(astuple(self), dtype=torch.float64).abs() / CALIBRATED.deviations
+        return [text for text, size in zip(self.parts, sizes.tolist(), strict=True) if size > 2]
 
     @property
-    def _sizes(self) -> Float[Tensor, "4"]:
-        """The parts in standard deviations of a good calibration."""
-        return torch.tensor(astuple(self), dtype=torch.float64).abs() / CALIBRATED.deviations
-
-    @property
-    def sentences(self) -> tuple[str, str, str, str]:
+    def parts(self) -> tuple[str, str, str, str]:
         """Each part of the correction in words, in the order of the fields."""
         longer, right, down, higher = (
             word if value >= 0 else opposite
@@ -79,10 +78,10 @@ class Calibration:
             )
         )
         return (
-            f"a focal length {abs(self.focal_factor - 1):.1%} {longer} than given",
-            f"a principal point {abs(self.shift_u):.1%} of the focal length further {right} than given",
-            f"a principal point {abs(self.shift_v):.1%} of the focal length further {down} than given",
-            f"a radial distortion {abs(self.radial):.3f} {higher} than given",
+            f"a focal length {abs(self.focal_factor - 1):.1%} {longer}",
+            f"a principal point {abs(self.shift_u):.1%} of the focal length further {right}",
+            f"a principal point {abs(self.shift_v):.1%} of the focal length further {down}",
+            f"a radial distortion {abs(self.radial):.3f} {higher}",
         )
 
 
@@ -107,7 +106,7 @@ class Stretch:
         if factor == 1:
             return calibration.sentence
         how = f"{abs(factor - 1):.0%} {'wider' if factor > 1 else 'narrower'}"
-        return " and ".join([f"an image {how} than stated", *calibration.considerable])
+        return f"{enumeration([f'an image {how}', *calibration.considerable])} than given"
 
 
 UNSTRETCHED = Stretch()

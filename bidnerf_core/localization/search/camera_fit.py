@@ -79,14 +79,16 @@ def better_camera(
     """
     here = _Projection(data, T_world_rig, calibration.radial)
     start = _unknowns(calibration)
-    before, support = here.agreeing(start, limit), here.support(start, limit)
+    before, enough = here.agreeing(start, limit), MORE * here.support(start, limit) + FURTHER
     if not 0 < before < unsuspected * len(data):
         return None
     fits = [_fitted(here, start, limit)]
-    if before < SUSPECTED * len(data) and fits[0][1] < MORE * support + FURTHER:
-        fits += _from_far(data, T_world_rig, calibration, limit)
+    if fits[0][1] < enough:
+        fits += _from_sample(data, limit)
+    if before < SUSPECTED * len(data) and max(support for _, support in fits) < enough:
+        fits.append(_from_far(data, T_world_rig, calibration, limit))
     found, best = max(fits, key=lambda fit: fit[1])
-    return found if best >= MORE * support + FURTHER else None
+    return found if best >= enough else None
 
 
 def _unknowns(calibration: Calibration) -> Float[np.ndarray, "10"]:
@@ -108,10 +110,25 @@ def _fitted(
     return CameraFit(project.pose(found), stretch, corrected, within), project.support(found, limit)
 
 
+def _from_sample(data: ObservedPoints, limit: float) -> list[tuple[CameraFit, float]]:
+    """Return the fit from the best minimal sample of the matches, whose focal length is free; none if there is no sample.
+
+    Images of several cameras have no such samples.
+    """
+    parts = (data.translation, data.rotation, data.focal)
+    if not all(bool((part == part[0]).all()) for part in parts):
+        return []
+    sampled = focal_consensus(data, limit, seed=0, most_draws=FEW_DRAWS)
+    if sampled is None:
+        return []
+    project = _Projection(data, sampled.T_world_rig, 0.0)
+    return [_fitted(project, _unknowns(sampled.calibration), limit, FIT_SCALES[-1:])]
+
+
 def _from_far(
     data: ObservedPoints, T_world_rig: SE3, calibration: Calibration, limit: float
-) -> list[tuple[CameraFit, float]]:
-    """Return fits from principal points far off, and from a minimal sample of the matches, whose focal length is free."""
+) -> tuple[CameraFit, float]:
+    """Return the best fit from principal points far off."""
     rough = []
     for u, v in itertools.product((-FAR, FAR), repeat=2):
         # The principal point and this turn move the image by opposite amounts.
@@ -121,14 +138,7 @@ def _from_far(
         found = project.descended(start, FIT_SCALES[0] * limit, ROUGH_EVALUATIONS)
         rough.append((project.support(found, limit), project, found))
     _, project, found = max(rough, key=lambda fit: fit[0])
-    fits = [_fitted(project, found, limit)]
-    parts = (data.translation, data.rotation, data.focal)
-    one_camera = all(bool((part == part[0]).all()) for part in parts)
-    sampled = focal_consensus(data, limit, seed=0, most_draws=FEW_DRAWS) if one_camera else None
-    if sampled is not None:
-        project = _Projection(data, sampled.T_world_rig, 0.0)
-        fits.append(_fitted(project, _unknowns(sampled.calibration), limit, FIT_SCALES[-1:]))
-    return fits
+    return _fitted(project, found, limit)
 
 
 def told_apart(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:

@@ -91,7 +91,9 @@ def confirm(
     visible, matches, chance = visible_and_matching(query, T_world_camera)
     answer = confirmed(query, T_world_camera)
     clock.lap("refinement")
-    pose = None if answer is None else described(query, answer.correspondences, answer, clock.seconds)
+    unguided = unguided_matches(query.images, matcher, STRONGEST)
+    pose = None if answer is None else described(query, unguided, answer, clock.seconds)
+    clock.lap("assessment")
     return Confirmation(pose, visible, matches, chance)
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
-
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.correspondences import query_images
@@ -64,20 +62,6 @@ def mirror_evidence(
     found = sample_consensus(query.observed(matches), matches.view, query.threshold, seed)
     agreeing = 0 if found is None else int(found.inliers.sum())
     return MirrorEvidence(agreeing, log10_agreement(query, matches, agreeing))
-
-
-def unguided_log10_nfa(
-    matcher: LandmarkMatcher, views: Sequence[View], T_world_camera: SE3, features: Features = SIFT
-) -> float:
-    """Return the logarithm of the number of false alarms of a pose of the last of ``views`` by descriptors alone.
-
-    Unlike matches that were sought near the projections, it compares with the evidence for a mirror image.
-    """
-    last = [View(views[-1].frame, SE3.identity())]
-    query = LandmarkQuery(query_images(last, features), matcher.landmarks, FIXED)
-    matches = unguided_matches(query.images, matcher, KEYPOINTS)
-    off = torch.linalg.vector_norm(query.observed(matches).residuals(T_world_camera), dim=-1)
-    return log10_agreement(query, matches, int((off <= query.threshold).sum()))
 
 
 def mirror_image(frame: Frame) -> Frame:
