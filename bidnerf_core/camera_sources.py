@@ -164,7 +164,7 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource:
     alike = [c for c in cameras if any(same_aspect((c.width, c.height), shape) for shape in shapes)]
     per_diagonal = [math.sqrt(c.fx * c.fy) / math.hypot(c.width, c.height) for c in alike or cameras]
     camera = Intrinsics.from_focal(median_low(per_diagonal) * math.hypot(*size), *size)
-    return _described(camera, "no focal length in EXIF, that of the map's images is assumed")
+    return _described(camera, "no focal length is known, that of the map's images is assumed")
 
 
 def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> CameraSource:

@@ -160,6 +160,9 @@ def test_a_folder_of_images(tmp_path: Path) -> None:
     assert frames[1].frame.depth is None
     with pytest.raises(InputError, match="no focal length in EXIF, expected a camera"):
         list(open_sequence(tmp_path))
+    assumed = next(iter(open_sequence(tmp_path, assumed=[Intrinsics.from_focal(20, 16, 12)]))).frame
+    assert assumed.intrinsics == Intrinsics.from_focal(10, 8, 6)
+    assert assumed.focal_is_approximate
 
 
 def test_image_names_may_be_times(tmp_path: Path) -> None:

@@ -54,6 +54,17 @@ def test_frames_come_in_order_with_their_times(clip: Path) -> None:
     assert frames[3].frame.intrinsics == Intrinsics.from_hfov(60, WIDTH, HEIGHT)
 
 
+def test_an_assumed_camera_is_approximate(clip: Path) -> None:
+    camera = Intrinsics.from_focal(50, 2 * WIDTH, 2 * HEIGHT)
+    for sequence, approximate in (
+        (open_sequence(clip, assumed=[camera]), True),
+        (open_sequence(clip, focal=25, assumed=[camera]), False),
+    ):
+        frame = next(iter(sequence)).frame
+        assert frame.intrinsics == Intrinsics.from_focal(25, WIDTH, HEIGHT)
+        assert frame.focal_is_approximate is approximate
+
+
 def test_an_iteration_may_end_early(clip: Path) -> None:
     for timed in open_sequence(clip, focal=50):
         assert timed.time == 0

@@ -15,7 +15,8 @@ NO = "no"
 """The value of ``--register-depth`` that takes depth as it is."""
 
 one_camera = tyro.conf.create_mutex_group(
-    required=False, title="camera of images whose format has none (default: from EXIF)"
+    required=False,
+    title="camera of images whose format has none (default: from EXIF, or like that of the map's images)",
 )
 CameraFile = Annotated[
     Path | None,

@@ -107,11 +107,11 @@ def run(arguments: list[str]) -> None:
             require_matplotlib()
         if video is not None:
             check_video(video)
-        given, registration = GivenCamera(camera, focal, hfov), depth_registration(register_depth)
-        if follow:
-            given = replace(given, sensor=given_sensor(sequence, registration))
+        registration = depth_registration(register_depth)
+        sensor = given_sensor(sequence, registration) if follow else None
         begin, settings = None if start is None else read_pose(start), AutoConfig(depth_sensor=depth_sensor)
         stored = load_map(map)
+        assumed = () if stored.landmarks is None else stored.landmarks.cameras
         path = TrackedPath(stored.info)
         tracker = Tracker(Localizer(stored, config=settings), config, begin)
         drawn = nullcontext() if video is None else TrackingVideo(video, stored)
@@ -120,11 +120,12 @@ def run(arguments: list[str]) -> None:
             with drawn as drawing:
                 step = _Step(tracker, path, depth, drawing)
                 if follow:
+                    given = GivenCamera(camera, focal, hfov, sensor, assumed)
                     _follow(str(sequence), step, given, stored.bounds.background)
                 else:
                     frames = open_sequence(
-                        sequence, camera=camera, focal=focal, hfov=hfov, background=stored.bounds.background,
-                        register_depth=registration,
+                        sequence, camera=camera, focal=focal, hfov=hfov, assumed=assumed,
+                        background=stored.bounds.background, register_depth=registration,
                     )  # fmt: skip
                     _track(frames, step, every)
         finally:  # Ctrl-C included: what there is, is written whole

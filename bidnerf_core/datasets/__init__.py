@@ -144,6 +144,7 @@ def open_sequence(
     camera: Intrinsics | str | Path | None = None,
     focal: float | None = None,
     hfov: float | None = None,
+    assumed: Sequence[Intrinsics] = (),
     background: Background | None = None,
     readers: Sequence[Reader] | None = None,
     register_depth: DepthRegistration | None = None,
@@ -151,11 +152,11 @@ def open_sequence(
     """Open the frames of ``path`` in the order of time: a dataset, a folder of images, or a video. None is read yet.
 
     Images and videos have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in
-    ``Frame.open``; images without them that of their EXIF. Datasets have their own, but for those of which ``open_dataset``
+    ``Frame.open``; images without them that of their EXIF, or else one like the ``assumed`` cameras, and videos the latter. Datasets have their own, but for those of which ``open_dataset``
     takes one. ``register_depth`` is as in ``open_dataset``; depth beside images is registered where a sensor is given. Raises
     ``InputError`` where nothing is found, where a description is not usable, and for a camera that is missing or one too many.
     """
-    place, given = Path(path), GivenCamera(camera, focal, hfov)
+    place, given = Path(path), GivenCamera(camera, focal, hfov, assumed=tuple(assumed))
     if not place.exists():
         raise InputError(f"{place}: no such file or folder")
     if not place.is_dir():

@@ -36,14 +36,20 @@ class GivenCamera:
         return any(given is not None for given in (self.camera, self.focal, self.hfov))
 
     def require(self, path: Path, why: str) -> None:
-        """Raise ``InputError`` where no camera is given; ``why`` says why one is needed."""
-        if not self.is_given:
+        """Raise ``InputError`` where no camera is given or assumed; ``why`` says why one is needed."""
+        if not self.is_given and not self.assumed:
             raise InputError(f"{path}: {why}, expected a camera: {WAYS}")
 
     def of(self, path: Path, width: int, height: int) -> CameraSource:
         """Return the camera of an upright image. Raises ``InputError`` as ``find_camera`` does."""
         return find_camera(
-            str(path), Raster(width, height, UPRIGHT), Exif(), self.camera, self.focal, self.hfov
+            str(path),
+            Raster(width, height, UPRIGHT),
+            Exif(),
+            self.camera,
+            self.focal,
+            self.hfov,
+            self.assumed,
         )
 
     def read(

@@ -2,7 +2,7 @@
 
 Frames are decoded one after the other, each with the time stamp that the file has for it, in seconds from its start: phones record at a
 varying rate. A rotation that the file asks for is applied, so the camera is that of the upright image. A video does not record its focal
-length, so the camera has to be given.
+length, so the camera has to be given, or assumed.
 """
 
 from __future__ import annotations
@@ -73,7 +73,10 @@ class Video:
     def _frame(self, pixels: UInt8[np.ndarray, "h w 3"], number: int) -> Frame:
         rgb = torch.from_numpy(pixels.astype(np.float32) / 255)
         found = self.camera.of(self.path, pixels.shape[1], pixels.shape[0])
-        return Frame(f"{number:06d}", rgb, found.intrinsics, camera_source=found.description)
+        return Frame(
+            f"{number:06d}", rgb, found.intrinsics, camera_source=found.description,
+            focal_is_approximate=found.approximate,
+        )  # fmt: skip
 
 
 def open_video(path: Path, camera: GivenCamera) -> Video:

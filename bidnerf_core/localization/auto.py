@@ -100,7 +100,7 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         answer = answer if rejection is None else replace(answer, verdict=rejection, confidence=None)
     has_points = _measured_points(problem) >= LEAST_POINTS
     doubtful = answer is not None and has_points and _is_doubtful(problem, answer)
-    if answer is not None and not doubtful and _is_final(answer.verdict.outcome, has_points):
+    if answer is not None and not doubtful and _is_final(answer, has_points):
         return localization_by_landmarks(problem, answer, began)
     if answer is not None and problem.start is None:
         problem = replace(problem, start=answer.T)  # one more place to look
@@ -146,9 +146,14 @@ def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
     return there < SurfaceThresholds().on_surface
 
 
-def _is_final(outcome: Outcome, has_points: bool) -> bool:
-    """Whether the surface has nothing to add to what landmarks found."""
-    if outcome is Outcome.UNCERTAIN:
+def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
+    """Whether the surface has nothing to add to what landmarks found.
+
+    Colours do not determine a position that landmarks leave imprecise because the intrinsics are unknown.
+    """
+    outcome = answer.verdict.outcome
+    unknown_camera = outcome is Outcome.IMPRECISE and answer.found.estimates_calibration
+    if outcome is Outcome.UNCERTAIN or unknown_camera:
         return not has_points
     return outcome is Outcome.CONVERGED or outcome in FINAL
 
