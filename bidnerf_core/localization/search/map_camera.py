@@ -7,6 +7,7 @@ manufacturer does. The map was fitted to the intrinsics of its own images, so th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -129,10 +130,15 @@ def camera_like(
         shift = max(abs(camera.cx - fitted.cx) / fitted.fx, abs(camera.cy - fitted.cy) / fitted.fy)
         return abs(across + down) / 2, abs(across - down), shift
 
-    resized = {camera.resized(fitted.width, fitted.height) for camera in cameras}
     limits = (max(ALIKE.log_focal, 2 * log_focal_deviation), ALIKE_SHAPES, ALIKE.shift)
+    resized = resized_cameras(cameras, fitted)
     alike = [c for c in resized if all(x <= y for x, y in zip(differences(c), limits, strict=True))]
     return min(alike, key=differences, default=None)
+
+
+def resized_cameras(cameras: Sequence[Intrinsics], image: Intrinsics) -> list[Intrinsics]:
+    """Return the different cameras of a map's images, resized to the size of an image whatever its shape, by focal length."""
+    return sorted({camera.resized(image.width, image.height) for camera in cameras}, key=lambda c: c.fx)
 
 
 def _agree(a: Intrinsics, b: Intrinsics) -> bool:

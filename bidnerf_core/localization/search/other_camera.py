@@ -14,7 +14,12 @@ from bidnerf_core.localization.search.guided_refinement import LEAST_GUIDED_MATC
 from bidnerf_core.localization.search.landmark_evidence import described
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, camera_like, correction_between
+from bidnerf_core.localization.search.map_camera import (
+    OTHER_CAMERA,
+    camera_like,
+    correction_between,
+    resized_cameras,
+)
 from bidnerf_core.localization.search.ransac import Hypothesis, sample_consensus
 from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.mapping.calibration import ANY, FIXED, Calibration, Stretch
@@ -84,12 +89,10 @@ def _sampled_with_map_camera(
 ) -> LandmarkPose | None:
     """Return the pose by minimal samples with the map's intrinsics, resized to the image whatever its shape, if far more agree."""
     given = query.images[-1].intrinsics
-    resized = sorted(
-        {camera.resized(given.width, given.height) for camera in query.landmarks.cameras}, key=lambda c: c.fx
-    )
-    if not resized:
+    resized = resized_cameras(query.landmarks.cameras, given)
+    camera = resized[(len(resized) - 1) // 2] if resized else given
+    if camera == given:
         return None
-    camera = resized[(len(resized) - 1) // 2]
     data = query.seen_by([camera] * len(query.images)).observed(matches)
     first = sample_consensus(data, matches.view, query.threshold, seed=0)
     enough = MORE * found.agreeing + FURTHER
