@@ -106,8 +106,8 @@ def find_camera(
         raise InputError(f"{where}: {error}") from error
     if camera is None:
         known = exif.has_focal_length or not assumed
-        source = camera_from_exif(where, raster, exif) if known else _assumed(raster, assumed)
-        return replace(source, approximate=True)
+        by_exif = camera_from_exif(where, raster, exif, parts=bool(assumed)) if known else None
+        return replace(by_exif or _assumed(raster, assumed), approximate=True)
     given, origin = (
         (camera, "camera as given")
         if isinstance(camera, Intrinsics)
@@ -134,26 +134,30 @@ def _focal(camera: Intrinsics) -> str:
     return f"fx {camera.fx:.0f} px at {camera.width}x{camera.height}"
 
 
-def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
+def camera_from_exif(where: str, raster: Raster, exif: Exif, parts: bool = False) -> CameraSource:
     """Return the camera that EXIF describes; it is good to some percent, and the lens is taken as free of distortion.
 
-    Raises ``InputError`` where there is no focal length, and where the image was cropped after it was taken.
+    Raises ``InputError`` where there is no focal length, and where the image was cropped after it was taken. With ``parts``, such
+    an image is taken for a part of the photo at its resolution, whose middle is assumed as the principal point.
     """
     taken = exif.size
-    if taken and not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size)):
-        size = f"{raster.width}x{raster.height}"
+    cropped = taken and not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size))
+    if taken and cropped and not parts:
+        now = f"{raster.width}x{raster.height}"
         raise InputError(
-            f"{where}: image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS}"
+            f"{where}: image is {now}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS}"
         )
+    of_photo = f", for a photo of {taken[0]}x{taken[1]} of which this is a part" if taken and cropped else ""
+    size = taken if taken and cropped else raster.size
     if exif.equivalent_mm is not None:
-        focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*raster.size)
-        return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF")
+        focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*size)
+        return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF{of_photo}")
     if exif.focal_mm is not None and exif.pixels_per_mm is not None:
         # The resolution is that of the image when it was taken.
-        scale = max(raster.size) / max(taken) if taken else 1.0
+        scale = max(size) / max(taken) if taken else 1.0
         focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
-        return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
+        return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF{of_photo}")
     raise InputError(f"{where}: no focal length in EXIF, expected a camera: {WAYS}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,19 @@ def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assume
         Exif(equivalent_mm=26)
     )
     assert not find_camera("a.jpg", PHOTO, Exif(), focal=3000, assumed=[small]).approximate
+
+
+@pytest.mark.parametrize(
+    "exif", [Exif(equivalent_mm=26), Exif(focal_mm=4.2, pixels_per_mm=(700.0, 700.0), digital_zoom=2.0)]
+)
+def test_a_part_of_a_photo_has_the_focal_length_of_the_whole_one_where_it_is_estimated(exif: Exif) -> None:
+    whole, part = replace(exif, size=SIZE), Raster(1200, 3000, UPRIGHT)
+    source = find_camera("a.jpg", part, whole, assumed=[Intrinsics.from_focal(300, 400, 300)])
+    assert source.approximate
+    assert source.intrinsics == Intrinsics.from_focal(found(exif).fx, 1200, 3000)
+    assert "for a photo of 4032x3024 of which this is a part" in source.description
+    with pytest.raises(InputError, match="is 1200x3000, but was 4032x3024"):
+        find_camera("a.jpg", part, whole)
 
 
 def test_tags_are_read_from_the_file(tmp_path: Path) -> None:
