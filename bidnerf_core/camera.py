@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bidnerf_core.constants import constant
 from bidnerf_core.errors import InputError
-from bidnerf_core.orientation import Orientation
+from bidnerf_core.orientation import QUARTER_TURNS, Orientation
 
 LARGEST_SIZE = 1_000_000
 """Columns or rows of an image."""
@@ -144,6 +144,23 @@ class Intrinsics:
         return replace(
             self, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y, width=width, height=height
         )
+
+    def turned_like(self, width: int, height: int) -> tuple[Intrinsics, ...]:
+        """Return this camera turned by a quarter, both ways, if its image lies and one of another size stands, or the reverse.
+
+        Otherwise it is returned alone. A tilted sensor (14 distortion coefficients) is not turned: nothing is returned then.
+        """
+        if (self.width - self.height) * (width - height) >= 0:
+            return (self,)
+        return () if any(self.distortion[TAU_X:]) else tuple(map(self.upright, QUARTER_TURNS))
+
+    def largest_part(self, width: int, height: int) -> Intrinsics:
+        """Return the camera of the largest part of the image, about its middle, that has the shape of another size, at that size."""
+        scale = max(width / self.width, height / self.height)
+        return replace(
+            self, fx=self.fx * scale, fy=self.fy * scale, cx=width / 2 + (self.cx - self.width / 2) * scale,
+            cy=height / 2 + (self.cy - self.height / 2) * scale, width=width, height=height,
+        )  # fmt: skip
 
     def upright(self, orientation: Orientation) -> Intrinsics:
         """Return the camera of the upright image; this one is of the image as it is stored.

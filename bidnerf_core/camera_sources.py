@@ -162,12 +162,15 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif, parts: bool = False
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource:
-    """Return a camera with the median focal length of the ``cameras`` of images with the same shape, lying or standing, or of all."""
+    """Return a camera with the median focal length of the ``cameras`` of images with the same shape, lying or standing.
+
+    If there are none, the image is taken for the largest part of one of theirs that has its shape.
+    """
     size = raster.upright_size
-    shapes = (size, size[::-1])
-    alike = [c for c in cameras if any(same_aspect((c.width, c.height), shape) for shape in shapes)]
-    per_diagonal = [math.sqrt(c.fx * c.fy) / math.hypot(c.width, c.height) for c in alike or cameras]
-    camera = Intrinsics.from_focal(median_low(per_diagonal) * math.hypot(*size), *size)
+    turned = [camera for each in cameras for camera in each.turned_like(*size)] or cameras
+    alike = [camera for camera in turned if same_aspect((camera.width, camera.height), size)]
+    parts = [camera.largest_part(*size) for camera in alike or turned]
+    camera = Intrinsics.from_focal(median_low(math.sqrt(part.fx * part.fy) for part in parts), *size)
     return _described(camera, "no focal length is known, that of the map's images is assumed")
 
 

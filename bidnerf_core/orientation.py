@@ -44,3 +44,5 @@ CODES = {
     7: (True, True, True),
     8: (True, False, True),
 }
+QUARTER_TURNS = tuple(Orientation(*CODES[code]) for code in (6, 8))
+"""Those of cameras that stand on one side or the other."""

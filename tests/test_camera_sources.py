@@ -82,7 +82,7 @@ def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assume
         assert source.intrinsics == Intrinsics.from_focal(300 * 4032 / 400, *raster.upright_size)
         assert "that of the map's images is assumed" in source.description
     square = find_camera("a.jpg", Raster(250, 250, UPRIGHT), Exif(), assumed=[small])
-    assert square.intrinsics.fx == pytest.approx(300 * math.sqrt(2) * 250 / 500)
+    assert square.intrinsics == Intrinsics.from_focal(300 * 250 / 300, 250, 250)
     assert find_camera("a.jpg", PHOTO, Exif(equivalent_mm=26), assumed=[small]).intrinsics == found(
         Exif(equivalent_mm=26)
     )

@@ -1,4 +1,4 @@
-"""Rejects poses by colour alone whose intrinsics differ slightly from those of the map's images.
+"""Rejects poses by colour alone whose focal length is approximate, or whose intrinsics differ slightly from those of the map's images.
 
 Focal length and distance can hardly be separated without landmarks: a camera with a slightly longer focal length a little
 further away takes nearly the same image. If the intrinsics are wrong, the pose is off by the difference.
@@ -26,9 +26,14 @@ def _differs_a_little(camera: MapCamera) -> bool:
 
 
 def without_ambiguous_intrinsics(found: Localization, problem: Problem) -> Localization:
-    """Reject an accepted pose that neither landmarks nor depth determine where ``may_be_miscalibrated``."""
+    """Reject an accepted pose by colour alone where the focal length is approximate, or the intrinsics ``may_be_miscalibrated``."""
     by_colour = not problem.has_depth and not isinstance(found.diagnostics, LandmarkDiagnostics)
-    if not (found.converged and by_colour and may_be_miscalibrated(problem)):
+    if not (found.converged and by_colour):
+        return found
+    if any(view.frame.focal_is_approximate for view in problem.views):
+        why = "the focal length is approximate, and colours alone hardly tell it from the distance"
+        return replace(found, outcome=Outcome.IMPRECISE, reason=f"{why}; {found.reason}")
+    if not may_be_miscalibrated(problem):
         return found
     why = "the intrinsics given are near those of the map's images, and without landmarks nothing tells which are right"
     return replace(found, outcome=Outcome.MISCALIBRATED, reason=f"{why}; {found.reason}")

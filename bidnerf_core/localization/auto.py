@@ -23,7 +23,7 @@ from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_int
 from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
-from bidnerf_core.localization.by_colour import without_the_imprecise, without_unknown_focal_length
+from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface
 from bidnerf_core.localization.by_image_search import localized_by_images
 from bidnerf_core.localization.by_landmarks import (
@@ -117,13 +117,12 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     else:
         found = localized_by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
-        found = without_unknown_focal_length(without_the_imprecise(found, typical), problem)
+        found = without_the_imprecise(found, typical)
     if matcher is None:
         return found
     found = _compared_with_landmarks(found, problem, matcher, config, seed, began)
     found = replace(found, seconds=time.perf_counter() - began)
-    hardly_known = found.outcome in (Outcome.TOO_FEW_MATCHES, Outcome.IMPRECISE)
-    if answer is not None and hardly_known and answer.verdict.outcome in UNSURE:
+    if answer is not None and found.outcome is Outcome.TOO_FEW_MATCHES and answer.verdict.outcome in UNSURE:
         return localization_by_landmarks(problem, answer, began)
     return found
 

@@ -125,11 +125,3 @@ def without_the_imprecise(found: Localization, typical: float) -> Localization:
         return found
     why = f"the position is uncertain by {deviation:.3g}, the map's own images by {typical:.3g}"
     return replace(found, outcome=Outcome.IMPRECISE, reason=f"{why}; {found.reason}")
-
-
-def without_unknown_focal_length(found: Localization, problem: Problem) -> Localization:
-    """Reject an accepted answer to images whose focal length is approximate: with a wrong one, they agree at a wrong distance."""
-    if not found.converged or not any(view.frame.focal_is_approximate for view in problem.views):
-        return found
-    why = "the focal length is approximate, and colours alone hardly tell it from the distance"
-    return replace(found, outcome=Outcome.IMPRECISE, reason=f"{why}; {found.reason}")

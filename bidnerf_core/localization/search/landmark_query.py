@@ -41,7 +41,9 @@ class LandmarkQuery:
     def map_camera(self) -> MapCamera | None:
         """The intrinsics of the map's images, if all images of the query state the same."""
         given = {image.intrinsics for image in self.images}
-        return map_camera(given.pop(), self.landmarks.cameras) if len(given) == 1 else None
+        if len(given) > 1:
+            return None
+        return map_camera(given.pop(), self.landmarks.cameras, parts=self.prior.log_focal > 0)
 
     def seen_by(self, cameras: Sequence[Intrinsics]) -> LandmarkQuery:
         """Return the query with other intrinsics for each of its images."""

@@ -91,17 +91,20 @@ class MapCamera:
 
 
 @lru_cache(maxsize=64)
-def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera | None:
+def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...], parts: bool = False) -> MapCamera | None:
     """Return the camera of a map's images of the same shape as those with the ``given`` intrinsics; None if there are none.
+
+    Images that stand may be those of a camera that was turned. With ``parts``, an image of another shape is compared with the
+    largest parts of the map's images that have its shape.
 
     It is the one that the given intrinsics agree with or, if that took hardly any of the images, that with the median focal
     length. None as well if its lens is so different that ``Calibration`` cannot describe the difference.
     """
-    alike = [
-        camera.resized(given.width, given.height)
-        for camera in cameras
-        if same_aspect((camera.width, camera.height), (given.width, given.height))
-    ]
+    size = (given.width, given.height)
+    turned = [camera for each in cameras for camera in each.turned_like(*size)]
+    alike = [camera.resized(*size) for camera in turned if same_aspect((camera.width, camera.height), size)]
+    if parts and not alike:
+        alike = [camera.largest_part(*size) for camera in turned]
     agreeing = [camera for camera in alike if _agree(given, camera)]
     if len(agreeing) > UNUSUAL * len(alike):
         alike = agreeing[:1]
@@ -138,7 +141,9 @@ def camera_like(
 
 def resized_cameras(cameras: Sequence[Intrinsics], image: Intrinsics) -> list[Intrinsics]:
     """Return the different cameras of a map's images, resized to the size of an image whatever its shape, by focal length."""
-    return sorted({camera.resized(image.width, image.height) for camera in cameras}, key=lambda c: c.fx)
+    size = (image.width, image.height)
+    found = {camera.resized(*size) for each in cameras for camera in each.turned_like(*size)}
+    return sorted(found, key=lambda c: c.fx)
 
 
 def _agree(a: Intrinsics, b: Intrinsics) -> bool:
