@@ -10,6 +10,7 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.map_camera import map_camera, resized_cameras
+from bidnerf_core.mapping.calibration import Calibration
 from bidnerf_core.orientation import QUARTER_TURNS
 
 LYING = Intrinsics(520.0, 521.0, 310.0, 245.0, 640, 480, (0.05, -0.01, 0.001, 0.002))
@@ -60,7 +61,23 @@ def test_the_map_camera_of_an_image_that_stands_is_turned() -> None:
         taken = map_camera(own, (LYING,))
         assert taken is not None
         assert taken.intrinsics == own
+        near = Calibration(shift_u=(own.cx - given.cx) / given.fx, shift_v=(own.cy - given.cy) / given.fx)
+        taken = map_camera(given, (LYING, LYING), near=near)
+        assert taken is not None
+        assert taken.intrinsics == own
     assert set(resized_cameras([LYING], given)) == {one, other}
+
+
+def test_of_images_that_lie_and_stand_those_that_lie_as_the_query_are_taken() -> None:
+    one, _ = LYING.turned_like(480, 640)
+    standing = replace(one, fx=500.0, fy=500.0)
+    for cameras in ((LYING, standing), (standing, LYING)):
+        found = map_camera(Intrinsics.from_focal(510, 480, 640), cameras)
+        assert found is not None
+        assert found.intrinsics == standing
+    tilted = replace(LYING, distortion=(0.0,) * 12 + (0.1, 0.0))
+    assert map_camera(standing, (tilted,)) is None
+    assert map_camera(standing, ()) is None
 
 
 def test_parts_are_compared_only_on_demand() -> None:

@@ -120,7 +120,8 @@ def _with_camera_judged(
 def _other_camera(problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose) -> Intrinsics:
     """Return those of the given intrinsics and the map's that were not taken."""
     given = problem.views[-1].frame.intrinsics
-    camera = None if found.takes_map_camera else map_camera(given, matcher.landmarks.cameras)
+    near = Calibration(*found.miscalibration.alternative.tolist())
+    camera = None if found.takes_map_camera else map_camera(given, matcher.landmarks.cameras, near=near)
     return given if camera is None else camera.intrinsics
 
 

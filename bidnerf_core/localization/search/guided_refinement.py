@@ -126,7 +126,8 @@ def _settled(
     correlation = query.landmarks.correlation_of(len(found))
     free, crop = _with_free_camera(query, fit, found, open_camera=prior.log_focal > 0)
     evidence, approximate = query.evidence, query.prior.log_focal > 0
-    taken = taken_intrinsics(free, query.landmarks, query.map_camera, approximate, evidence.map_camera)
+    camera = query.map_camera_near(free.calibration)
+    taken = taken_intrinsics(free, query.landmarks, camera, approximate, evidence.map_camera)
     right = query.prior if approximate and taken.camera is None else CALIBRATED
     wrong = Miscalibration.of(free, query.landmarks, taken, evidence.mistaken, right)
     certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_BY_OTHERS

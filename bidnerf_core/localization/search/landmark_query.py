@@ -14,7 +14,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
 from bidnerf_core.localization.search.map_camera import MapCamera, map_camera
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
-from bidnerf_core.mapping.calibration import CalibrationPrior
+from bidnerf_core.mapping.calibration import GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
@@ -40,10 +40,14 @@ class LandmarkQuery:
     @property
     def map_camera(self) -> MapCamera | None:
         """The intrinsics of the map's images, if all images of the query state the same."""
+        return self.map_camera_near(GIVEN)
+
+    def map_camera_near(self, estimated: Calibration) -> MapCamera | None:
+        """Return ``map_camera``, turned to the side to which an estimated correction points where it was turned."""
         given = {image.intrinsics for image in self.images}
         if len(given) > 1:
             return None
-        return map_camera(given.pop(), self.landmarks.cameras, parts=self.prior.log_focal > 0)
+        return map_camera(given.pop(), self.landmarks.cameras, parts=self.prior.log_focal > 0, near=estimated)
 
     def seen_by(self, cameras: Sequence[Intrinsics]) -> LandmarkQuery:
         """Return the query with other intrinsics for each of its images."""

@@ -18,6 +18,7 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics, same_aspect
 from bidnerf_core.mapping.calibration import (
     CALIBRATED,
+    GIVEN,
     MISTAKEN,
     MISTAKES,
     USUAL,
@@ -90,21 +91,33 @@ class MapCamera:
         return (-0.5 * (self.correction / deviations).square() - deviations.log())[self.differs].sum()
 
 
-@lru_cache(maxsize=64)
-def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...], parts: bool = False) -> MapCamera | None:
+def map_camera(
+    given: Intrinsics, cameras: tuple[Intrinsics, ...], parts: bool = False, near: Calibration = GIVEN
+) -> MapCamera | None:
     """Return the camera of a map's images of the same shape as those with the ``given`` intrinsics; None if there are none.
 
-    Images that stand may be those of a camera that was turned. With ``parts``, an image of another shape is compared with the
-    largest parts of the map's images that have its shape.
-
     It is the one that the given intrinsics agree with or, if that took hardly any of the images, that with the median focal
-    length. None as well if its lens is so different that ``Calibration`` cannot describe the difference.
+    length. None as well if its lens is so different that ``Calibration`` cannot describe the difference. With ``parts``, an image
+    of another shape is compared with the largest parts of the map's images that have its shape.
+
+    If all the map's images lie and this one stands, or the reverse, its camera was turned to one side or the other: to that
+    with the principal point nearest to a correction ``near`` the right one.
     """
+    ways = [each.turned_like(given.width, given.height) for each in cameras]
+    ways = [way for way in ways if len(way) == 1] or [way for way in ways if way]
+    known = [_camera_among(given, turned, parts) for turned in zip(*ways, strict=True)]
+    shift = torch.tensor([near.shift_u, near.shift_v], dtype=torch.float64)
+    found = [camera for camera in known if camera is not None]
+    return min(found, key=lambda camera: float((camera.correction[1:3] - shift).norm()), default=None)
+
+
+@lru_cache(maxsize=64)
+def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...], parts: bool) -> MapCamera | None:
+    """Return the camera of images that lie or stand as those with the ``given`` intrinsics."""
     size = (given.width, given.height)
-    turned = [camera for each in cameras for camera in each.turned_like(*size)]
-    alike = [camera.resized(*size) for camera in turned if same_aspect((camera.width, camera.height), size)]
+    alike = [camera.resized(*size) for camera in cameras if same_aspect((camera.width, camera.height), size)]
     if parts and not alike:
-        alike = [camera.largest_part(*size) for camera in turned]
+        alike = [camera.largest_part(*size) for camera in cameras]
     agreeing = [camera for camera in alike if _agree(given, camera)]
     if len(agreeing) > UNUSUAL * len(alike):
         alike = agreeing[:1]
