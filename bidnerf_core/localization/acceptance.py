@@ -136,7 +136,8 @@ class LandmarkThresholds:
     """Thresholds for accepting a pose by landmarks. They have no units, so they suit every scene and image."""
 
     log10_nfa: float = -12.0  # logarithm of the number of such agreements expected by chance, at most
-    inliers: int = 15  # correspondences within three standard deviations, at least
+    # correspondences within three standard deviations, at least; in proportion more if intrinsics are unknowns too
+    inliers: int = 15
     above_chance: float = 3.0  # times as many as at a wrong pose, at least
     spread: float = 0.06  # share of the image's cells that hold one, at least
     miscalibration: float = 0.1  # probability that the given intrinsics are wrong, at most
@@ -151,7 +152,8 @@ class LandmarkThresholds:
 def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = LandmarkThresholds()) -> Verdict:
     """Judge a pose by how many landmarks agree with it, compared with chance, and how much of the image they cover."""
     share = f"{found.inliers} landmarks agree"
-    if found.log10_nfa > thresholds.log10_nfa or found.inliers < thresholds.inliers:
+    unknowns = 10 if found.estimates_calibration else 6
+    if found.log10_nfa > thresholds.log10_nfa or found.inliers < thresholds.inliers * unknowns / 6:
         return Verdict(Outcome.TOO_FEW_MATCHES, f"only {share} ({found.agreeing} of {found.matches} matches)")
     if found.inliers < thresholds.above_chance * found.chance:
         return Verdict(Outcome.AMBIGUOUS, f"{share}, about {found.chance:.0f} would by chance")
