@@ -301,6 +301,13 @@ def test_wrong_intrinsics_leave_the_image_alone(view: View) -> None:
     wide = faulty(view, "stretch:1.1", 0).frame
     assert wide.rgb is view.frame.rgb
     assert wide.intrinsics == dataclasses.replace(own, fx=1.1 * own.fx)
+    for frame in (faulty(view, "focal:0.5+nominal", 0).frame, faulty(view, "nominal+focal:0.5", 0).frame):
+        assert frame.rgb is view.frame.rgb
+        assert frame.focal_is_approximate
+        focal = 0.5 * math.sqrt(own.fx * own.fy)
+        assert frame.intrinsics.fx == pytest.approx(focal)
+        expected = Intrinsics.from_focal(frame.intrinsics.fx, own.width, own.height)
+        assert frame.intrinsics == expected
     for seed in range(3):
         part = faulty(view, "crop:0.25", seed).frame
         width, height = round(0.75 * own.width), round(0.75 * own.height)

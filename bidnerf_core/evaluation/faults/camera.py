@@ -23,6 +23,15 @@ def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
     return replace(frame, intrinsics=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
 
 
+def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
+    """State the focal length alone and as approximate, as of a photo without a calibration; the image stays as it is."""
+    if not on:
+        return frame
+    camera = frame.intrinsics
+    stated = Intrinsics.from_focal(math.sqrt(camera.fx * camera.fy), camera.width, camera.height)
+    return replace(frame, intrinsics=stated, focal_is_approximate=True)
+
+
 def stretched(frame: Frame, factor: float, generator: Generator) -> Frame:
     """State ``factor`` times the true focal length across, as if an image had been resized in height alone."""
     return replace(frame, intrinsics=replace(frame.intrinsics, fx=frame.intrinsics.fx * factor))

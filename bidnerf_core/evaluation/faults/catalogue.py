@@ -73,6 +73,10 @@ FAULTS: dict[str, Fault] = {
         "stated focal lengths multiplied by a factor", "factor", FACTOR, 1.0, (0.9, 0.95, 0.98, 1.02, 1.05, 1.1),
         camera.focal_scaled,
     ),
+    "nominal": Fault(
+        "only the focal length stated, and as approximate, as of a photo without a calibration", "1: on, 0: off", SWITCH, 0.0,
+        (1.0,), camera.nominal,
+    ),
     "stretch": Fault(
         "stated focal length across multiplied by a factor, as of an image that was resized to another shape", "factor",
         FACTOR, 1.0, (0.75, 0.9, 1.1, 1.33), camera.stretched,
