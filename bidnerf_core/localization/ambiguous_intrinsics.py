@@ -15,10 +15,16 @@ from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, MapCamera,
 
 
 def may_be_miscalibrated(problem: Problem) -> bool:
-    """Whether the intrinsics given are others than the map's, but so near them that they may be a mistake."""
+    """Whether the focal length is approximate, or the intrinsics are others than the map's but so near that they may be a mistake."""
+    if _is_approximate(problem):
+        return True
     cameras = () if problem.matcher is None else problem.matcher.landmarks.cameras
     known = [map_camera(view.frame.intrinsics, cameras) for view in problem.views]
     return any(_differs_a_little(camera) for camera in known if camera is not None)
+
+
+def _is_approximate(problem: Problem) -> bool:
+    return any(view.frame.focal_is_approximate for view in problem.views)
 
 
 def _differs_a_little(camera: MapCamera) -> bool:
@@ -26,14 +32,12 @@ def _differs_a_little(camera: MapCamera) -> bool:
 
 
 def without_ambiguous_intrinsics(found: Localization, problem: Problem) -> Localization:
-    """Reject an accepted pose by colour alone where the focal length is approximate, or the intrinsics ``may_be_miscalibrated``."""
+    """Reject an accepted pose that neither landmarks nor depth determine where ``may_be_miscalibrated``."""
     by_colour = not problem.has_depth and not isinstance(found.diagnostics, LandmarkDiagnostics)
-    if not (found.converged and by_colour):
+    if not (found.converged and by_colour and may_be_miscalibrated(problem)):
         return found
-    if any(view.frame.focal_is_approximate for view in problem.views):
+    if _is_approximate(problem):
         why = "the focal length is approximate, and colours alone hardly tell it from the distance"
         return replace(found, outcome=Outcome.IMPRECISE, reason=f"{why}; {found.reason}")
-    if not may_be_miscalibrated(problem):
-        return found
     why = "the intrinsics given are near those of the map's images, and without landmarks nothing tells which are right"
     return replace(found, outcome=Outcome.MISCALIBRATED, reason=f"{why}; {found.reason}")

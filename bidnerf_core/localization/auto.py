@@ -8,6 +8,7 @@ from which ``auto`` descends as ``bid`` does.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
@@ -54,7 +55,7 @@ FEWER = 0.05
 """Share of the measured points by which landmarks may take a pose off the surface."""
 IN_FRONT = 0.9
 """Least share of the points of an occluder that must lie before the surface."""
-WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=0.0)
+WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=math.inf)
 """Thresholds for landmarks that match near a pose that was not found by them."""
 MISLEADING = 0.5
 """Probability that the intrinsics are wrong, by the landmarks near a pose by colour alone, from which on it is rejected."""

@@ -56,7 +56,7 @@ UNSUITABLE = (
 def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: int) -> Localization:
     """Return a doubtful pose refined and judged anew if the images are blurrier than what the field renders from there.
 
-    Poses are returned as they are where depth was measured, part of an image is hidden, the intrinsics were corrected or differ
+    Poses are returned as they are where depth was measured, part of an image is hidden, the intrinsics were corrected, approximate or differ
     a little from those of the map's images, the field is itself not sharp, or the map has no surface. ``rays`` and ``seed`` are those of ``mirror_rejection``, which judges poses that
     are accepted here only.
     """

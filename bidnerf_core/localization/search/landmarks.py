@@ -91,8 +91,10 @@ def confirm(
     visible, matches, chance = visible_and_matching(query, T_world_camera)
     answer = confirmed(query, T_world_camera)
     clock.lap("refinement")
+    if answer is None:
+        return Confirmation(None, visible, matches, chance)
     unguided = unguided_matches(query.images, matcher, STRONGEST)
-    pose = None if answer is None else described(query, unguided, answer, clock.seconds)
+    pose = described(query, unguided, answer, clock.seconds)
     clock.lap("assessment")
     return Confirmation(pose, visible, matches, chance)
 
