@@ -145,17 +145,12 @@ class Intrinsics:
             self, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y, width=width, height=height
         )
 
-    def turned_like(self, width: int, height: int) -> tuple[Intrinsics, ...]:
-        """Return this camera turned by a quarter, both ways, if its image lies and one of another size stands, or the reverse.
-
-        Otherwise it is returned alone. A tilted sensor (14 distortion coefficients) is not turned: nothing is returned then.
-        """
-        if (self.width - self.height) * (width - height) >= 0:
-            return (self,)
+    def quarter_turns(self) -> tuple[Intrinsics, ...]:
+        """Return this camera turned by a quarter, to one side and to the other; none if its sensor is tilted (14 coefficients)."""
         return () if any(self.distortion[TAU_X:]) else tuple(map(self.upright, QUARTER_TURNS))
 
-    def largest_part(self, width: int, height: int) -> Intrinsics:
-        """Return the camera of the largest part of the image, about its middle, that has the shape of another size, at that size."""
+    def centre_crop(self, width: int, height: int) -> Intrinsics:
+        """Return the camera of the largest centred part of the image that has the shape of another size, at that size."""
         scale = max(width / self.width, height / self.height)
         return replace(
             self, fx=self.fx * scale, fy=self.fy * scale, cx=width / 2 + (self.cx - self.width / 2) * scale,

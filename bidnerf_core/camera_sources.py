@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median_low
 
 from bidnerf_core.camera import Intrinsics, same_aspect
 from bidnerf_core.camera_records import camera_record
+from bidnerf_core.camera_shapes import cameras_at_size, median_camera
 from bidnerf_core.errors import InputError
 from bidnerf_core.exif import Exif
 from bidnerf_core.files import read_file
@@ -18,6 +18,8 @@ from bidnerf_core.records import parse_record
 
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
 """Millimetres; 35 mm-equivalent focal lengths refer to it (CIPA DCG-001)."""
+LEAST_CROP = 0.5
+"""Share of the width or of the height from which on a cropped photo is taken to have kept its resolution."""
 MIDDLE = "the principal point is assumed in the middle"
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
 COLMAP_MODELS: dict[str, tuple[int, ...]] = {
@@ -105,15 +107,21 @@ def find_camera(
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     if camera is None:
-        known = exif.has_focal_length or not assumed
-        by_exif = camera_from_exif(where, raster, exif, parts=bool(assumed)) if known else None
-        return replace(by_exif or _assumed(raster, assumed), approximate=True)
+        return replace(_found_camera(where, raster, exif, assumed), approximate=True)
     given, origin = (
         (camera, "camera as given")
         if isinstance(camera, Intrinsics)
         else (read_camera(Path(camera), size), f"camera of {camera}")
     )
     return _fitted(where, raster, given, origin)
+
+
+def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intrinsics]) -> CameraSource:
+    """Return the camera by EXIF, or one of the ``assumed`` ones."""
+    if exif.has_focal_length and assumed and exif.size and _is_cropped(raster, exif.size):
+        return _camera_of_crop(where, raster, exif, exif.size)
+    assumable = None if exif.has_focal_length else _assumed(raster, assumed)
+    return assumable or camera_from_exif(where, raster, exif)
 
 
 def _described(camera: Intrinsics, origin: str) -> CameraSource:
@@ -134,44 +142,60 @@ def _focal(camera: Intrinsics) -> str:
     return f"fx {camera.fx:.0f} px at {camera.width}x{camera.height}"
 
 
-def camera_from_exif(where: str, raster: Raster, exif: Exif, parts: bool = False) -> CameraSource:
+def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
     """Return the camera that EXIF describes; it is good to some percent, and the lens is taken as free of distortion.
 
-    Raises ``InputError`` where there is no focal length, and where the image was cropped after it was taken. With ``parts``, such
-    an image is taken for a part of the photo at its resolution, whose middle is assumed as the principal point.
+    Raises ``InputError`` where there is no focal length, and where the image was cropped after it was taken.
     """
     taken = exif.size
-    cropped = taken and not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size))
-    if taken and cropped and not parts:
-        now = f"{raster.width}x{raster.height}"
+    if taken and _is_cropped(raster, taken):
+        size = f"{raster.width}x{raster.height}"
         raise InputError(
-            f"{where}: image is {now}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS}"
+            f"{where}: image is {size}, but was {taken[0]}x{taken[1]} when EXIF was written; give its camera: {WAYS}"
         )
-    of_photo = f", for a photo of {taken[0]}x{taken[1]} of which this is a part" if taken and cropped else ""
-    size = taken if taken and cropped else raster.size
+    return _by_exif(where, raster, exif, raster.size)
+
+
+def _camera_of_crop(where: str, raster: Raster, exif: Exif, taken: tuple[int, int]) -> CameraSource:
+    """Return the camera of a photo that was cropped after EXIF was written, at a size of ``taken``.
+
+    It is taken to have kept its resolution, unless it is far smaller or larger: then for a centre crop that was resized.
+    """
+    ratio = max(raster.width / taken[0], raster.height / taken[1])
+    fits = raster.width <= taken[0] and raster.height <= taken[1]
+    scale = 1.0 if fits and ratio >= LEAST_CROP else ratio
+    whole = (round(taken[0] * scale), round(taken[1] * scale))
+    found = _by_exif(where, raster, exif, whole)
+    return replace(found, description=f"{found.description}; a crop of a photo of {taken[0]}x{taken[1]}")
+
+
+def _is_cropped(raster: Raster, taken: tuple[int, int]) -> bool:
+    return not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size))
+
+
+def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> CameraSource:
+    """Return the camera of an image which is, or is cut out of, one of the size ``whole``."""
     if exif.equivalent_mm is not None:
-        focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*size)
-        return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF{of_photo}")
+        focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*whole)
+        return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF")
     if exif.focal_mm is not None and exif.pixels_per_mm is not None:
         # The resolution is that of the image when it was taken.
-        scale = max(size) / max(taken) if taken else 1.0
+        scale = max(whole) / max(exif.size) if exif.size else 1.0
         focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
-        return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF{of_photo}")
+        return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
     raise InputError(f"{where}: no focal length in EXIF, expected a camera: {WAYS}")
 
 
-def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource:
-    """Return a camera with the median focal length of the ``cameras`` of images with the same shape, lying or standing.
-
-    If there are none, the image is taken for the largest part of one of theirs that has its shape.
-    """
+def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource | None:
+    """Return a camera with the focal length of those of the ``cameras`` whose images have the same shape, or else of their centre crops."""
     size = raster.upright_size
-    turned = [camera for each in cameras for camera in each.turned_like(*size)] or cameras
-    alike = [camera for camera in turned if same_aspect((camera.width, camera.height), size)]
-    parts = [camera.largest_part(*size) for camera in alike or turned]
-    camera = Intrinsics.from_focal(median_low(math.sqrt(part.fx * part.fy) for part in parts), *size)
-    return _described(camera, "no focal length is known, that of the map's images is assumed")
+    groups = cameras_at_size(tuple(cameras), *size, crops=True)
+    if not groups:
+        return None
+    likely = median_camera(groups[0])
+    camera = Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size)
+    return _described(camera, "focal length unknown, assumed to be that of the map's images")
 
 
 def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> CameraSource:

@@ -45,4 +45,4 @@ CODES = {
     8: (True, False, True),
 }
 QUARTER_TURNS = tuple(Orientation(*CODES[code]) for code in (6, 8))
-"""Those of cameras that stand on one side or the other."""
+"""The orientations of a camera that is turned to one side, and to the other."""

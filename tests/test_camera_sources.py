@@ -80,7 +80,7 @@ def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assume
         source = find_camera("a.jpg", raster, Exif(), assumed=[wide, film, small, small])
         assert source.approximate
         assert source.intrinsics == Intrinsics.from_focal(300 * 4032 / 400, *raster.upright_size)
-        assert "that of the map's images is assumed" in source.description
+        assert "assumed to be that of the map's images" in source.description
     square = find_camera("a.jpg", Raster(250, 250, UPRIGHT), Exif(), assumed=[small])
     assert square.intrinsics == Intrinsics.from_focal(300 * 250 / 300, 250, 250)
     assert find_camera("a.jpg", PHOTO, Exif(equivalent_mm=26), assumed=[small]).intrinsics == found(
@@ -92,12 +92,17 @@ def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assume
 @pytest.mark.parametrize(
     "exif", [Exif(equivalent_mm=26), Exif(focal_mm=4.2, pixels_per_mm=(700.0, 700.0), digital_zoom=2.0)]
 )
-def test_a_part_of_a_photo_has_the_focal_length_of_the_whole_one_where_it_is_estimated(exif: Exif) -> None:
+def test_a_cropped_photo_has_the_focal_length_of_the_whole_one_where_it_is_estimated(exif: Exif) -> None:
     whole, part = replace(exif, size=SIZE), Raster(1200, 3000, UPRIGHT)
-    source = find_camera("a.jpg", part, whole, assumed=[Intrinsics.from_focal(300, 400, 300)])
+    assumed = [Intrinsics.from_focal(300, 400, 300)]
+    source = find_camera("a.jpg", part, whole, assumed=assumed)
     assert source.approximate
     assert source.intrinsics == Intrinsics.from_focal(found(exif).fx, 1200, 3000)
-    assert "for a photo of 4032x3024 of which this is a part" in source.description
+    assert source.description.endswith("a crop of a photo of 4032x3024")
+    square = find_camera("a.jpg", Raster(1080, 1080, UPRIGHT), whole, assumed=assumed)  # resized as well
+    assert square.intrinsics.fx == pytest.approx(found(exif).fx * 1080 / 3024)
+    large = find_camera("a.jpg", Raster(8064, 4536, UPRIGHT), whole, assumed=assumed)
+    assert large.intrinsics.fx == pytest.approx(found(exif).fx * 2)
     with pytest.raises(InputError, match="is 1200x3000, but was 4032x3024"):
         find_camera("a.jpg", part, whole)
 

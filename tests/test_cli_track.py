@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 
@@ -83,6 +84,25 @@ def test_frames_that_trained_the_map_are_counted(
     assert "training" not in bidnerf(*track).out
     monkeypatch.setattr(track_module, "load_map", lambda folder: ground)
     assert "2 frames; errors of frames that trained the map are no test" in bidnerf(*track).out
+
+
+def test_images_without_a_focal_length_begin_with_the_camera_of_the_map(
+    bidnerf: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known, images = textured_map(surface=True), tmp_path / "images"
+    assert known.landmarks is not None
+    landmarks = replace(known.landmarks, cameras=(CAMERA,))
+    ground = StoredGround(known.field, known.bounds, landmarks, known.surface)
+    monkeypatch.setattr(track_module, "load_map", lambda folder: ground)
+    images.mkdir()
+    for number, (_, frame, _) in enumerate(flight()[:3]):
+        iio.imwrite(images / f"{number}.png", (255 * frame.rgb).round().byte().numpy())
+    status, _, err = bidnerf("track", "MAP", images, "--out", tmp_path / "path.json")
+    assert status == 0, err
+    assert err.count("assumed to be that of the map's images") == 1
+    for row, (_, _, T) in zip(json.loads((tmp_path / "path.json").read_text()), flight()[:3], strict=True):
+        assert row["converged"]
+        assert np.linalg.norm(np.array(row["T_world_camera"])[:3, 3] - T.translation.numpy()) < 0.05
 
 
 def test_json_holds_all_frames(bidnerf: Run, data: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pyte
     error = pose_error(SE3.from_matrix(torch.tensor(answer["T_world_camera"])), unseen().T_ref_camera)
     assert error.translation < 0.05
     assert error.rotation_deg < 3
-    assert "no focal length is known, that of the map's images is assumed" in err
+    assert "focal length unknown, assumed to be that of the map's images" in err
 
 
 @pytest.mark.parametrize("option", [["--no-landmarks"], ["--method", "inerf-lm", "--start", "start.json"]])
@@ -83,6 +84,20 @@ def test_a_wrong_focal_length_from_the_photo_gives_way_to_that_of_the_map(photo:
     assert found.converged
     assert found.focal_factor == pytest.approx(1 / factor, rel=0.01)
     assert pose_error(found.T_world_camera, unseen().T_ref_camera).translation < 0.02
+
+
+def test_a_portrait_photo_in_a_map_of_landscape_ones_has_their_camera() -> None:
+    rgb = torch.rot90(unseen().frame.rgb, 1, (0, 1)).contiguous()
+    camera = Intrinsics.from_focal(1.2 * CAMERA.fx, CAMERA.height, CAMERA.width)
+    frame = Frame("portrait", rgb, camera, focal_is_approximate=True)
+    found = Localizer(replace(textured_map(surface=True), landmarks=landmarks_of(CAMERA)))(frame)
+    assert found.converged
+    assert found.intrinsics is not None
+    assert found.intrinsics.fx == CAMERA.fx
+    turn = SE3.exp(torch.tensor([0, 0, 0, 0, 0, math.pi / 2], dtype=torch.float64))
+    error = pose_error(found.T_world_camera, unseen().T_ref_camera @ turn)
+    assert error.translation < 0.02
+    assert error.rotation_deg < 1
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.15])

@@ -146,8 +146,12 @@ class _Step:
     def __init__(self, tracker: Tracker, path: TrackedPath, depth: bool, video: TrackingVideo | None) -> None:
         self.tracker, self.path, self._depth, self._video = tracker, path, depth, video
         self._lost_at: int | None = None
+        self._cameras: set[str] = set()  # where those of the frames come from, as far as it was said
 
     def __call__(self, frame: Frame, time: float | None, truth: SE3 | None = None) -> Localization:
+        if frame.camera_source and frame.camera_source not in self._cameras:
+            self._cameras.add(frame.camera_source)
+            say(f"{frame.name}: {frame.camera_source}")
         found = self.tracker(frame if self._depth else replace(frame, depth=None), time)
         self.path.add(frame, time, found, truth)
         if self._video is not None:

@@ -118,11 +118,12 @@ def _with_camera_judged(
 
 
 def _other_camera(problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose) -> Intrinsics:
-    """Return those of the given intrinsics and the map's that were not taken."""
-    given = problem.views[-1].frame.intrinsics
-    near = Calibration(*found.miscalibration.alternative.tolist())
-    camera = None if found.takes_map_camera else map_camera(given, matcher.landmarks.cameras, near=near)
-    return given if camera is None else camera.intrinsics
+    """Return the intrinsics that were not taken: the given ones, the fitted ones where those are approximate, or the map's."""
+    frame, other = problem.views[-1].frame, Calibration(*found.miscalibration.alternative.tolist())
+    if found.intrinsics is not None:
+        return other.applied(found.intrinsics) if frame.focal_is_approximate else frame.intrinsics
+    camera = map_camera(frame.intrinsics, matcher.landmarks.cameras, near=other)
+    return frame.intrinsics if camera is None else camera.intrinsics
 
 
 def _log_odds_of(

@@ -47,7 +47,7 @@ class LandmarkQuery:
         given = {image.intrinsics for image in self.images}
         if len(given) > 1:
             return None
-        return map_camera(given.pop(), self.landmarks.cameras, parts=self.prior.log_focal > 0, near=estimated)
+        return map_camera(given.pop(), self.landmarks.cameras, crops=self.prior.log_focal > 0, near=estimated)
 
     def seen_by(self, cameras: Sequence[Intrinsics]) -> LandmarkQuery:
         """Return the query with other intrinsics for each of its images."""

@@ -7,7 +7,6 @@ manufacturer does. The map was fitted to the intrinsics of its own images, so th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -15,7 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics, same_aspect
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera_shapes import cameras_at_size, stretched_cameras
 from bidnerf_core.mapping.calibration import (
     CALIBRATED,
     GIVEN,
@@ -92,32 +92,27 @@ class MapCamera:
 
 
 def map_camera(
-    given: Intrinsics, cameras: tuple[Intrinsics, ...], parts: bool = False, near: Calibration = GIVEN
+    given: Intrinsics, cameras: tuple[Intrinsics, ...], crops: bool = False, near: Calibration = GIVEN
 ) -> MapCamera | None:
     """Return the camera of a map's images of the same shape as those with the ``given`` intrinsics; None if there are none.
 
     It is the one that the given intrinsics agree with or, if that took hardly any of the images, that with the median focal
-    length. None as well if its lens is so different that ``Calibration`` cannot describe the difference. With ``parts``, an image
-    of another shape is compared with the largest parts of the map's images that have its shape.
+    length. None as well if its lens is so different that ``Calibration`` cannot describe the difference.
 
-    If all the map's images lie and this one stands, or the reverse, its camera was turned to one side or the other: to that
-    with the principal point nearest to a correction ``near`` the right one.
+    A camera that took landscape images alone is turned for a portrait one, to the side that puts its principal point nearest to that of the
+    correction ``near``. With ``crops``, an image of a shape that the map does not have is compared with centre crops of the map's images.
     """
-    ways = [each.turned_like(given.width, given.height) for each in cameras]
-    ways = [way for way in ways if len(way) == 1] or [way for way in ways if way]
-    known = [_camera_among(given, turned, parts) for turned in zip(*ways, strict=True)]
+    groups = cameras_at_size(cameras, given.width, given.height, crops)
+    known = [_camera_among(given, group) for group in groups]
     shift = torch.tensor([near.shift_u, near.shift_v], dtype=torch.float64)
     found = [camera for camera in known if camera is not None]
     return min(found, key=lambda camera: float((camera.correction[1:3] - shift).norm()), default=None)
 
 
 @lru_cache(maxsize=64)
-def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...], parts: bool) -> MapCamera | None:
-    """Return the camera of images that lie or stand as those with the ``given`` intrinsics."""
-    size = (given.width, given.height)
-    alike = [camera.resized(*size) for camera in cameras if same_aspect((camera.width, camera.height), size)]
-    if parts and not alike:
-        alike = [camera.largest_part(*size) for camera in cameras]
+def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera | None:
+    """Return the one of ``cameras``, all of images of one size, that ``map_camera`` describes."""
+    alike = list(cameras)
     agreeing = [camera for camera in alike if _agree(given, camera)]
     if len(agreeing) > UNUSUAL * len(alike):
         alike = agreeing[:1]
@@ -147,16 +142,9 @@ def camera_like(
         return abs(across + down) / 2, abs(across - down), shift
 
     limits = (max(ALIKE.log_focal, 2 * log_focal_deviation), ALIKE_SHAPES, ALIKE.shift)
-    resized = resized_cameras(cameras, fitted)
+    resized = [c for group in stretched_cameras(cameras, fitted.width, fitted.height) for c in group]
     alike = [c for c in resized if all(x <= y for x, y in zip(differences(c), limits, strict=True))]
     return min(alike, key=differences, default=None)
-
-
-def resized_cameras(cameras: Sequence[Intrinsics], image: Intrinsics) -> list[Intrinsics]:
-    """Return the different cameras of a map's images, resized to the size of an image whatever its shape, by focal length."""
-    size = (image.width, image.height)
-    found = {camera.resized(*size) for each in cameras for camera in each.turned_like(*size)}
-    return sorted(found, key=lambda c: c.fx)
 
 
 def _agree(a: Intrinsics, b: Intrinsics) -> bool:

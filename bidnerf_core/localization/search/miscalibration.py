@@ -159,8 +159,11 @@ def taken_intrinsics(
     if camera is None:
         return TakenIntrinsics()
     if approximate:
-        likely = probability_beside_approximate(free, landmarks, camera) > LIKELY
-        return TakenIntrinsics(camera.calibration, camera) if likely else TakenIntrinsics()
+        probability = probability_beside_approximate(free, landmarks, camera, other_log_odds)
+        if probability <= LIKELY:
+            return TakenIntrinsics()
+        fitted = Calibration(*(_as_tensor(free.calibration) - camera.correction).tolist())
+        return TakenIntrinsics(camera.calibration, camera, fitted, 1 - probability)
     if not bool(camera.differs.any()):
         return TakenIntrinsics(as_map=camera.is_near(CALIBRATED))
     if not camera.is_near(OTHER_CAMERA):
@@ -187,7 +190,9 @@ def probability_of_map_camera(
     return float(torch.tensor(evidence + camera.log_odds + other_log_odds, dtype=torch.float64).sigmoid())
 
 
-def probability_beside_approximate(free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera) -> float:
+def probability_beside_approximate(
+    free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera, other_log_odds: float = 0.0
+) -> float:
     """Return the same probability where the given focal length is approximate, so that only the image tells it."""
     if not camera.is_near(NOMINAL):
         return 0.0
@@ -196,7 +201,7 @@ def probability_beside_approximate(free: ReprojectionFit, landmarks: LandmarkMap
     by_any = -0.5 * (value.square() / total + total.log())
     # The other parameters hardly tell cameras apart.
     evidence = (_log_density_by(camera, value, noise) - by_any)[0]
-    return float((evidence + SAME_LOG_ODDS).sigmoid())
+    return float((evidence + SAME_LOG_ODDS + other_log_odds).sigmoid())
 
 
 def _log_density_by(

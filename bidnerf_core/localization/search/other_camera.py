@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera_shapes import median_camera, stretched_cameras
 from bidnerf_core.localization.search.camera_fit import FURTHER, MORE, SUSPECTED, CameraFit, told_apart
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import LEAST_GUIDED_MATCHES, refined_pose
@@ -18,7 +19,6 @@ from bidnerf_core.localization.search.map_camera import (
     OTHER_CAMERA,
     camera_like,
     correction_between,
-    resized_cameras,
 )
 from bidnerf_core.localization.search.ransac import Hypothesis, sample_consensus
 from bidnerf_core.localization.search.stopwatch import Stopwatch
@@ -89,16 +89,17 @@ def _sampled_with_map_camera(
 ) -> LandmarkPose | None:
     """Return the pose by minimal samples with the map's intrinsics, resized to the image whatever its shape, if far more agree."""
     given = query.images[-1].intrinsics
-    resized = resized_cameras(query.landmarks.cameras, given)
-    camera = resized[(len(resized) - 1) // 2] if resized else given
-    if camera == given:
-        return None
-    data = query.seen_by([camera] * len(query.images)).observed(matches)
-    first = sample_consensus(data, matches.view, query.threshold, seed=0)
-    enough = MORE * found.agreeing + FURTHER
-    if first is None or int(first.inliers.sum()) < enough:
-        return None
-    return _with_map_camera(query, matches, camera, first, enough, clock)
+    groups = stretched_cameras(query.landmarks.cameras, given.width, given.height)
+    best, enough = None, MORE * found.agreeing + FURTHER
+    for camera in dict.fromkeys(median_camera(group) for group in groups):
+        if camera == given:
+            continue
+        data = query.seen_by([camera] * len(query.images)).observed(matches)
+        first = sample_consensus(data, matches.view, query.threshold, seed=0)
+        agreeing = 0 if first is None else int(first.inliers.sum())
+        if first is not None and agreeing >= (enough if best is None else best[2]):
+            best = (camera, first, agreeing)
+    return None if best is None else _with_map_camera(query, matches, best[0], best[1], enough, clock)
 
 
 def _with_map_camera(

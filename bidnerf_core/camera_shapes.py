@@ -1,0 +1,56 @@
+"""The cameras of a map's images as cameras of images with another size: portrait instead of landscape, cropped, or stretched."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from bidnerf_core.camera import Intrinsics, same_aspect
+
+CameraGroup = tuple[Intrinsics, ...]
+"""Cameras that were all turned to the same side, if they were turned at all."""
+
+
+@lru_cache(maxsize=64)
+def cameras_at_size(
+    cameras: CameraGroup, width: int, height: int, crops: bool = False
+) -> tuple[CameraGroup, ...]:
+    """Return the ``cameras`` of images with the shape of another size, resized to it.
+
+    If there are none, those of images with that shape after a quarter turn are returned: turned to one side, and to the other.
+    With ``crops``, the last resort are centre crops of all images. Raises nothing: there may be no group.
+    """
+    size = (width, height)
+    same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
+    if same:
+        return (same,)
+    turned = [c.quarter_turns() for c in cameras if same_aspect((c.height, c.width), size)]
+    sides = zip(*filter(None, turned), strict=True)
+    found = tuple(tuple(camera.resized(*size) for camera in side) for side in sides)
+    if found or not crops:
+        return found
+    return tuple(tuple(c.centre_crop(*size) for c in group) for group in _oriented(cameras, *size))
+
+
+@lru_cache(maxsize=64)
+def stretched_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
+    """Return all ``cameras``, resized to another size whatever their shape; landscape ones are turned for a portrait size, to either side."""
+    return tuple(
+        tuple(dict.fromkeys(camera.resized(width, height) for camera in group))
+        for group in _oriented(cameras, width, height)
+    )
+
+
+def median_camera(group: CameraGroup) -> Intrinsics:
+    """Return the camera with the median focal length, the lower one of two."""
+    return sorted(group, key=lambda camera: camera.fx)[(len(group) - 1) // 2]
+
+
+def _oriented(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
+    """Return the cameras as those of landscape or portrait images, as another size is: one group, or two if any had to be turned."""
+    ways = [
+        (camera,) if (camera.width - camera.height) * (width - height) >= 0 else camera.quarter_turns()
+        for camera in cameras
+    ]
+    ways = [way for way in ways if way]
+    sides = max(map(len, ways), default=0)
+    return tuple(tuple(way[side % len(way)] for way in ways) for side in range(sides))
