@@ -337,7 +337,7 @@ def test_intrinsics_that_are_also_the_maps_are_mistaken_less_often(landmarks: La
             "a focal length 5.1% longer, a principal point 10.0% of the focal length further left and a principal point 2.0% of"
             " the focal length further down than given",
         ),
-        (Calibration(log_focal=0.001, radial=0.001), "hardly other than given"),
+        (Calibration(log_focal=0.001, radial=0.001), "nearly the same as given"),
     ],
 )
 def test_a_correction_reads_as_words(correction: Calibration, words: str) -> None:

@@ -56,7 +56,9 @@ class Calibration:
     def sentence(self) -> str:
         """The considerable parts of the correction, in words."""
         return (
-            f"{enumeration(self.considerable)} than given" if self.considerable else "hardly other than given"
+            f"{enumeration(self.considerable)} than given"
+            if self.considerable
+            else "nearly the same as given"
         )
 
     @property
