@@ -152,9 +152,10 @@ def open_sequence(
     """Open the frames of ``path`` in the order of time: a dataset, a folder of images, or a video. None is read yet.
 
     Images and videos have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in
-    ``Frame.open``; images without them that of their EXIF, or else one like the ``assumed`` cameras, and videos the latter. Datasets have their own, but for those of which ``open_dataset``
-    takes one. ``register_depth`` is as in ``open_dataset``; depth beside images is registered where a sensor is given. Raises
-    ``InputError`` where nothing is found, where a description is not usable, and for a camera that is missing or one too many.
+    ``Frame.open``. Without them, images have that of their EXIF; those without a focal length, and videos, one of the ``assumed``
+    cameras. Datasets have their own, but for those of which ``open_dataset`` takes one. ``register_depth`` is as in
+    ``open_dataset``; depth beside images is registered where a sensor is given. Raises ``InputError`` where nothing is found,
+    where a description is not usable, and for a camera that is missing or one too many.
     """
     place, given = Path(path), GivenCamera(camera, focal, hfov, assumed=tuple(assumed))
     if not place.exists():

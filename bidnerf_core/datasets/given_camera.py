@@ -55,7 +55,10 @@ class GivenCamera:
     def read(
         self, image: Path, depth: Path | None, depth_unit: float | None, background: Background
     ) -> Frame:
-        """Read an image and its depth, upright; without a camera, that of EXIF, or else an assumed one, is taken. Raises ``InputError`` as ``Frame.open``."""
+        """Read an image and its depth, upright. Without a camera, that of EXIF is taken, or else an assumed one.
+
+        Raises ``InputError`` as ``Frame.open`` does.
+        """
         apart = self.sensor is not None and depth is not None
         frame = Frame.open(
             image, depth=None if apart else depth, depth_unit=depth_unit, camera=self.camera, focal=self.focal,

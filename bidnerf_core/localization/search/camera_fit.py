@@ -83,8 +83,8 @@ def better_camera(
     if not 0 < before < unsuspected * len(data):
         return None
     fits = [_fitted(here, start, limit)]
-    if fits[0][1] < enough:
-        fits += _from_sample(data, limit)
+    if fits[0][1] < enough and (sampled := _from_sample(data, limit)) is not None:
+        fits.append(sampled)
     if before < SUSPECTED * len(data) and max(support for _, support in fits) < enough:
         fits.append(_from_far(data, T_world_rig, calibration, limit))
     found, best = max(fits, key=lambda fit: fit[1])
@@ -110,19 +110,19 @@ def _fitted(
     return CameraFit(project.pose(found), stretch, corrected, within), project.support(found, limit)
 
 
-def _from_sample(data: ObservedPoints, limit: float) -> list[tuple[CameraFit, float]]:
-    """Return the fit from the best minimal sample of the matches, whose focal length is free; none if there is no sample.
+def _from_sample(data: ObservedPoints, limit: float) -> tuple[CameraFit, float] | None:
+    """Return the fit from the best minimal sample of the matches, whose focal length is free.
 
-    Images of several cameras have no such samples.
+    None if there is no sample, and for several views, whose matches are not of one pinhole.
     """
     parts = (data.translation, data.rotation, data.focal)
     if not all(bool((part == part[0]).all()) for part in parts):
-        return []
+        return None
     sampled = focal_consensus(data, limit, seed=0, most_draws=FEW_DRAWS)
     if sampled is None:
-        return []
+        return None
     project = _Projection(data, sampled.T_world_rig, 0.0)
-    return [_fitted(project, _unknowns(sampled.calibration), limit, FIT_SCALES[-1:])]
+    return _fitted(project, _unknowns(sampled.calibration), limit, FIT_SCALES[-1:])
 
 
 def _from_far(
