@@ -188,14 +188,19 @@ def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> 
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource | None:
-    """Return a camera with the focal length of those of the ``cameras`` whose images have the same shape, or else of their centre crops."""
+    """Return the one of the ``cameras`` with the median focal length, of those whose images have the same shape or else of their crops.
+
+    If it is not known to which side it was turned, only its focal length is taken.
+    """
     size = raster.upright_size
     groups = cameras_at_size(tuple(cameras), *size, crops=True)
     if not groups:
         return None
-    likely = median_camera(groups[0])
-    camera = Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size)
-    return _described(camera, "focal length unknown, assumed to be that of the map's images")
+    likely, *others = (median_camera(group) for group in groups)
+    origin = "camera unknown, assumed to be that of the map's images"
+    if not others:
+        return CameraSource(likely, f"{origin}: {_focal(likely)}")
+    return _described(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)
 
 
 def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> CameraSource:

@@ -50,7 +50,7 @@ def test_the_command_finds_the_pose(bidnerf: Run, photo: Path, monkeypatch: pyte
     error = pose_error(SE3.from_matrix(torch.tensor(answer["T_world_camera"])), unseen().T_ref_camera)
     assert error.translation < 0.05
     assert error.rotation_deg < 3
-    assert "focal length unknown, assumed to be that of the map's images" in err
+    assert "camera unknown, assumed to be that of the map's images" in err
 
 
 @pytest.mark.parametrize("option", [["--no-landmarks"], ["--method", "inerf-lm", "--start", "start.json"]])

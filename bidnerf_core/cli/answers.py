@@ -150,7 +150,7 @@ class Answers:
         WRITERS[_ending(out)](out, accepted)
         left_out = self._total - len(accepted)
         if left_out:
-            say(f"{out}: {amount(len(accepted), 'pose')}; {left_out} that did not converge are left out")
+            say(f"{out}: {amount(len(accepted), 'pose')}; {left_out} without an accepted pose are left out")
 
 
 def _ending(path: Path) -> str:

@@ -83,7 +83,9 @@ class TrackedPath:
             return
         write_poses(out, [frame.posed for frame in self.accepted])
         if left_out := len(self.frames) - len(self.accepted):
-            say(f"{out}: {amount(len(self.accepted), 'pose')}; {left_out} that did not converge are left out")
+            say(
+                f"{out}: {amount(len(self.accepted), 'pose')}; {left_out} without an accepted pose are left out"
+            )
 
     def plot(self, file: Path, surface: SurfaceMap | None) -> None:
         """Draw the path. Raises ``InputError`` without matplotlib or without any frame."""

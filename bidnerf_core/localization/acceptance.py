@@ -187,7 +187,9 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     with_others = ""
     if found.takes_map_camera or found.estimates_calibration:
         whose = "the map's" if found.takes_map_camera else "estimated"
-        with_others = f", with {whose} intrinsics: {found.camera_sentence}"
+        with_others = f", with {whose} intrinsics" + (
+            f": {found.camera_sentence}" if found.changes_camera else ""
+        )
     return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{with_others}")
 
 

@@ -155,21 +155,24 @@ def fused_answer(
     """
     diagnostics = landmark_diagnostics(found, searched)
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.stated_covariance, diagnostics)
+    approximate = any(view.frame.focal_is_approximate for view in problem.views)
     if not verdict.accepted or found.estimates_calibration:
-        return _judged(answer)  # the other terms would need intrinsics as exact as the landmarks'
+        if problem.has_depth and found.estimates_calibration:
+            answer = replace(answer, left_out="depth, which needs known intrinsics")
+        return _judged(answer, approximate)  # rendering would need intrinsics as exact as the landmarks' too
     problem = corrected(problem, found)
     generator, points = Generator().manual_seed(seed), None
     if problem.surface is not None and problem.has_depth:
         points = _cost_of_points(problem, problem.surface, generator)
         diagnostics = landmark_diagnostics(found, searched, points, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
-    answer = _judged(answer)
+    answer = _judged(answer, approximate)
     return _fused(problem, answer, points, rays if is_sharp(problem) else 0, generator)
 
 
-def _judged(answer: LandmarkAnswer) -> LandmarkAnswer:
+def _judged(answer: LandmarkAnswer, approximate: bool) -> LandmarkAnswer:
     """Return the answer with its confidence, which can turn its verdict into a rejection."""
-    judgement = judged(answer.verdict, answer.diagnostics)
+    judgement = judged(answer.verdict, answer.diagnostics, approximate)
     return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
 
 

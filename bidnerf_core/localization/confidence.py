@@ -18,7 +18,9 @@ from bidnerf_core.localization.result import Outcome, Verdict
 ACCEPTED = 0.8
 """Least confidence with which a pose is accepted."""
 ACCEPTED_ESTIMATED = 0.6
-"""Least confidence of a pose whose intrinsics were estimated along, which takes evidence of its own that the model does not count."""
+"""Least confidence of a pose whose intrinsics were estimated along because landmarks contradict the given ones: that takes evidence of its
+own, which the model does not count.
+"""
 TRUSTED = 0.95
 """Confidence from which on a pose by landmarks needs no further measurements to be trusted."""
 
@@ -45,13 +47,19 @@ class LogisticModel:
         return 1 / (1 + math.exp(-max(-500.0, min(500.0, odds))))
 
 
-def judged(verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> Judgement:
-    """Return the confidence in a pose, and the verdict, which it can turn into a rejection."""
+def judged(
+    verdict: Verdict, diagnostics: LandmarkDiagnostics | SurfaceDiagnostics, approximate: bool = False
+) -> Judgement:
+    """Return the confidence in a pose, and the verdict, which it can turn into a rejection.
+
+    ``approximate``: whether the focal length was given as such, so that it was estimated whatever landmarks say.
+    """
     value = confidence(diagnostics)
     estimated = isinstance(diagnostics, LandmarkDiagnostics) and diagnostics.estimated_calibration
-    least = ACCEPTED_ESTIMATED if estimated else ACCEPTED
+    least = ACCEPTED_ESTIMATED if estimated and not approximate else ACCEPTED
     if value is not None and verdict.accepted and value < least:
-        verdict = Verdict(Outcome.UNCERTAIN, f"only {value:.0%} likely to be right; {verdict.reason}")
+        percent = math.floor(100 * value)
+        verdict = Verdict(Outcome.UNCERTAIN, f"only {percent}% likely to be right; {verdict.reason}")
     return Judgement(verdict, value)
 
 

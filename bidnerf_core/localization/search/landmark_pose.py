@@ -97,6 +97,11 @@ class LandmarkPose:
         return self.stretch.sentence(self.calibration)
 
     @property
+    def changes_camera(self) -> bool:
+        """Whether the camera differs from the given one by more than errors of a good calibration."""
+        return bool(self.calibration.considerable) or self.stretch != UNSTRETCHED
+
+    @property
     def estimates_calibration(self) -> bool:
         """Whether the calibration was estimated with the pose."""
         return bool((self.calibration_deviations > 0).any())

@@ -93,8 +93,11 @@ def confirm(
     clock.lap("refinement")
     if answer is None:
         return Confirmation(None, visible, matches, chance)
+    pose = described(query, answer.correspondences, answer, clock.seconds)
+    # Matches that were not sought near the pose are the evidence for it, and tell another camera.
     unguided = unguided_matches(query.images, matcher, STRONGEST)
-    pose = described(query, unguided, answer, clock.seconds)
+    evidence = described(query, unguided, answer, clock.seconds)
+    pose = replace(pose, log10_nfa=evidence.log10_nfa, undecided=evidence.undecided)
     clock.lap("assessment")
     return Confirmation(pose, visible, matches, chance)
 

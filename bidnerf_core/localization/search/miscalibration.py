@@ -61,7 +61,7 @@ class TakenIntrinsics:
     camera: MapCamera | None = None  # the map's, if it is taken
     alternative: Calibration = GIVEN  # correction of those taken
     probability: float = 0.0  # that the alternative is right
-    as_map: bool = False  # whether the given intrinsics are those of the map's images
+    as_map: bool = False  # whether those taken are those of the map's images, and no others were given
 
     @property
     def log_odds_of_mistake(self) -> float:
@@ -163,7 +163,7 @@ def taken_intrinsics(
         if probability <= LIKELY:
             return TakenIntrinsics()
         fitted = Calibration(*(_as_tensor(free.calibration) - camera.correction).tolist())
-        return TakenIntrinsics(camera.calibration, camera, fitted, 1 - probability)
+        return TakenIntrinsics(camera.calibration, camera, fitted, 1 - probability, as_map=True)
     if not bool(camera.differs.any()):
         return TakenIntrinsics(as_map=camera.is_near(CALIBRATED))
     if not camera.is_near(OTHER_CAMERA):
