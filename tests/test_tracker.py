@@ -300,7 +300,10 @@ def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
     frames = flight()[:4]
     off = replace(frames[0][1].intrinsics, fx=1.06 * 130, fy=1.06 * 130)
     known = [(t, replace(f, depth=None, intrinsics=off, focal_is_approximate=True), T) for t, f, T in frames]
-    tracker = Tracker(localizer())
+    scene = textured_map(surface=True)
+    assert scene.landmarks is not None
+    recognised = replace(scene, landmarks=replace(scene.landmarks, cameras=(CAMERA,)))
+    tracker = Tracker(Localizer(recognised))  # colours alone do not confirm an approximate focal length
     tracker._state = replace(tracker._state, camera=CorrectedCamera(off, CAMERA, True))
     answers = tracked(known, tracker)
     assert_right(answers, known)

@@ -16,7 +16,7 @@ NO = "no"
 
 one_camera = tyro.conf.create_mutex_group(
     required=False,
-    title="camera of images whose format has none (default: from EXIF, or like that of the map's images)",
+    title="camera of images whose format has none (default: from EXIF or the map)",
 )
 CameraFile = Annotated[
     Path | None,
