@@ -193,11 +193,12 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource | No
     If it is not known to which side it was turned, only its focal length is taken.
     """
     size = raster.upright_size
-    groups = cameras_at_size(tuple(cameras), *size, crops=True)
+    whole = cameras_at_size(tuple(cameras), *size)
+    groups = whole or cameras_at_size(tuple(cameras), *size, crops=True)
     if not groups:
         return None
     likely, *others = (median_camera(group) for group in groups)
-    origin = "camera unknown, assumed to be that of the map's images"
+    origin = f"camera unknown, assumed to be that of {'' if whole else 'centre crops of '}the map's images"
     if not others:
         return CameraSource(likely, f"{origin}: {_focal(likely)}")
     return _described(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)

@@ -83,6 +83,7 @@ def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assume
         assert "assumed to be that of the map's images" in source.description
     square = find_camera("a.jpg", Raster(250, 250, UPRIGHT), Exif(), assumed=[small])
     assert square.intrinsics == Intrinsics.from_focal(300 * 250 / 300, 250, 250)
+    assert "assumed to be that of centre crops of the map's images" in square.description
     assert find_camera("a.jpg", PHOTO, Exif(equivalent_mm=26), assumed=[small]).intrinsics == found(
         Exif(equivalent_mm=26)
     )

@@ -334,8 +334,8 @@ def test_intrinsics_that_are_also_the_maps_are_mistaken_less_often(landmarks: La
         (Calibration(radial=-0.03), "a radial distortion 0.030 lower than given"),
         (
             Calibration(log_focal=0.05, shift_u=-0.1, shift_v=0.02),
-            "a focal length 5.1% longer, a principal point 10.0% of the focal length further left and a principal point 2.0% of"
-            " the focal length further down than given",
+            "a focal length 5.1% longer and a principal point 10.0% of the focal length further left and 2.0% of the focal"
+            " length further down than given",
         ),
         (Calibration(log_focal=0.001, radial=0.001), "nearly the same as given"),
     ],

@@ -12,6 +12,8 @@ from torch import Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.errors import enumeration
 
+PRINCIPAL_POINT = "a principal point "
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -65,7 +67,12 @@ class Calibration:
     def considerable(self) -> list[str]:
         """The parts of the correction that are larger than errors of a good calibration, in words."""
         sizes = torch.tensor(astuple(self), dtype=torch.float64).abs() / CALIBRATED.deviations
-        return [text for text, size in zip(self.parts, sizes.tolist(), strict=True) if size > 2]
+        large = (sizes > 2).tolist()
+        found = [text for text, is_large in zip(self.parts, large, strict=True) if is_large]
+        if large[1] and large[2]:  # one principal point
+            down = found.pop(found.index(self.parts[2]))
+            found[found.index(self.parts[1])] += f" and {down.removeprefix(PRINCIPAL_POINT)}"
+        return found
 
     @property
     def parts(self) -> tuple[str, str, str, str]:
@@ -81,8 +88,8 @@ class Calibration:
         )
         return (
             f"a focal length {abs(self.focal_factor - 1):.1%} {longer}",
-            f"a principal point {abs(self.shift_u):.1%} of the focal length further {right}",
-            f"a principal point {abs(self.shift_v):.1%} of the focal length further {down}",
+            f"{PRINCIPAL_POINT}{abs(self.shift_u):.1%} of the focal length further {right}",
+            f"{PRINCIPAL_POINT}{abs(self.shift_v):.1%} of the focal length further {down}",
             f"a radial distortion {abs(self.radial):.3f} {higher}",
         )
 
