@@ -14,6 +14,7 @@ import torch
 import bidnerf_core.cli.localize as localize_module
 from bidnerf_core import Frame, Intrinsics, Localizer
 from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map, MapInfo
@@ -106,7 +107,16 @@ def test_colours_alone_do_not_tell_an_approximate_focal_length(photo: Path, fact
     frame = Frame.open(photo, assumed=[replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)])
     for known in (landmarks_of(), None):
         assert not Localizer(replace(textured_map(surface=True), landmarks=known))(frame).converged
-    known_focal = replace(frame, focal_is_approximate=False)
-    assert (
-        factor != 1 or Localizer(replace(textured_map(surface=True), landmarks=None))(known_focal).converged
-    )
+
+
+@pytest.mark.parametrize("sigma", [2.0, 3.5])
+def test_nor_do_those_of_a_blurred_photo(sigma: float) -> None:
+    blurred = faulty(unseen(), f"blur:{sigma}", 0).frame
+    camera = replace(CAMERA, fx=CAMERA.fx * 1.1, fy=CAMERA.fy * 1.1)
+    frame = replace(blurred, depth=None, intrinsics=camera, focal_is_approximate=True)
+    assert not Localizer(replace(textured_map(surface=True), landmarks=None))(frame).converged
+
+
+def test_colours_alone_suffice_with_a_known_focal_length(photo: Path) -> None:
+    frame = Frame.open(photo, camera=CAMERA)
+    assert Localizer(replace(textured_map(surface=True), landmarks=None))(frame).converged
