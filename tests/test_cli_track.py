@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import re
+import shutil
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -103,6 +105,52 @@ def test_images_without_a_focal_length_begin_with_the_camera_of_the_map(
     for row, (_, _, T) in zip(json.loads((tmp_path / "path.json").read_text()), flight()[:3], strict=True):
         assert row["converged"]
         assert np.linalg.norm(np.array(row["T_world_camera"])[:3, 3] - T.translation.numpy()) < 0.05
+
+
+def test_a_file_that_cannot_be_read_is_left_out(bidnerf: Run, tmp_path: Path) -> None:
+    """The poses of the others keep their numbers, which stand for times where a sequence has none."""
+    broken = tmp_path / "data"
+    named = [View(replace(f, name=f"at{n}", depth=None), T) for n, (_, f, T) in enumerate(flight()[:FRAMES])]
+    write_transforms(broken, {"test": named}, (0.0, 0.0, 0.0))
+    images = sorted(broken.rglob("*.png"))
+    assert len(images) == FRAMES
+    images[2].write_bytes(images[2].read_bytes()[:200])
+    status, out, err = bidnerf("track", "MAP", broken, "--out", tmp_path / "path.txt")
+    assert status == 0, err
+    assert str(images[2]) in err
+    assert "; left out" in err
+    assert re.search(r"not read +1 frame\b", out)
+    assert read_trajectory(tmp_path / "path.txt").times.tolist() == [0, 1, 3, 4, 5]
+    status, _, err = bidnerf("track", "MAP", broken, "--out", tmp_path / "path.txt", "--every", "2")
+    assert status == 0, err
+    assert read_trajectory(tmp_path / "path.txt").times.tolist() == [0, 4]
+
+
+def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None:
+    named = [View(replace(f, depth=None), T) for _, f, T in flight()[:4]]
+    write_transforms(tmp_path / "data", {"train": named[:1], "test": named[1:]}, (0.0, 0.0, 0.0))
+    track = ("track", "MAP", tmp_path / "data", "--out", tmp_path / "path.json", "--split")
+    status, _, err = bidnerf(*track, "test")
+    assert status == 0, err
+    assert len(json.loads((tmp_path / "path.json").read_text())) == 3
+    status, _, err = bidnerf(*track, "val")
+    assert status == 1
+    assert f"{tmp_path / 'data'}: no frame is of a split 'val', expected one of test, train" in err
+    assert bidnerf("track", "MAP", tmp_path, "--follow", "--split", "test").status == 2
+
+
+def test_a_sequence_is_given_up_if_the_first_frames_cannot_be_read(
+    bidnerf: Run, data: Path, tmp_path: Path
+) -> None:
+    broken = tmp_path / "data"
+    shutil.copytree(data, broken)
+    for image in sorted(broken.rglob("*.png")):
+        image.write_bytes(b"")
+    status, _, err = bidnerf("track", "MAP", broken, "--out", tmp_path / "none.txt")
+    assert status == 1
+    assert err.count("left out") == 2
+    assert err.splitlines()[-1].startswith(f"bidnerf track: none of the first 3 frames can be read: {broken}")
+    assert not (tmp_path / "none.txt").exists()
 
 
 def test_json_holds_all_frames(bidnerf: Run, data: Path, tmp_path: Path) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sys
 import time as clocks
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
@@ -35,7 +37,7 @@ from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.cli.tracked_path import TrackedPath, check_out
 from bidnerf_core.cli.tracking_video import TrackingVideo, check_video
-from bidnerf_core.datasets import FrameSequence, given_sensor, open_sequence
+from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, given_sensor, open_sequence
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.plot_style import require_matplotlib
@@ -43,6 +45,9 @@ from bidnerf_core.frames import Frame
 from bidnerf_core.localization import AutoConfig, Localization, Localizer, Tracker, TrackerConfig
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
+
+TRIED = 3
+"""Number of frames of which none can be read at which a sequence is given up: what is wrong concerns all of them."""
 
 
 def run(arguments: list[str]) -> None:
@@ -79,6 +84,9 @@ def run(arguments: list[str]) -> None:
         register_depth: RegisterDepth = None,
         depth: Annotated[bool, option(None, "use the measured depth where there is any")] = True,
         depth_sensor: DepthSensorName = "unknown",
+        split: Annotated[
+            str | None, option("NAME", "take the frames of one split of a dataset only", "all")
+        ] = None,
         every: Annotated[int, option("N", "take every Nth frame only")] = 1,
         start: Annotated[
             Path | None, option("POSE.json", "file with a 4x4 T_world_camera of about the first frame", "")
@@ -99,6 +107,8 @@ def run(arguments: list[str]) -> None:
         the following ones are searched in the whole map. Where the sequence has true poses, a table compares them.
         """
         require("--every", every, 1)
+        if follow and split is not None:
+            raise UsageError("--split is for datasets, expected none with --follow")
         if out is None and not follow:
             raise UsageError("no --out, expected the name of a file of poses")
         if out is not None:
@@ -127,7 +137,7 @@ def run(arguments: list[str]) -> None:
                         sequence, camera=camera, focal=focal, hfov=hfov, assumed=assumed,
                         background=stored.bounds.background, register_depth=registration,
                     )  # fmt: skip
-                    _track(frames, step, every)
+                    _track(frames if split is None else _of_split(frames, split), step, every)
         finally:  # Ctrl-C included: what there is, is written whole
             seconds = clocks.perf_counter() - began
             if out is not None and path.frames:
@@ -148,34 +158,59 @@ class _Step:
         self._lost_at: int | None = None
         self._cameras: set[str] = set()  # where those of the frames come from, as far as it was said
 
-    def __call__(self, frame: Frame, time: float | None, truth: SE3 | None = None) -> Localization:
+    def __call__(
+        self, frame: Frame, time: float | None, truth: SE3 | None = None, place: int | None = None
+    ) -> Localization:
         if frame.camera_source and frame.camera_source not in self._cameras:
             self._cameras.add(frame.camera_source)
             say(f"{frame.name}: {frame.camera_source}")
         found = self.tracker(frame if self._depth else replace(frame, depth=None), time)
-        self.path.add(frame, time, found, truth)
+        self.path.add(frame, time, found, truth, place)
         if self._video is not None:
             self._video.add(frame, time, found)
-        number = len(self.path.frames)
+        number, count = self.path.frames[-1].posed.number + 1, len(self.path.frames)
         if not found.converged and self._lost_at is None:
-            self._lost_at = number
+            self._lost_at = count
             say(f"frame {number} ({frame.name}): {found.outcome}: {found.reason}")
         elif found.converged and self._lost_at is not None:
             say(
-                f"frame {number} ({frame.name}): tracking again after {amount(number - self._lost_at, 'frame')}"
+                f"frame {number} ({frame.name}): tracking again after {amount(count - self._lost_at, 'frame')}"
             )
             self._lost_at = None
         return found
 
 
+def _of_split(frames: FrameSequence, split: str) -> FileSequence:
+    if not isinstance(frames, FileSequence):
+        raise InputError(f"{frames.path}: a video has no splits, expected none (--split {split})")
+    return frames.of_split(split)
+
+
 def _track(frames: FrameSequence, step: _Step, every: int) -> None:
+    """Track every n-th frame. One whose files cannot be read is named and left out, unless the first ones all are."""
     total = -(-len(frames) // every)
     with counted("tracking", "frames", total) as report:
-        for number, timed in enumerate(frames):
-            if number % every:
-                continue
-            step(timed.frame, timed.time, timed.truth)
-            report(number // every + 1, total)
+        for number, timed in enumerate(_chosen(frames, every)):
+            if isinstance(timed, TimedFrame):
+                step(timed.frame, timed.time, timed.truth, every * number)
+            elif not step.path.frames and number + 1 >= min(TRIED, total):
+                raise InputError(f"none of the first {amount(number + 1, 'frame')} can be read: {timed}")
+            else:
+                say(f"{timed}; left out")
+                step.path.unread += 1
+            report(number + 1, total)
+
+
+def _chosen(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:
+    """Read every n-th frame; where each has files of its own, those that cannot be read give an error."""
+    if not isinstance(frames, FileSequence):
+        yield from islice(frames, 0, None, every)
+        return
+    for place in range(0, len(frames), every):
+        try:
+            yield frames[place]
+        except InputError as error:
+            yield error
 
 
 def _follow(source: str, step: _Step, camera: GivenCamera, background: tuple[float, float, float]) -> None:

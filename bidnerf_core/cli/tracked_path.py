@@ -46,14 +46,23 @@ class TrackedPath:
 
     def __init__(self, map: MapInfo) -> None:
         self.frames: list[TrackedFrame] = []
+        self.unread = 0  # frames whose files could not be read
         self._backend = map.backend
         self._trained_on = {camera.name: camera.pose for camera in as_given(map.cameras)}
 
-    def add(self, frame: Frame, time: float | None, found: Localization, truth: SE3 | None = None) -> None:
+    def add(
+        self,
+        frame: Frame,
+        time: float | None,
+        found: Localization,
+        truth: SE3 | None = None,
+        number: int | None = None,
+    ) -> None:
+        """Keep an answer. ``number``: the place of the frame in its sequence; that after the last one by default."""
+        if number is None:
+            number = self.frames[-1].posed.number + 1 if self.frames else 0
         intrinsics = found.frame_as_taken(frame).intrinsics
-        posed = PosedImage(
-            frame.name, len(self.frames), intrinsics, found.T_world_camera, None, time, found.covariance
-        )
+        posed = PosedImage(frame.name, number, intrinsics, found.T_world_camera, None, time, found.covariance)
         # The path of each single search would make long sequences large.
         self.frames.append(TrackedFrame(posed, replace(found, poses=found.poses[-1:]), truth))
 
@@ -113,6 +122,8 @@ class TrackedPath:
         total, lost = len(self.frames), self.lost
         table.add_row("frames", f"{total}, {total / max(seconds, 1e-9):.1f} per second")
         table.add_row("tracked", f"{len(self.accepted)} ({len(self.accepted) / max(1, total):.1%})")
+        if self.unread:
+            table.add_row("not read", amount(self.unread, "frame"))
         longest = max((last - first + 1 for first, last in lost), default=0)
         table.add_row(
             "lost",

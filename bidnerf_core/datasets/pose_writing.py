@@ -32,7 +32,7 @@ class PosedImage:
     """An image with its camera and an estimated pose."""
 
     name: str
-    number: int  # among the images of the same run, from 0; it is the timestamp where names are not times
+    number: int  # among the images of the same run or sequence, from 0; it is the timestamp where names are not times
     intrinsics: Intrinsics  # of the upright image
     T_world_camera: SE3  # OpenCV axes
     file: Path | None = None

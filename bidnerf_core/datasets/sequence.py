@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Protocol, TypeAlias, overload, runtime_checkable
 
 from bidnerf_core.datasets.dataset import Dataset, unique_names
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame
 from bidnerf_core.photos import natural_order
 from bidnerf_core.se3 import SE3
@@ -87,6 +88,15 @@ class FileSequence:
     def times(self) -> list[float | None]:
         """The times of the frames (seconds); none is read."""
         return [entry.time for entry in self._entries]
+
+    def of_split(self, split: str) -> FileSequence:
+        """Return the frames of one split of a dataset. Raises ``InputError`` where none is of it."""
+        chosen = [entry for entry in self._entries if entry.split == split]
+        if not chosen:
+            known = ", ".join(sorted({entry.split for entry in self._entries if entry.split is not None}))
+            expected = f"expected one of {known}" if known else "as only those of a dataset with poses are"
+            raise InputError(f"{self._path}: no frame is of a split {split!r}, {expected}")
+        return FileSequence(self._path, chosen)
 
     def __len__(self) -> int:
         return len(self._entries)
