@@ -11,13 +11,11 @@ CameraGroup = tuple[Intrinsics, ...]
 
 
 @lru_cache(maxsize=64)
-def cameras_at_size(
-    cameras: CameraGroup, width: int, height: int, crops: bool = False
-) -> tuple[CameraGroup, ...]:
+def cameras_at_size(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
     """Return the ``cameras`` of images with the shape of another size, resized to it.
 
     If there are none, those of images with that shape after a quarter turn are returned: turned to one side, and to the other.
-    With ``crops``, the last resort are centre crops of all images. Raises nothing: there may be no group.
+    Empty if there are none either.
     """
     size = (width, height)
     same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
@@ -25,9 +23,16 @@ def cameras_at_size(
         return (same,)
     turned = [c.quarter_turns() for c in cameras if same_aspect((c.height, c.width), size)]
     sides = zip(*filter(None, turned), strict=True)
-    found = tuple(tuple(camera.resized(*size) for camera in side) for side in sides)
-    if found or not crops:
-        return found
+    return tuple(tuple(camera.resized(*size) for camera in side) for side in sides)
+
+
+@lru_cache(maxsize=64)
+def centre_crop_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
+    """Return all ``cameras``, cropped about the middle to the shape of another size and resized to it.
+
+    Landscape ones are turned for a portrait size, to either side, and the other way round.
+    """
+    size = (width, height)
     return tuple(tuple(c.centre_crop(*size) for c in group) for group in _oriented(cameras, *size))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bidnerf_core.camera import Intrinsics, same_aspect
 from bidnerf_core.camera_records import camera_record
-from bidnerf_core.camera_shapes import cameras_at_size, median_camera
+from bidnerf_core.camera_shapes import cameras_at_size, centre_crop_cameras, median_camera
 from bidnerf_core.errors import InputError
 from bidnerf_core.exif import Exif
 from bidnerf_core.files import read_file
@@ -194,7 +194,7 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource | No
     """
     size = raster.upright_size
     whole = cameras_at_size(tuple(cameras), *size)
-    groups = whole or cameras_at_size(tuple(cameras), *size, crops=True)
+    groups = whole or centre_crop_cameras(tuple(cameras), *size)
     if not groups:
         return None
     likely, *others = (median_camera(group) for group in groups)

@@ -67,6 +67,34 @@ def test_another_exposure_is_accepted_by_depth(gain: float) -> None:
     assert found.converged, found.reason
 
 
+def approximate(view: View) -> View:
+    return replace(view, frame=replace(view.frame, focal_is_approximate=True))
+
+
+def test_measured_points_do_not_tell_an_approximate_focal_length() -> None:
+    """A wrong one spreads them, for which a shifted pose partly makes up. The rays of a lidar do not depend on it."""
+    view = baked.unseen()[0]
+    found = found_for(baked.problem(approximate(view)))
+    assert found.outcome is Outcome.IMPRECISE
+    assert "the focal length is approximate" in found.reason
+    colour = approximate(colour_only(view))
+    lidar = rig(FieldMap(baked.FIELD, baked.BOUNDS, baked.toy()), [colour], None, in_camera(view))
+    assert found_for(lidar).converged
+
+
+def test_a_rejection_says_that_the_map_has_no_landmarks() -> None:
+    view = baked.unseen()[0]
+    noise = torch.rand(view.frame.rgb.shape, generator=torch.Generator().manual_seed(0))
+    blank = torch.full_like(noise, 0.5)
+    rejected = [
+        found_for(baked.problem(replace(view, frame=replace(view.frame, rgb=rgb, depth=None))))
+        for rgb in (noise, blank)
+    ]
+    assert not any(found.converged for found in rejected)
+    advice = "; the map has no landmarks ('bidnerf bake' makes them)"
+    assert [found.reason.endswith(advice) for found in rejected] == [True, False]
+
+
 def test_a_start_helps_where_the_map_has_no_view_alike() -> None:
     view = baked.unseen()[0]
     aside = replace(baked.toy(), keyframes=torch.eye(4, dtype=torch.float64)[None])

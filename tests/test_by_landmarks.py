@@ -408,7 +408,7 @@ def test_an_answer_of_the_surface_that_landmarks_contradict_is_not_accepted(
 ) -> None:
     """Whole images may look alike where no keypoint does."""
     monkeypatch.setattr(auto_module, "answer_by_landmarks", lambda *_: None)
-    monkeypatch.setattr(auto_module, "confirm", lambda *_: Confirmation(None, visible, matches, 8.0))
+    monkeypatch.setattr(auto_module, "confirm", lambda *_, **__: Confirmation(None, visible, matches, 8.0))
     localizer = Localizer(textured_map(surface=True), "auto", replace(QUICK, **settings))
     found = localizer(without_depth(unseen()).frame, start=TRUTH)
     assert found.outcome is expected

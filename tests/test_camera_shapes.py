@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.camera_shapes import cameras_at_size, median_camera, stretched_cameras
+from bidnerf_core.camera_shapes import cameras_at_size, centre_crop_cameras, median_camera, stretched_cameras
 from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.mapping.calibration import Calibration
 from bidnerf_core.orientation import QUARTER_TURNS
@@ -96,12 +96,12 @@ def test_single_images_of_another_shape_do_not_matter() -> None:
     turned = cameras_at_size((LANDSCAPE,), 480, 640)
     assert len(turned) == 2
     assert cameras_at_size((tall, LANDSCAPE, square), 480, 640) == turned
-    assert cameras_at_size((tall, LANDSCAPE, square), 480, 640, crops=True) == turned
     assert cameras_at_size((tall, square), 480, 640) == ()
-    assert cameras_at_size((tall, square), 480, 640, crops=True) == (
+    assert centre_crop_cameras((tall, square), 480, 640) == (
         (tall.centre_crop(480, 640), square.centre_crop(480, 640)),
     )
-    assert cameras_at_size((), 480, 640, crops=True) == stretched_cameras((), 480, 640) == ()
+    assert cameras_at_size((), 480, 640) == stretched_cameras((), 480, 640) == ()
+    assert centre_crop_cameras((), 480, 640) == ()
     both = stretched_cameras((tall, LANDSCAPE), 480, 640)
     assert [group[0] for group in both] == 2 * [tall.resized(480, 640)]
     assert [group[1] for group in both] == [group[0] for group in turned]

@@ -74,6 +74,12 @@ def test_the_nearest_piece_is_cut_out_along_its_edges() -> None:
     assert bool(inside[back[:, 1], back[:, 0]].all())
 
 
+def test_an_approximate_focal_length_is_no_better_known_behind_a_board() -> None:
+    view = behind_a_board(baked.unseen()[0])
+    assert found_for(view).converged
+    assert not found_for(replace(view, frame=replace(view.frame, focal_is_approximate=True))).converged
+
+
 @pytest.mark.parametrize(
     "depth",
     [

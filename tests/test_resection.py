@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import astuple, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.optimize import approx_fprime
 from bidnerf_core import SE3, Intrinsics
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import _Residuals, _State, resect
+from bidnerf_core.mapping.resection import _Residuals, _State, log_likelihood_ratio, resect
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
 FOCAL = 400.0
@@ -100,6 +101,37 @@ def test_the_slope_is_how_the_pose_follows_the_calibration() -> None:
         moved = resect(data, TRUE, 0.05, calibration=replace(GIVEN, **{name: step})).T_world_rig
         update = (TRUE.inverse() @ moved).log() / step
         torch.testing.assert_close(slope[:, i], update, rtol=0.05, atol=0.02)
+
+
+def test_fits_are_compared_by_how_likely_they_make_the_observations() -> None:
+    """Small residuals with Gaussian noise count by half the difference of their squares in standard deviations."""
+    data = observed(noise=0.5, calibration=WRONG)
+    free, fixed = (resect(data, NEAR, 2.0, prior) for prior in (NOMINAL, FIXED))
+    ratio = log_likelihood_ratio(data, free, fixed)
+    assert ratio > 50
+    assert log_likelihood_ratio(data, fixed, free) == pytest.approx(-ratio)
+    assert log_likelihood_ratio(data, free, fixed, correlation=4.0) == pytest.approx(ratio / 4)
+    assert log_likelihood_ratio(data, free, free) == 0
+    exact = resect(observed(), TRUE, 1.0)
+    near = replace(exact, T_world_rig=TRUE.retract(torch.full((6,), 1e-6, dtype=torch.float64)))
+    squares = observed().residuals(near.T_world_rig).square().sum() / exact.noise**2
+    assert log_likelihood_ratio(observed(), exact, near) == pytest.approx(0.5 * float(squares), rel=0.01)
+
+
+def test_fits_with_the_same_residuals_are_as_likely_whatever_the_errors_of_the_points() -> None:
+    """A frontal plane looks the same with a shorter focal length from nearer by, where the points' errors are larger in pixels."""
+    data = observed(noise=0.3)
+    local = TRUE.inverse().apply(data.points)
+    plane = replace(
+        data,
+        points=TRUE.apply(local * (4 / local[:, 2:])),
+        deviations=torch.full_like(data.deviations, 0.01),
+    )
+    fit = resect(plane, TRUE, 1.0)
+    back = TRUE.retract(torch.tensor([0.0, 0.0, -0.4, 0.0, 0.0, 0.0], dtype=torch.float64))
+    longer = replace(fit, T_world_rig=back, calibration=Calibration(log_focal=math.log(1.1)))
+    fit = replace(fit, T_world_rig=TRUE)
+    assert log_likelihood_ratio(plane, fit, longer) == pytest.approx(0, abs=1e-6)
 
 
 def test_outliers_do_not_move_the_pose() -> None:

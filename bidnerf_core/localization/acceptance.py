@@ -180,9 +180,10 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         return Verdict(Outcome.MISCALIBRATED, f"{share}, but only with {found.camera_sentence}")
     deviation = position_deviation(found.stated_covariance)
     if not deviation <= thresholds.precision * found.distance:
+        cause = ", as the intrinsics had to be estimated" if found.estimates_calibration else ""
         return Verdict(
             Outcome.IMPRECISE,
-            f"{share}, but the position is uncertain by {deviation / found.distance:.1%} of the distance",
+            f"{share}, but the position is uncertain by {deviation / found.distance:.1%} of the distance{cause}",
         )
     with_others = ""
     if found.takes_map_camera or found.estimates_calibration:

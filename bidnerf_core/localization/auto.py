@@ -44,6 +44,8 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.occluders import nearest_piece
+from bidnerf_core.localization.twin_rejection import between_twins, twin_rejection
+from bidnerf_core.se3 import SE3
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
 """Reasons for which landmarks reject a pose that nothing else can put right: with wrong intrinsics, the surface is not found at
@@ -81,7 +83,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         return found
     if found.converged and occluder.share_in_front(problem.surface, found.T_world_camera) < IN_FRONT:
         return found
-    rest = _found(occluder.rest, config, seed)
+    rest = without_ambiguous_intrinsics(_found(occluder.rest, config, seed), occluder.rest)
     seconds = found.seconds + rest.seconds
     if not rest.converged or occluder.share_in_front(problem.surface, rest.T_world_camera) < IN_FRONT:
         return replace(found, seconds=seconds)
@@ -93,12 +95,17 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
 
 def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     began, answer, matcher = time.perf_counter(), None, problem.matcher if config.landmarks else None
+    given = problem.start
     if matcher is not None:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
     if answer is not None and matcher is not None:
         here = corrected(problem, answer.found)
         rejection = mirror_rejection(here, matcher, answer.found.log10_nfa, config.fused_rays, seed)
         answer = answer if rejection is None else replace(answer, verdict=rejection, confidence=None)
+        was_accepted = answer.verdict.accepted
+        answer = between_twins(problem, matcher, answer, given, config.fused_rays, seed)
+        if was_accepted and not answer.verdict.accepted:  # the surface, too, is taken to look the same there
+            return localization_by_landmarks(problem, answer, began)
     has_points = _measured_points(problem) >= LEAST_POINTS
     doubtful = answer is not None and has_points and _is_doubtful(problem, answer)
     if answer is not None and not doubtful and _is_final(answer, has_points):
@@ -106,7 +113,11 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
     if answer is not None and problem.start is None:
         problem = replace(problem, start=answer.T)  # one more place to look
     if problem.surface is None:
-        return _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
+        found = _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
+        if matcher is None or not found.converged:
+            return found
+        near = confirm(matcher, problem.views, found.T_world_camera, seek_twin=True).pose
+        return _unless_twin(found, near, problem, given, config, seed)
     if has_points:
         found = localized_by_depth(problem, problem.surface, config, seed)
         if (
@@ -120,12 +131,19 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
         found = without_the_imprecise(found, typical)
     if matcher is None:
-        return found
-    found = _compared_with_landmarks(found, problem, matcher, config, seed, began)
+        return found if problem.matcher is not None else _without_landmarks(found)
+    found = _compared_with_landmarks(found, problem, given, matcher, config, seed, began)
     found = replace(found, seconds=time.perf_counter() - began)
     if answer is not None and found.outcome is Outcome.TOO_FEW_MATCHES and answer.verdict.outcome in UNSURE:
         return localization_by_landmarks(problem, answer, began)
     return found
+
+
+def _without_landmarks(found: Localization) -> Localization:
+    """Return an answer in a map without landmarks, which says so where they might have led to a pose."""
+    if found.converged or found.outcome is Outcome.UNDETERMINED:
+        return found
+    return replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
 
 
 def _is_settled(found: Localization) -> bool:
@@ -158,14 +176,15 @@ def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
     return outcome is Outcome.CONVERGED or outcome in FINAL
 
 
-def _rejected_by_mirror(found: Localization, twin: Verdict) -> Localization:
+def _rejected(found: Localization, why: Verdict) -> Localization:
     """Return a pose as rejected; its confidence, which follows from how well it fits, does not hold."""
-    return replace(found, outcome=twin.outcome, reason=f"{twin.reason}; {found.reason}", confidence=None)
+    return replace(found, outcome=why.outcome, reason=f"{why.reason}; {found.reason}", confidence=None)
 
 
 def _compared_with_landmarks(
     found: Localization,
     problem: Problem,
+    start: SE3 | None,
     matcher: LandmarkMatcher,
     config: AutoConfig,
     seed: int,
@@ -173,10 +192,11 @@ def _compared_with_landmarks(
 ) -> Localization:
     """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not.
 
+    ``start`` is what the user gave.
     Landmarks with less confidence than ``MOVING`` confirm an accepted pose by measured points, but do not move it if the points
     determine it better.
     """
-    near = confirm(matcher, problem.views, found.T_world_camera)
+    near = confirm(matcher, problem.views, found.T_world_camera, seek_twin=True)
     verdict = None if near.pose is None else landmark_verdict(near.pose, WITHOUT_SEARCH)
     if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
@@ -185,9 +205,10 @@ def _compared_with_landmarks(
         answer = replace(answer, verdict=verdict) if supported else answer
         refined = localization_by_landmarks(problem, answer, began)
         here, evidence = corrected(problem, near.pose), near.pose.log10_nfa
-        twin = mirror_rejection(here, matcher, evidence, config.fused_rays, seed)
-        if twin is not None:
-            return _rejected_by_mirror(refined, twin)
+        rejection = mirror_rejection(here, matcher, evidence, config.fused_rays, seed)
+        rejection = rejection or twin_rejection(problem, near.pose, start, config.fused_rays, seed)
+        if rejection is not None:
+            return _rejected(refined, rejection)
         if found.converged and _leaves_surface(problem, found, answer):
             return found
         if (
@@ -204,13 +225,26 @@ def _compared_with_landmarks(
     if found.converged and near.pose is not None and verdict is not None and _is_misled(near.pose, problem):
         reason = f"{verdict.reason}; {found.reason}"
         return replace(found, outcome=Outcome.MISCALIBRATED, reason=reason, confidence=None)
+    if not found.converged:
+        return found
     here = replace(problem, start=found.T_world_camera)
-    if (
-        found.converged
-        and (twin := mirror_rejection(here, matcher, 0.0, config.fused_rays, seed)) is not None
-    ):
-        return _rejected_by_mirror(found, twin)
-    return found
+    rejection = mirror_rejection(here, matcher, 0.0, config.fused_rays, seed)
+    if rejection is not None:
+        return _rejected(found, rejection)
+    return _unless_twin(found, near.pose, problem, start, config, seed)
+
+
+def _unless_twin(
+    found: Localization,
+    near: LandmarkPose | None,
+    problem: Problem,
+    start: SE3 | None,
+    config: AutoConfig,
+    seed: int,
+) -> Localization:
+    """Return an accepted pose that landmarks did not find, rejected if those ``near`` it match at another place as well."""
+    rejection = None if near is None else twin_rejection(problem, near, start, config.fused_rays, seed)
+    return found if rejection is None else _rejected(found, rejection)
 
 
 def _is_misled(near: LandmarkPose, problem: Problem) -> bool:

@@ -106,8 +106,8 @@ def _is_hopeless(problem: Problem) -> bool:
 
 def _unrecognised(problem: Problem) -> Verdict:
     """Return why an image without recognised landmarks is rejected in a blurred field."""
-    approximate = any(view.frame.focal_is_approximate for view in problem.views)
-    focal = "; give the camera's calibration instead of an approximate focal length" if approximate else ""
+    advice = "; give the camera's calibration instead of an approximate focal length"
+    focal = advice if problem.focal_is_approximate else ""
     why = f"too few landmarks were recognised, and the field is too blurred to compare images with its renderings{focal}"
     return Verdict(Outcome.TOO_FEW_MATCHES, why)
 

@@ -91,7 +91,7 @@ def answer_by_landmarks(
     Returns None if too few features match. ``rays`` is the number of rays rendered for the refinement; 0 leaves rendering
     out, also where it would tell which intrinsics are right.
     """
-    found = propose(matcher, problem.views, seed=seed)
+    found = propose(matcher, problem.views, seed=seed, seek_twin=True)
     if found is not None and rays:
         found = _with_camera_judged(problem, matcher, found, seed)
     return None if found is None else fused_answer(problem, found, landmark_verdict(found), rays, seed)
@@ -108,12 +108,12 @@ def _with_camera_judged(
         other, correction = _other_camera(problem, matcher, found), found.miscalibration.alternative
         odds = _log_odds_of(problem, found, correction, lambda _: other, seed)
         evidence = CameraEvidence(map_camera=-odds if found.takes_map_camera else odds)
-        found = propose(matcher, problem.views, seed=seed, evidence=evidence) or found
+        found = propose(matcher, problem.views, seed=seed, seek_twin=True, evidence=evidence) or found
     if not found.estimates_calibration and found.miscalibration.worst[1] > limits.miscalibration:
         correction = found.miscalibration.apparent
         change = Calibration(*correction.tolist())
         evidence = replace(evidence, mistaken=_log_odds_of(problem, found, correction, change.applied, seed))
-        found = propose(matcher, problem.views, seed=seed, evidence=evidence) or found
+        found = propose(matcher, problem.views, seed=seed, seek_twin=True, evidence=evidence) or found
     return found
 
 
@@ -155,7 +155,7 @@ def fused_answer(
     """
     diagnostics = landmark_diagnostics(found, searched)
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.stated_covariance, diagnostics)
-    approximate = any(view.frame.focal_is_approximate for view in problem.views)
+    approximate = problem.focal_is_approximate
     if not verdict.accepted or found.estimates_calibration:
         if problem.has_depth and found.estimates_calibration:
             answer = replace(answer, left_out="depth, which needs known intrinsics")

@@ -34,11 +34,11 @@ def mirror_rejection(
     if not rays or (rejection is None and log10_nfa < HARDLY_MATCHED):
         return rejection
     last = View(mirror_image(problem.views[-1].frame), SE3.identity())
-    twin = propose(matcher, [last], seed=seed)
-    if twin is None:
+    mirrored = propose(matcher, [last], seed=seed)
+    if mirrored is None:
         return rejection
     image, mirror = replace(problem, views=problem.views[-1:]), replace(problem, views=(last,))
-    odds = log_odds_by_rendering(image, corrected(mirror, twin), seed)
+    odds = log_odds_by_rendering(image, corrected(mirror, mirrored), seed)
     if odds > TOLD_FROM_MIRROR:
         return None
     if odds < -TOLD_FROM_MIRROR and rejection is None:

@@ -96,6 +96,11 @@ class Problem:
         return self.depth_rays is not None or any(view.frame.has_depth for view in self.views)
 
     @property
+    def focal_is_approximate(self) -> bool:
+        """Whether the focal length of a view's camera was only assumed or read from EXIF."""
+        return any(view.frame.focal_is_approximate for view in self.views)
+
+    @property
     def device(self) -> torch.device:
         """The device on which the field computes; rays are moved there."""
         return device_of(self.field)

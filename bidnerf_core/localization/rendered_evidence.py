@@ -31,29 +31,32 @@ NOISIEST = 0.15
 """Colour noise of a field on its own training images above which it does not tell explanations apart: it has hardly been trained."""
 
 
-def log_odds_by_rendering(one: Problem, other: Problem, seed: int) -> float:
+def log_odds_by_rendering(one: Problem, other: Problem, seed: int, steps: int = FITTED.steps) -> float:
     """Return the logarithm of the odds, by rendered colours alone, that ``one`` is right and not ``other``.
 
-    Both hold images of the same size with intrinsics, and the pose found with them as the start. 0 where the field is too noisy, or
-    renders what is not finite.
+    Both hold images of the same size with intrinsics, and the pose found with them as the start, from which ``steps`` are taken to
+    that which suits them best. 0 where the field is too noisy, or renders what is not finite.
     """
     if one.colour_noise is not None and one.colour_noise > NOISIEST:
         return 0.0
-    difference = _ray_costs(other, seed) - _ray_costs(one, seed)
+    stage = replace(FITTED, steps=steps)
+    difference = _ray_costs(other, stage, seed) - _ray_costs(one, stage, seed)
     error = float(difference.std()) * len(difference) ** 0.5
     odds = LOG_ODDS_PER_DEVIATION * float(difference.sum()) / max(error, 1e-12)
     return odds if math.isfinite(odds) else 0.0
 
 
-def _ray_costs(problem: Problem, seed: int) -> Float[Tensor, "n"]:
+def _ray_costs(problem: Problem, stage: RefinementStage, seed: int) -> Float[Tensor, "n"]:
     """Return the cost of each ray from the pose near the start that suits the images best."""
     problem = problem.without_depth()
     assert problem.start is not None
     settings = RenderedCostSettings(ColourSettings(), None, RefinementSettings(exposure=True))
     generator = Generator().manual_seed(seed)
-    T = take_few_steps(problem, problem.start, FITTED, settings, generator).poses[-1]
-    stage = replace(FITTED, rays=min(COMPARED_RAYS, _visible_pixels(problem)))
-    cost = settings.drawn(problem.on_device(), stage, pivot("scene", problem).to(problem.device), generator)
+    T = take_few_steps(problem, problem.start, stage, settings, generator).poses[-1]
+    compared = replace(stage, rays=min(COMPARED_RAYS, _visible_pixels(problem)))
+    cost = settings.drawn(
+        problem.on_device(), compared, pivot("scene", problem).to(problem.device), generator
+    )
     return cost.residuals(T[None], derivatives=False).ray_costs()[0]
 
 

@@ -105,6 +105,21 @@ def resect(
     )
 
 
+def log_likelihood_ratio(
+    data: ObservedPoints, fit: ReprojectionFit, other: ReprojectionFit, correlation: float = 1.0
+) -> float:
+    """Return the logarithm of how many times as likely the observations are with one fit to them as with another.
+
+    Both are compared by the loss of ``resect``, with the deviations that the one with less noise, the better explanation, has:
+    those of the points depend on the pose, and larger ones would make residuals less unlikely at no price.
+    """
+    better = min(fit, other, key=lambda fit: fit.noise)
+    residuals, none_free = _Residuals(data, better.T_world_rig), np.arange(0)
+    states = [_State.of(f.T_world_rig, f.calibration) for f in (other, fit)]
+    costs = [residuals.system(residuals.linearized(s, none_free), better.noise).cost for s in states]
+    return (costs[0] - costs[1]) / correlation
+
+
 @dataclass(frozen=True, eq=False)
 class _State:
     """The unknowns: the rig's pose and the calibration."""

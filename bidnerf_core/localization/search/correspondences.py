@@ -68,6 +68,11 @@ class LandmarkMatches:
     def __len__(self) -> int:
         return len(self.view)
 
+    @property
+    def keys(self) -> Int[Tensor, "m"]:
+        """A number for each match, the same for the same view (of up to 512), keypoint (of up to a million) and landmark."""
+        return (self.view << 54) + (self.keypoint << 34) + self.landmark
+
     def __getitem__(self, index: Tensor) -> LandmarkMatches:
         return LandmarkMatches(
             self.view[index], self.keypoint[index], self.landmark[index], self.ambiguity[index]

@@ -36,7 +36,7 @@ from bidnerf_core.mapping.calibration import (
 )
 from bidnerf_core.mapping.features import NORM
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import ReprojectionFit, resect
+from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
 from bidnerf_core.se3 import SE3
 
 RADII = (3.0, 1.5)
@@ -55,7 +55,8 @@ measurements support it.
 """
 POSSIBLE, PROBABLE = 0.1, 0.5
 """Probabilities that an image is a part of one from which on its principal point is free in the fit that judges the intrinsics,
-which then are doubtful, and from which on the principal point may be estimated.
+which then are doubtful, and from which on the principal point may be estimated. Where the focal length is approximate, so that it is
+estimated anyway, the principal point is from the first one on.
 """
 MOST_DISTANCE = (0.5 * NORM) ** 2
 """Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
@@ -131,7 +132,10 @@ def _settled(
     right = query.prior if approximate and taken.camera is None else CALIBRATED
     wrong = Miscalibration.of(free, query.landmarks, taken, evidence.mistaken, right)
     certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_BY_OTHERS
-    if wrong.worst[1] > certain and not POSSIBLE < crop < PROBABLE:
+    if approximate and crop > POSSIBLE:
+        taken = TakenIntrinsics()
+        fit, found = _guided(query, ANY, free, found, most, RADII[1:])
+    elif wrong.worst[1] > certain and not POSSIBLE < crop < PROBABLE:
         taken = TakenIntrinsics()
         prior = wrong.prior(query.prior if approximate else DOUBTED, crop >= PROBABLE)
         fit, found = _guided(query, prior, free, found, most, RADII[1:])
@@ -160,7 +164,8 @@ def _with_free_camera(
         resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation)
         for prior in (ANY if open_camera else CROPPED, NOMINAL)
     )
-    probability = probability_of_crop(part, whole, query.landmarks, len(found) / correlation, open_camera)
+    ratio = log_likelihood_ratio(data, part, whole, correlation)
+    probability = probability_of_crop(part, whole, query.landmarks, ratio, open_camera)
     return (part if probability > POSSIBLE else whole), probability
 
 
@@ -192,9 +197,7 @@ def _guided(
 
 def _changed(a: LandmarkMatches, b: LandmarkMatches) -> float:
     """Return the share of the matches ``a`` that are not among ``b``."""
-    keypoints = 1 << 32
-    keys = [((m.view * keypoints) + m.keypoint) * keypoints + m.landmark for m in (a, b)]
-    return 1 - float(torch.isin(*keys).float().mean())
+    return 1 - float(torch.isin(a.keys, b.keys).float().mean())
 
 
 def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:

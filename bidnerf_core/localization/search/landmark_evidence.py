@@ -12,7 +12,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import GuidedPose
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Unguided
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
@@ -58,7 +58,7 @@ def described(
         miscalibration=answer.miscalibration,
         calibration_scatter=query.landmarks.calibration_scatter,
         depth_scale=depth_scale(data, fit.T_world_rig),
-        undecided=(given, query.threshold),
+        unguided=Unguided(given, query.threshold),
         seconds=seconds,
     )
 

@@ -21,8 +21,24 @@ from bidnerf_core.se3 import SE3
 
 ESTIMATED_INFLATION = 3.0
 """Factor on the covariance of poses whose intrinsics were estimated along: errors of landmarks and of lenses, which the right intrinsics
-hide, shift the estimate. With it, 149 of 156 such poses lie inside their 95 % bound in the record ``faults_camera``.
+hide, shift the estimate. With it, 148 of 155 such poses lie inside their 95 % bound in the record ``faults_camera``.
 """
+
+
+@dataclass(frozen=True, eq=False)
+class Unguided:
+    """Matches by descriptors alone, before there was a pose."""
+
+    matches: ObservedPoints  # as the given intrinsics have them
+    limit: float  # pixels: largest residual of one that agrees with a pose
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """Another pose that about as many landmarks agree with."""
+
+    T_world_rig: SE3
+    share: float  # of the number of correspondences at the pose itself, those by chance left out of both
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,25 +74,21 @@ class LandmarkPose:
     calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
-    # What tells another camera: matches by descriptors alone, as the given intrinsics have them, and the residual (pixels) up to
-    # which one agrees; None if another camera was taken already.
-    undecided: tuple[ObservedPoints, float] | None = None
+    unguided: Unguided | None = None  # what tells another camera; None for landmarks that were followed
+    has_other_camera: bool = False  # one that far more matches agree with than with the given one
+    twin: Twin | None = None  # where it was sought: another pose that about as many landmarks agree with
     stretch: Stretch = UNSTRETCHED  # of the given intrinsics; ``calibration`` corrects the stretched ones
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
     @cached_property
     def better_camera(self) -> CameraFit | None:
         """The camera with which far more matches agree; None if there is none, or if it was taken."""
-        if self.undecided is None:
+        if self.has_other_camera or self.unguided is None:
             return None
-        data, limit = self.undecided
         least = 1.0 if self.estimates_calibration else UNSUSPECTED
-        return better_camera(data, self.T_world_camera, self.calibration, limit, least)
-
-    @property
-    def has_other_camera(self) -> bool:
-        """Whether the given camera was replaced by one that far more matches agree with."""
-        return self.undecided is None
+        return better_camera(
+            self.unguided.matches, self.T_world_camera, self.calibration, self.unguided.limit, least
+        )
 
     @property
     def focal_factor(self) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
@@ -60,6 +60,10 @@ class LandmarkQuery:
     def observed(self, matches: LandmarkMatches) -> ObservedPoints:
         """Return the landmarks and keypoints of ``matches`` as input of a pose solver."""
         return observed_points(self.images, self.landmarks, matches)
+
+    def descriptors(self, matches: LandmarkMatches) -> UInt8[Tensor, "m d"]:
+        """Return the descriptors of the keypoints of ``matches``."""
+        return torch.cat([image.keypoints.descriptors for image in self.images])[self._number(matches)]
 
     def squared_distances(self, matches: LandmarkMatches) -> Float[Tensor, "m"]:
         """Return the squared descriptor distance of each match."""

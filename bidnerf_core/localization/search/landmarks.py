@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_images
@@ -17,6 +19,7 @@ from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraE
 from bidnerf_core.localization.search.other_camera import with_other_camera
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
 from bidnerf_core.localization.search.stopwatch import Stopwatch
+from bidnerf_core.localization.search.twins import twin_of
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.features import SIFT, Features
@@ -43,12 +46,14 @@ def propose(
     seed: int = 0,
     prior: CalibrationPrior | None = None,
     evidence: CameraEvidence = NO_EVIDENCE,
+    seek_twin: bool = False,
 ) -> LandmarkPose | None:
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
     ``prior`` says how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal
     length is approximate. One correction is estimated for all views; those of different cameras are taken as given.
-    ``evidence``: what else is known of the camera. Raises ``InputError`` if there is no view.
+    ``evidence``: what else is known of the camera. ``seek_twin`` says to look for another place that the images may show.
+    Raises ``InputError`` if there is no view.
     """
     if not views:
         raise InputError("nothing to localize: expected at least one view")
@@ -63,7 +68,8 @@ def propose(
     clock.lap("refinement")
     found = described(query, matches, answer, clock.seconds)
     clock.lap("assessment")
-    return with_other_camera(query, matches, found, clock)
+    found = with_other_camera(query, matches, found, clock)
+    return _with_twin(query, matcher, found, clock) if seek_twin else found
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +88,16 @@ class Confirmation:
 
 
 def confirm(
-    matcher: LandmarkMatcher, views: Sequence[View], T_world_camera: SE3, features: Features = SIFT
+    matcher: LandmarkMatcher,
+    views: Sequence[View],
+    T_world_camera: SE3,
+    features: Features = SIFT,
+    seek_twin: bool = False,
 ) -> Confirmation:
-    """Match the landmarks near their projections at a pose of the last of ``views``, and refine it."""
+    """Match the landmarks near their projections at a pose of the last of ``views``, and refine it.
+
+    ``seek_twin`` is as in ``propose``.
+    """
     clock = Stopwatch()
     query = LandmarkQuery(query_images(views, features), matcher.landmarks, _calibration_prior(views))
     clock.lap("descriptors")
@@ -93,13 +106,24 @@ def confirm(
     clock.lap("refinement")
     if answer is None:
         return Confirmation(None, visible, matches, chance)
-    pose = described(query, answer.correspondences, answer, clock.seconds)
     # Matches that were not sought near the pose are the evidence for it, and tell another camera.
-    unguided = unguided_matches(query.images, matcher, STRONGEST)
-    evidence = described(query, unguided, answer, clock.seconds)
-    pose = replace(pose, log10_nfa=evidence.log10_nfa, undecided=evidence.undecided)
+    pose = described(query, unguided_matches(query.images, matcher, STRONGEST), answer, clock.seconds)
+    agreeing = int((torch.linalg.vector_norm(pose.residuals, dim=-1) <= query.threshold).sum())
+    pose = replace(pose, matches=len(pose.correspondences), agreeing=agreeing)
     clock.lap("assessment")
+    pose = _with_twin(query, matcher, pose, clock) if seek_twin else pose
     return Confirmation(pose, visible, matches, chance)
+
+
+def _with_twin(
+    query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose, clock: Stopwatch
+) -> LandmarkPose:
+    """Return a pose with its twin, if there is one, sought with the intrinsics that were taken or estimated."""
+    cameras = [found.intrinsics_of(image.intrinsics) or image.intrinsics for image in query.images]
+    seen = replace(query.seen_by(cameras), prior=FIXED, evidence=NO_EVIDENCE)
+    twin = twin_of(seen, matcher, found)
+    clock.lap("twin")
+    return replace(found, twin=twin)
 
 
 def _calibration_prior(views: Sequence[View]) -> CalibrationPrior:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
-from bidnerf_core.camera_shapes import cameras_at_size, stretched_cameras
+from bidnerf_core.camera_shapes import cameras_at_size, centre_crop_cameras, stretched_cameras
 from bidnerf_core.mapping.calibration import (
     CALIBRATED,
     GIVEN,
@@ -102,7 +102,9 @@ def map_camera(
     A camera that took landscape images alone is turned for a portrait one, to the side that puts its principal point nearest to that of the
     correction ``near``. With ``crops``, an image of a shape that the map does not have is compared with centre crops of the map's images.
     """
-    groups = cameras_at_size(cameras, given.width, given.height, crops)
+    groups = cameras_at_size(cameras, given.width, given.height)
+    if crops and not groups:
+        groups = centre_crop_cameras(cameras, given.width, given.height)
     known = [_camera_among(given, group) for group in groups]
     shift = torch.tensor([near.shift_u, near.shift_v], dtype=torch.float64)
     found = [camera for camera in known if camera is not None]

@@ -216,31 +216,36 @@ def probability_of_crop(
     part: ReprojectionFit,
     whole: ReprojectionFit,
     landmarks: LandmarkMap,
-    measurements: float,
+    log_ratio: float,
     open_camera: bool,
 ) -> float:
     """Return the probability that an image is a part of one.
 
     ``part`` is a fit whose principal point was free, and ``whole`` one whose focal length was, with the prior ``NOMINAL``. The prior of
-    the first is ``CROPPED``, or ``ANY`` with an ``open_camera``. ``measurements``: number of independent keypoints.
+    the first is ``CROPPED``, or ``ANY`` with an ``open_camera``. ``log_ratio``: logarithm of how many times as likely the keypoints are
+    with the first. The prior odds are those among images whose intrinsics are wrong, also with an ``open_camera``: a principal point
+    that is estimated in vain costs little there.
     """
     value, noise = _estimate(part, landmarks)
     factor = part.calibration.focal_factor  # shares of the given focal length become those of the true one
     value, noise = value / factor, noise / factor**2
     cropped, right = (_log_density(prior, value, noise)[1:3].sum() for prior in (CROPPED, NOMINAL))
     against_right = float(cropped - right) + math.log(CROPS / (1 - WRONG_SHARE))
-    evidence = _log_evidence(part, ANY if open_camera else CROPPED, measurements) - _log_evidence(
-        whole, NOMINAL, measurements
-    )
+    factors = _log_occam_factor(part, ANY if open_camera else CROPPED) - _log_occam_factor(whole, NOMINAL)
+    evidence = log_ratio + factors
     odds = min(against_right, evidence + math.log(CROPS / MISTAKES))
     return float(torch.tensor(odds, dtype=torch.float64).sigmoid())
 
 
-def _log_evidence(fit: ReprojectionFit, prior: CalibrationPrior, measurements: float) -> float:
-    """Return the logarithm of the marginal likelihood of a fit with a prior, but for a constant (Laplace's approximation)."""
+def _log_occam_factor(fit: ReprojectionFit, prior: CalibrationPrior) -> float:
+    """Return the logarithm of a fit's Occam factor (MacKay 2003, ch. 28), but for a constant: prior density times posterior width.
+
+    The likelihood of the fit times this factor is the evidence for its ``prior``, in Laplace's approximation. The width is that of
+    independent parameters, and the pose, which is free in all fits, is left out.
+    """
     scaled = _as_tensor(fit.calibration) / prior.deviations
     narrowed = (fit.calibration_deviations / prior.deviations).clamp(min=1e-6).log()
-    return float((narrowed - 0.5 * scaled.square()).sum()) - 2 * measurements * math.log(fit.noise)
+    return float((narrowed - 0.5 * scaled.square()).sum())
 
 
 def unresolved_deviations(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "4"]:

@@ -67,7 +67,7 @@ def _estimated(
     clock.lap("camera")
     if found.agreeing < AS_MANY * better.agreeing:
         return None
-    return replace(found, stretch=better.stretch, undecided=None)
+    return replace(found, stretch=better.stretch, has_other_camera=True)
 
 
 def _like_map_camera(
@@ -121,7 +121,7 @@ def _with_map_camera(
     if refuted or found.agreeing < enough:
         return None
     stretch, calibration = correction
-    return replace(found, intrinsics=camera, calibration=calibration, stretch=stretch, undecided=None)
+    return replace(found, intrinsics=camera, calibration=calibration, stretch=stretch, has_other_camera=True)
 
 
 def _correction(given: Intrinsics, camera: Intrinsics) -> tuple[Stretch, Calibration] | None:

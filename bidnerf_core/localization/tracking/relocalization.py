@@ -15,6 +15,7 @@ from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localiza
 from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.twin_rejection import between_twins
 from bidnerf_core.se3 import SE3
 
 FIRST_FULL_SEARCH = 4
@@ -50,6 +51,9 @@ def relocalized(
         began = time.perf_counter()
         problem = rig(localizer.map, [View(frame, SE3.identity())], None, None, localizer.matcher)
         answer = answer_by_landmarks(problem, localizer.matcher, 0, seed)
+        if answer is not None:
+            near = predicted if lost <= FIRST_FULL_SEARCH else None  # later predictions have drifted
+            answer = between_twins(problem, localizer.matcher, answer, near, 0, seed)
         found = None if answer is None else localization_by_landmarks(problem, answer, began)
         if found is not None and found.converged:
             return found

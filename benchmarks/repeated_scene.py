@@ -1,0 +1,191 @@
+"""Whether poses are believed in a scene that repeats itself.
+
+    python benchmarks/repeated_scene.py MAP:DATA [MAP:DATA ...] [--frames 40] [--tuning-frames]
+
+Each map is doubled: its field and its landmarks stand once more, far away and turned by 0, 90 or 180 degrees about an axis of the world.
+Both copies' descriptors get noise of their own, as if each was built from its own photos. The test frames show nothing that tells the
+copies apart, so that no pose should be accepted, of images alone or with measured depth. With a start near the true pose (a tenth of the
+copies' distance away; only where the copy is not turned), the right copy should be. The doubled maps have no surface. Frames whose index in
+the test split is 1 modulo 5 are for tuning and left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Generator, Tensor, nn
+
+from bidnerf_core import Localizer, Map, load_map
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.errors import pose_error, success_rate
+from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
+from bidnerf_core.frames import View
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.se3 import SE3
+
+RESULTS = Path(__file__).resolve().parent / "results"
+TURNS = (0.0, 90.0, 180.0)
+DESCRIPTOR_NOISE = 5.0
+"""Standard deviation of the noise of each channel of a descriptor, of 256 steps."""
+
+
+class DoubledField(nn.Module):
+    """A field and its copy; points and rays belong to the nearer one."""
+
+    def __init__(self, field: RadianceField, bounds: SceneBounds, T_world_copy: SE3) -> None:
+        super().__init__()
+        self.field, self._bounds, self._T = field, bounds, T_world_copy.to("cpu", torch.float32)
+
+    @property
+    def sampler(self) -> DoubledField:
+        return self
+
+    def forward(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        origins, directions = self._home(rays.origins, rays.directions)
+        return self.field.sampler(self._bounds.rays(origins, directions), jitter)
+
+    def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
+        return self.field.query(*self._home(positions, directions.expand_as(positions)))
+
+    def _home(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions and directions in the frame of the copy that they belong to."""
+        centre = positions.new_tensor(self._bounds.centre)
+        there = (positions - self._T.apply(centre)).norm(dim=-1) < (positions - centre).norm(dim=-1)
+        back = self._T.inverse()
+        return (
+            torch.where(there[..., None], back.apply(positions), positions),
+            torch.where(there[..., None], back.rotate(directions), directions),
+        )
+
+
+def doubled(map: Map, T_world_copy: SE3) -> Map:
+    """Return a map with all that it has twice, without its surface."""
+    if map.landmarks is None:
+        raise InputError("a map without landmarks, expected one that was baked")
+    bounds = map.bounds
+    copy = T_world_copy.translation
+    lower, upper = torch.tensor(bounds.lower), torch.tensor(bounds.upper)
+    reach = (upper - lower).norm()
+    wide = replace(
+        bounds,
+        lower=tuple((torch.minimum(lower, lower + copy) - reach).tolist()),
+        upper=tuple((torch.maximum(upper, upper + copy) + reach).tolist()),
+    )
+    field = DoubledField(map.field, bounds, T_world_copy).eval()
+    info = replace(map.info, bounds=wide)
+    return replace(map, info=info, field=field, surface=None, landmarks=twice(map.landmarks, T_world_copy))
+
+
+def twice(landmarks: LandmarkMap, T_world_copy: SE3, share: float = 1.0) -> LandmarkMap:
+    """Return landmarks of which a random share also stands elsewhere; the descriptors of all get noise."""
+    T, generator = T_world_copy.to("cpu", torch.float32), Generator().manual_seed(0)
+    chosen = torch.rand(len(landmarks), generator=Generator().manual_seed(1)) < share
+
+    def with_chosen(here: Tensor, there: Tensor | None = None) -> Tensor:
+        return torch.cat([here, (here if there is None else there)[chosen]])
+
+    descriptors = with_chosen(landmarks.descriptors)
+    noise = DESCRIPTOR_NOISE * torch.randn(descriptors.shape, generator=generator)
+    return replace(
+        landmarks,
+        positions=with_chosen(landmarks.positions, T.apply(landmarks.positions)),
+        directions=with_chosen(landmarks.directions, T.rotate(landmarks.directions)),
+        descriptors=(descriptors + noise).round().clamp(0, 255).to(descriptors.dtype),
+        deviations=with_chosen(landmarks.deviations),
+        cones=with_chosen(landmarks.cones),
+        sizes=with_chosen(landmarks.sizes),
+        views=with_chosen(landmarks.views),
+    )
+
+
+def copies(bounds: SceneBounds) -> list[SE3]:
+    """Return where the copy of a map stands, so far away that neither is within the space that the other models."""
+    away = torch.tensor([4 * max(bounds.far, bounds.side), 0.0, 0.0], dtype=torch.float64)
+    found = []
+    for turn in TURNS:
+        c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+        rotation = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+        found.append(SE3(rotation, away))
+    return found
+
+
+def judged(localizer: Localizer, view: View, near: SE3 | None) -> tuple[bool, bool, str]:
+    """Return whether the answer is accepted, whether it is right, and its outcome."""
+    try:
+        found = localizer(view.frame, near, seed=0)
+    except InputError:
+        return False, False, "no landmarks recognised"
+    error = pose_error(found.T_world_camera, view.T_ref_camera)
+    return (
+        found.converged,
+        bool(error.translation < 0.05) and bool(error.rotation_deg < 5),
+        str(found.outcome),
+    )
+
+
+def measured(scene: Map, views: list[View]) -> dict[str, Any]:
+    """Return counts over all frames and copies, of images alone and with depth, without and with a start."""
+    counts: dict[str, Counter[str]] = {}
+    for number, T_world_copy in enumerate(copies(scene.bounds)):
+        localizer = Localizer(doubled(scene, T_world_copy))
+        off = torch.zeros(6, dtype=torch.float64)
+        off[0] = 0.1 * float(T_world_copy.translation.norm())
+        for view in views:
+            colour = replace(view, frame=replace(view.frame, depth=None))
+            modes: list[tuple[str, View, SE3 | None]] = [("RGB", colour, None)]
+            modes += [("RGB, start", colour, view.T_ref_camera.retract(off))] if number == 0 else []
+            modes += [("RGB-D", view, None)] if view.frame.has_depth else []
+            for name, given, near in modes:
+                accepted, right, outcome = judged(localizer, given, near)
+                counts.setdefault(name, Counter()).update(
+                    {
+                        "n": 1,
+                        "believed": accepted,
+                        "right": right,
+                        "believed and right": accepted and right,
+                        outcome: 1,
+                    }
+                )
+    return {name: dict(count) for name, count in counts.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="+", metavar="MAP:DATA")
+    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--tuning-frames", action="store_true")
+    parser.add_argument("--name", default="repeated_scene", help="of the record")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    scenes: dict[str, Any] = {}
+    for pair in given.scenes:
+        folder, data = pair.split(":", 1)
+        scene = load_map(Path(folder))
+        dataset = open_dataset(Path(data), scene.bounds.background)
+        names = [n for i, n in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == given.tuning_frames]
+        count = min(given.frames, len(names))
+        views = dataset.views("test", [names[i * len(names) // count] for i in range(count)])
+        scenes[Path(folder).name] = measured(scene, views)
+        print(Path(folder).name, scenes[Path(folder).name], flush=True)
+    total: dict[str, Counter[str]] = {}
+    for modes in scenes.values():
+        for name, count in modes.items():
+            total.setdefault(name, Counter()).update(count)
+    rates = {name: asdict(success_rate(count["believed"], count["n"])) for name, count in total.items()}
+    print({name: dict(count) for name, count in total.items()})
+    results = {"scenes": scenes, "all": total, "believed": rates}
+    print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
+
+
+if __name__ == "__main__":
+    main()

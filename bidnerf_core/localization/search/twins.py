@@ -1,0 +1,71 @@
+"""A second place where about as many landmarks match: a scene that repeats itself, such as two rooms with the same furniture."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.search.guided_refinement import LEAST_GUIDED_MATCHES, RADII, confirmed
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Twin
+from bidnerf_core.localization.search.landmark_query import LandmarkQuery
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.ransac import sample_consensus
+from bidnerf_core.localization.search.unguided import LOOKED_UP
+
+COMPARED = 100
+"""Largest number of correspondences for which landmarks are sought elsewhere."""
+ALIKE = 0.9
+"""Least ratio of a correspondence's descriptor distance to that of a landmark elsewhere that looks as much like the keypoint."""
+LEAST_ALIKE = 0.3
+"""Share of the correspondences that need such a landmark, and that have to agree with one other pose."""
+RIVAL = 0.5
+"""Share of the correspondences, those by chance left out, that have to match about another pose for it to be a twin."""
+
+
+def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> Twin | None:
+    """Return the twin of a pose, or None; ``query`` has the intrinsics with which it was found.
+
+    The keypoints of its correspondences are compared with landmarks at other places. Where a scene does not repeat itself, few look
+    as much alike, and those do not agree on a pose.
+    """
+    here = found.correspondences
+    chosen = here[torch.linspace(0, len(here) - 1, min(COMPARED, len(here))).round().long().unique()]
+    others = _elsewhere(query, matcher, chosen, found)
+    least = max(LEAST_ALIKE * len(chosen), LEAST_GUIDED_MATCHES)
+    if _keypoints(others) < least:
+        return None
+    first = sample_consensus(query.observed(others), others.view, query.threshold, seed=0)
+    if first is None or _keypoints(others[first.inliers]) < least:
+        return None
+    there = confirmed(query, first.T_world_rig)
+    if there is None or _is_shared(there.correspondences, here):
+        return None
+    share = (len(there.correspondences) - there.chance) / max(len(here) - found.chance, 1)
+    return Twin(there.fit.T_world_rig, share) if share >= RIVAL else None
+
+
+def _elsewhere(
+    query: LandmarkQuery, matcher: LandmarkMatcher, chosen: LandmarkMatches, found: LandmarkPose
+) -> LandmarkMatches:
+    """Return matches of the keypoints of ``chosen`` with landmarks that do not project near them from the pose, the most alike first."""
+    distances, index = matcher.nearest(query.descriptors(chosen), LOOKED_UP)
+    ratio = distances / query.squared_distances(chosen).clamp(min=1)[:, None]
+    row, column = (ratio <= ALIKE**-2).nonzero().unbind(-1)
+    order = ratio[row, column].argsort(stable=True)
+    row, column = row[order], column[order]
+    others = LandmarkMatches(chosen.view[row], chosen.keypoint[row], index[row, column], torch.ones(len(row)))
+    off = torch.linalg.vector_norm(query.observed(others).residuals(found.T_world_camera), dim=-1)
+    return others[~(off <= RADII[0] * query.threshold)]
+
+
+def _keypoints(matches: LandmarkMatches) -> int:
+    """Return the number of keypoints that are matched."""
+    keys: Int[Tensor, "m"] = (matches.view << 34) + matches.keypoint
+    return len(keys.unique())
+
+
+def _is_shared(there: LandmarkMatches, here: LandmarkMatches) -> bool:
+    """Return whether most of the matches at another pose are those of this one, which is then the same."""
+    return float(torch.isin(there.keys, here.keys).float().mean()) > 0.5

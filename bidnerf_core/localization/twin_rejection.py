@@ -1,0 +1,109 @@
+"""Poses in a scene that repeats itself: a start or renderings tell two places apart, or the pose is rejected."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+
+from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization.by_landmarks import LandmarkAnswer, corrected, fused_answer
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
+from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Twin, Unguided
+from bidnerf_core.localization.search.landmarks import confirm
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.se3 import SE3
+
+TOLD_FROM_TWIN = 10.0
+"""Logarithm of the odds from which on renderings decide between two places.
+
+At exact copies the odds are not 0 either, since keypoints determine the pose at one of them better.
+"""
+FITTING_STEPS = 5
+"""Number of steps to the poses near both places that suit the images best."""
+NEARER = 0.5
+"""Ratio of the motions from a start to one place and to the other one below which the start decides."""
+NEARLY_AS_MANY = 0.8
+"""Share of the correspondences that match at another place from which on these do not decide by themselves."""
+
+
+def between_twins(
+    problem: Problem,
+    matcher: LandmarkMatcher,
+    answer: LandmarkAnswer,
+    start: SE3 | None,
+    rays: int,
+    seed: int,
+) -> LandmarkAnswer:
+    """Return an answer as it is, or that at its twin if it is from there, or the answer as rejected if nothing tells the two apart.
+
+    A ``start`` that is far nearer to one of them decides. Otherwise renderings of both are compared, unless ``rays`` is 0.
+    """
+    found = answer.found
+    if found.twin is None or not answer.verdict.accepted:
+        return answer
+    odds = _log_odds(problem, found, found.twin, start, rays, seed)
+    if _is_told(odds, found.twin):
+        return answer
+    if odds < -TOLD_FROM_TWIN:
+        there = _at_twin(problem, matcher, found, found.twin)
+        verdict = None if there is None else landmark_verdict(there)
+        if there is not None and verdict is not None and verdict.accepted:
+            return fused_answer(problem, there, verdict, rays, seed)
+    return replace(answer, verdict=_rejection(found.twin), confidence=None, terms=(), left_out="")
+
+
+def twin_rejection(
+    problem: Problem, found: LandmarkPose, start: SE3 | None, rays: int, seed: int
+) -> Verdict | None:
+    """Return why a pose is rejected whose twin fits about as well, or None; ``start`` and ``rays`` are as in ``between_twins``."""
+    if found.twin is None or _is_told(_log_odds(problem, found, found.twin, start, rays, seed), found.twin):
+        return None
+    return _rejection(found.twin)
+
+
+def _at_twin(
+    problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, twin: Twin
+) -> LandmarkPose | None:
+    """Return the pose at the twin. Matches by descriptors that agree with the pose itself say nothing of the camera there."""
+    there = confirm(matcher, problem.views, twin.T_world_rig).pose
+    if there is None or there.unguided is None:
+        return there
+    data, limit = there.unguided.matches, there.unguided.limit
+    elsewhere = torch.linalg.vector_norm(data.residuals(found.T_world_camera), dim=-1) <= limit
+    return replace(there, unguided=Unguided(data[~elsewhere], limit))
+
+
+def _rejection(twin: Twin) -> Verdict:
+    many = f"{min(twin.share, 1):.0%} as many"
+    return Verdict(
+        Outcome.AMBIGUOUS, f"{many} landmarks match at another place, and nothing tells the two apart"
+    )
+
+
+def _is_told(log_odds: float, twin: Twin) -> bool:
+    """Return whether an image is told from one of the twin: without other evidence, by clearly more landmarks."""
+    return log_odds > TOLD_FROM_TWIN or (log_odds == 0 and twin.share < NEARLY_AS_MANY)
+
+
+def _log_odds(
+    problem: Problem, found: LandmarkPose, twin: Twin, start: SE3 | None, rays: int, seed: int
+) -> float:
+    """Return the logarithm of the odds that the images show the pose and not its twin; 0 where nothing tells."""
+    if start is not None:
+        here, there = (_motion(start, T, found.distance) for T in (found.T_world_camera, twin.T_world_rig))
+        if here < NEARER * there or there < NEARER * here:
+            return math.inf if here < there else -math.inf
+    if not rays:
+        return 0.0
+    one = corrected(problem, found)
+    return log_odds_by_rendering(one, replace(one, start=twin.T_world_rig), seed, FITTING_STEPS)
+
+
+def _motion(start: SE3, T: SE3, distance: float) -> float:
+    """Return how far what is seen at a ``distance`` (metres) moves on the way from one pose to another, about."""
+    update = (start.to("cpu", T.translation.dtype).inverse() @ T).log()
+    return float(update[:3].norm() + distance * update[3:].norm())
