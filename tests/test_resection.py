@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import approx_fprime
+from torch import Tensor
 
 from bidnerf_core import SE3, Intrinsics
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import _Residuals, _State, log_likelihood_ratio, resect
+from bidnerf_core.mapping.reprojection import ReprojectionErrors, State
+from bidnerf_core.mapping.resection import log_likelihood_ratio, resect
+from bidnerf_core.mapping.rolling_shutter import STILL, MotionPrior, exposure_moments
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
-FOCAL = 400.0
+FOCAL, HEIGHT = 400.0, 480.0
 
 
 def observed(
@@ -33,7 +36,9 @@ def observed(
     eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
     focal = torch.full((count,), FOCAL, dtype=torch.float64)
     along = nothing + torch.tensor([0.0, 0.0, 1.0])
-    return ObservedPoints(points, nothing[:, :2], along, pixels / FOCAL, focal, nothing[:, 0], eye, nothing)
+    return ObservedPoints(
+        points, nothing[:, :2], along, pixels / FOCAL, focal, nothing[:, 0], eye, nothing, pixels[:, 1] / HEIGHT
+    )  # fmt: skip
 
 
 def error(T: SE3) -> float:
@@ -46,8 +51,8 @@ WRONG = Calibration(0.05, 0.01, -0.02, 0.03)
 
 def test_the_gradient_is_the_numerical_one() -> None:
     data, free = observed(noise=1.0), np.arange(4)
-    residuals = _Residuals(data, NEAR)
-    state = _State.of(NEAR, WRONG)
+    residuals = ReprojectionErrors(data, NEAR)
+    state = State.of(NEAR, WRONG)
 
     def cost(step: np.ndarray) -> float:
         return residuals.system(residuals.linearized(state.retracted(step, free), free), 0.7).cost
@@ -139,3 +144,81 @@ def test_outliers_do_not_move_the_pose() -> None:
     image = data.image.clone()
     image[::4] += 0.1  # 40 pixels
     assert error(resect(replace(data, image=image), NEAR, 2.0).T_world_rig) < 2e-3
+
+
+MOTION = torch.tensor([0.01, -0.02, 0.005, 0.01, 0.005, -0.015], dtype=torch.float64)
+OPEN = MotionPrior(move=0.05, turn=0.02)
+
+
+def observed_while_moving(motion: Tensor, noise: float = 0.0, seed: int = 0) -> ObservedPoints:
+    """The same points as a camera sees them whose pose at each row is that of the exponential of the motion so far."""
+    data = observed(seed=seed)
+    local = TRUE.inverse().apply(data.points)
+    moments = data.moments
+    for _ in range(20):  # the row on which a point appears depends on the pose at that row
+        there = SE3.exp(-moments[:, None] * motion).apply(local)
+        image = there[:, :2] / there[:, 2:]
+        moments = image[:, 1] * FOCAL / HEIGHT
+    random = torch.Generator().manual_seed(seed + 1)
+    off = noise / FOCAL * torch.randn(image.shape, generator=random, dtype=torch.float64)
+    return replace(data, image=image + off, moments=moments)
+
+
+def test_the_gradient_by_the_motion_is_the_numerical_one() -> None:
+    data, free = observed(noise=1.0), np.arange(4, 10)
+    errors, state = ReprojectionErrors(data, NEAR), State.of(NEAR)
+
+    def cost(step: np.ndarray) -> float:
+        return errors.system(errors.linearized(state.retracted(step, free), free), 0.7).cost
+
+    numerical = approx_fprime(np.zeros(12), cost, 1e-7)
+    gradient = errors.system(errors.linearized(state, free), 0.7).gradient
+    np.testing.assert_allclose(gradient, numerical, rtol=2e-3, atol=1e-2)
+
+
+def test_a_motion_between_rows_is_found_and_no_longer_shifts_the_pose() -> None:
+    data = observed_while_moving(MOTION)
+    found = resect(data, NEAR, 0.1, motion=OPEN)
+    torch.testing.assert_close(found.motion, MOTION, atol=3e-4, rtol=0)
+    assert error(found.T_world_rig) < 3e-4
+    assert error(resect(data, NEAR, 0.1).T_world_rig) > 10 * error(found.T_world_rig)
+    at_once = data.at_once(found.T_world_rig, found.motion)
+    assert float(at_once.residuals(found.T_world_rig).norm(dim=-1).max()) < 0.1
+
+
+def test_deviations_of_poses_with_motion_are_those_of_repeated_observations() -> None:
+    fits = [resect(observed_while_moving(MOTION, 0.5, seed), TRUE, 0.5, motion=OPEN) for seed in range(60)]
+    squared = [
+        float((off := (TRUE.inverse() @ fit.T_world_rig).log()) @ torch.linalg.solve(fit.covariance, off))
+        for fit in fits
+    ]
+    assert 4 < sum(squared) / len(squared) < 9  # chi-squared with six degrees of freedom
+
+
+@pytest.mark.parametrize(
+    ("motion", "evident"), [(MOTION, True), (0 * MOTION, False)], ids=["moving", "still"]
+)
+def test_the_evidence_for_a_motion_tells_whether_there_was_one(motion: Tensor, evident: bool) -> None:
+    for seed in range(10):
+        data = observed_while_moving(motion, 0.5, seed)
+        moving, still = (resect(data, TRUE, 0.5, motion=prior) for prior in (OPEN, STILL))
+        odds = log_likelihood_ratio(data, moving, still) + moving.log_occam_factor(OPEN)
+        assert (odds > 0) is evident
+
+
+def test_rows_of_upright_images_are_their_columns() -> None:
+    pixels = torch.tensor([[0.0, 0.0], [320.0, 120.0], [640.0, 480.0]])
+    wide = Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480)
+    upright = Intrinsics(400.0, 400.0, 240.0, 320.0, 480, 640)
+    assert exposure_moments(pixels, wide).tolist() == [-0.5, -0.25, 0.5]
+    assert exposure_moments(pixels.flip(-1), upright).tolist() == [-0.5, -0.25, 0.5]
+
+
+def test_a_change_of_the_calibration_moves_the_pose_by_its_slope_if_the_motion_follows() -> None:
+    data = observed_while_moving(MOTION)
+    still = resect(data, TRUE, 0.05, motion=OPEN)
+    for number, name in enumerate(("log_focal", "shift_u")):
+        changed = replace(GIVEN, **{name: 1e-3})
+        moved = resect(data, TRUE, 0.05, calibration=changed, motion=OPEN).T_world_rig
+        update = (still.T_world_rig.inverse() @ moved).log() / 1e-3
+        torch.testing.assert_close(update, still.slope[:, number], rtol=0.1, atol=0.1)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.mapping.calibration import Calibration
+from bidnerf_core.mapping.rolling_shutter import moved_points
 from bidnerf_core.se3 import SE3
 
 
@@ -24,6 +25,7 @@ class ObservedPoints:
     depth: Float[Tensor, "m"]  # metres, 0 where none was measured
     rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
     translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
+    moments: Float[Tensor, "m"]  # of exposure, as of ``exposure_moments``
 
     def __len__(self) -> int:
         return len(self.points)
@@ -35,6 +37,11 @@ class ObservedPoints:
         """Return the same pixels as observations of cameras whose calibration is corrected."""
         undistorted = calibration.undistorted(self.image, self.focal)
         return replace(self, image=undistorted, focal=self.focal * calibration.focal_factor)
+
+    def at_once(self, T_world_rig: SE3, motion: Float[Tensor, "6"]) -> ObservedPoints:
+        """Return the points where a camera that did not move would have seen them as one did that moved about this pose."""
+        rig = T_world_rig.inverse().apply(self.points)
+        return replace(self, points=T_world_rig.apply(moved_points(rig, self.moments, motion)))
 
     def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
         """Return each point in the frame of the camera that observed it."""

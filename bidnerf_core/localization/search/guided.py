@@ -16,6 +16,8 @@ from bidnerf_core.localization.search.correspondences import LandmarkMatches, Qu
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.reprojection import AT_REST
+from bidnerf_core.mapping.rolling_shutter import exposure_moments, moved_points
 from bidnerf_core.se3 import SE3
 
 CANDIDATES = 6
@@ -35,12 +37,14 @@ def guided_matches(
     radius: float,
     most_distance: float,
     calibration: Calibration = GIVEN,
+    motion: Float[Tensor, "6"] = AT_REST,
 ) -> LandmarkMatches:
     """Return the matches of keypoints with landmarks that project within ``radius`` pixels of them.
 
+    ``motion`` is that of a single camera while its rows were exposed.
     ``most_distance`` is the largest squared distance between the descriptors of a match.
     """
-    projections = projected_landmarks(images, landmarks, T_world_rig, calibration, radius)
+    projections = projected_landmarks(images, landmarks, T_world_rig, calibration, radius, motion)
     return LandmarkMatches.cat([found.matches(radius, most_distance) for found in projections])
 
 
@@ -50,10 +54,11 @@ def projected_landmarks(
     T_world_rig: SE3,
     calibration: Calibration,
     margin: float,
+    motion: Float[Tensor, "6"] = AT_REST,
 ) -> list[ProjectedLandmarks]:
     """Return the landmarks that each image should show, up to ``margin`` pixels beyond its edges."""
     return [
-        ProjectedLandmarks(number, image, landmarks, T_world_rig, calibration, margin)
+        ProjectedLandmarks(number, image, landmarks, T_world_rig, calibration, margin, motion)
         for number, image in enumerate(images)
     ]
 
@@ -69,6 +74,7 @@ class ProjectedLandmarks:
         T_world_rig: SE3,
         calibration: Calibration,
         margin: float,
+        motion: Float[Tensor, "6"] = AT_REST,
     ) -> None:
         self._number, self._image, self._landmarks = number, image, landmarks
         focal = image.focal * calibration.focal_factor
@@ -77,6 +83,10 @@ class ProjectedLandmarks:
         self._index = _visible(image, landmarks, T_world_camera, local, focal, margin).nonzero()[:, 0]
         local = local[self._index]
         self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
+        if bool(motion.any()):
+            moments = exposure_moments(self._pixels + _principal_point(image), image.intrinsics)
+            local = moved_points(local, moments, motion)
+            self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
         self._tree = cKDTree(self._pixels.numpy()) if len(self._pixels) else None
         self._sizes = landmarks.sizes[self._index] * focal / local[:, 2]
 
@@ -109,6 +119,10 @@ class ProjectedLandmarks:
         index = torch.from_numpy(np.asarray(found, dtype=np.int64))
         rows, columns = (index < len(self._pixels)).nonzero().unbind(-1)
         return rows, index[rows, columns]
+
+
+def _principal_point(image: QueryImage) -> Float[Tensor, "2"]:
+    return torch.tensor([image.intrinsics.cx, image.intrinsics.cy])
 
 
 def _visible(

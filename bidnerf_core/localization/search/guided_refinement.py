@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.search.evident_motion import evident_motion
 from bidnerf_core.localization.search.guided import (
     ProjectedLandmarks,
     guided_matches,
@@ -37,6 +38,7 @@ from bidnerf_core.mapping.calibration import (
 from bidnerf_core.mapping.features import NORM
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
+from bidnerf_core.mapping.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.se3 import SE3
 
 RADII = (3.0, 1.5)
@@ -126,6 +128,12 @@ def _settled(
     fit, found = _guided(query, prior, fit, found, most, RADII)
     correlation = query.landmarks.correlation_of(len(found))
     free, crop = _with_free_camera(query, fit, found, open_camera=prior.log_focal > 0)
+    motion = STILL  # views of a rig may be of different moments
+    if len(query.images) == 1:
+        motion = evident_motion(query.observed(found), free, correlation)
+    if motion != STILL:
+        fit, found = _guided(query, prior, fit, found, most, RADII[1:], motion)
+        free, crop = _with_free_camera(query, fit, found, prior.log_focal > 0, motion)
     evidence, approximate = query.evidence, query.prior.log_focal > 0
     camera = query.map_camera_near(free.calibration)
     taken = taken_intrinsics(free, query.landmarks, camera, approximate, evidence.map_camera)
@@ -134,26 +142,33 @@ def _settled(
     certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_BY_OTHERS
     if approximate and crop > POSSIBLE:
         taken = TakenIntrinsics()
-        fit, found = _guided(query, ANY, free, found, most, RADII[1:])
+        fit, found = _guided(query, ANY, free, found, most, RADII[1:], motion)
     elif wrong.worst[1] > certain and not POSSIBLE < crop < PROBABLE:
         taken = TakenIntrinsics()
         prior = wrong.prior(query.prior if approximate else DOUBTED, crop >= PROBABLE)
-        fit, found = _guided(query, prior, free, found, most, RADII[1:])
+        fit, found = _guided(query, prior, free, found, most, RADII[1:], motion)
     elif taken.camera is not None:
         query = query.seen_by([taken.camera.intrinsics] * len(query.images))
-        fit = resect(query.observed(found), free.T_world_rig, free.noise, FIXED, GIVEN, correlation)
-        fit, found = _guided(query, FIXED, fit, found, most, RADII[1:])
+        fit = resect(query.observed(found), free.T_world_rig, free.noise, FIXED, GIVEN, correlation, motion)
+        fit, found = _guided(query, FIXED, fit, found, most, RADII[1:], motion)
     elif prior != query.prior:
-        fit = resect(query.observed(found), free.T_world_rig, free.noise, query.prior, GIVEN, correlation)
-        fit, found = _guided(query, query.prior, fit, found, most, RADII[1:])
+        prior = query.prior
+        fit = resect(query.observed(found), free.T_world_rig, free.noise, prior, GIVEN, correlation, motion)
+        fit, found = _guided(query, prior, fit, found, most, RADII[1:], motion)
     radius = RADII[-1] * query.threshold
-    projections = projected_landmarks(query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius)
+    projections = projected_landmarks(
+        query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius, fit.motion
+    )
     visible, chance = sum(map(len, projections)), matches_by_chance(projections, radius, most)
     return GuidedPose(query, fit, found, visible, chance, taken, wrong)
 
 
 def _with_free_camera(
-    query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches, open_camera: bool
+    query: LandmarkQuery,
+    fit: ReprojectionFit,
+    found: LandmarkMatches,
+    open_camera: bool,
+    motion: MotionPrior = STILL,
 ) -> tuple[ReprojectionFit, float]:
     """Return a fit of the intrinsics along with the pose, and the probability that the image is a part of one.
 
@@ -161,7 +176,7 @@ def _with_free_camera(
     """
     data, correlation = query.observed(found), query.landmarks.correlation_of(len(found))
     part, whole = (
-        resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation)
+        resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation, motion)
         for prior in (ANY if open_camera else CROPPED, NOMINAL)
     )
     ratio = log_likelihood_ratio(data, part, whole, correlation)
@@ -176,12 +191,14 @@ def _guided(
     found: LandmarkMatches,
     most: float,
     radii: Sequence[float],
+    motion: MotionPrior = STILL,
 ) -> tuple[ReprojectionFit, LandmarkMatches]:
     """Match near the projections and fit the pose to the matches, in rounds."""
     for radius in (*radii[:-1], *[radii[-1]] * GUIDED_ROUNDS):
         guided = guided_matches(
-            query.images, query.landmarks, fit.T_world_rig, radius * query.threshold, most, fit.calibration
-        )
+            query.images, query.landmarks, fit.T_world_rig, radius * query.threshold, most, fit.calibration,
+            fit.motion,
+        )  # fmt: skip
         data = query.observed(guided)
         agrees = _depth_agrees(data, fit.T_world_rig)
         guided, data = guided[agrees], data[agrees]
@@ -189,7 +206,7 @@ def _guided(
             break
         changed, found = _changed(guided, found), guided
         correlation = query.landmarks.correlation_of(len(found))
-        fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation)
+        fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation, motion)
         if changed <= UNCHANGED:
             break
     return fit, found

@@ -27,10 +27,13 @@ def described(
     query: LandmarkQuery, matches: LandmarkMatches, answer: GuidedPose, seconds: dict[str, float]
 ) -> LandmarkPose:
     """Return a refined pose with the evidence for it; ``matches`` are those by descriptors alone."""
-    given = query.observed(matches)
-    fit, query, camera = answer.fit, answer.query, answer.taken.camera
-    data = query.observed(answer.correspondences).corrected(fit.calibration)
-    by_descriptors = query.observed(matches).corrected(fit.calibration)
+    fit = answer.fit
+    given = query.observed(matches).at_once(fit.T_world_rig, fit.motion)
+    query, camera = answer.query, answer.taken.camera
+    data, by_descriptors = (
+        query.observed(found).at_once(fit.T_world_rig, fit.motion).corrected(fit.calibration)
+        for found in (answer.correspondences, matches)
+    )
     off = by_descriptors.residuals(fit.T_world_rig)
     agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= query.threshold).sum())
     return LandmarkPose(
@@ -55,6 +58,7 @@ def described(
         intrinsics=None if camera is None else camera.intrinsics,
         calibration_deviations=fit.calibration_deviations,
         slope=fit.slope,
+        motion=fit.motion,
         miscalibration=answer.miscalibration,
         calibration_scatter=query.landmarks.calibration_scatter,
         depth_scale=depth_scale(data, fit.T_world_rig),

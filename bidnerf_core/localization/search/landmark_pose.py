@@ -70,6 +70,9 @@ class LandmarkPose:
     )
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
     slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each of them
+    motion: Float[
+        Tensor, "6"
+    ]  # of the camera while its rows were exposed, as of ``rolling_shutter``; 0 if none is evident
     miscalibration: Miscalibration
     calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones

@@ -27,7 +27,7 @@ from bidnerf_core.localization.search.landmark_query import LandmarkQuery, pixel
 from bidnerf_core.localization.search.matching import EXHAUSTIVE, LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import Miscalibration, TakenIntrinsics
 from bidnerf_core.localization.search.unguided import unguided_matches
-from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose
+from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose, with_motion
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL
 from bidnerf_core.mapping.features import Features
 from bidnerf_core.mapping.landmarks import LandmarkMap
@@ -104,6 +104,7 @@ class LandmarkDetector:
         if seen is None:
             return None
         points, found, _ = seen
+        found = with_motion(found, self.landmarks.correlation_of(len(points)))
         evidence = _guided_evidence(query, found, tight, most_distance)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
         points = replace(points, landmark=number[points.landmark])
@@ -203,6 +204,7 @@ def landmark_pose(
         calibration=GIVEN,
         calibration_deviations=fit.calibration_deviations,
         slope=fit.slope,
+        motion=fit.motion,
         miscalibration=miscalibration,
         calibration_scatter=landmarks.calibration_scatter,
         intrinsics=None,

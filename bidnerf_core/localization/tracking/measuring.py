@@ -40,7 +40,7 @@ from bidnerf_core.localization.tracking.detection import (
 from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.judging import not_by_chance, precise_enough, unconfirmed
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
-from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose
+from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
 from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
@@ -109,6 +109,7 @@ class ByLandmarks:
         found = fit_pose(
             points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation
         )
+        found = None if found is None else with_motion(found, correlation)
         judged = measured = None
         state = replace(state, age=state.age + 1)
         if found is not None:

@@ -12,11 +12,13 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame
+from bidnerf_core.localization.search.evident_motion import evident_motion
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, resect
+from bidnerf_core.mapping.rolling_shutter import STILL, exposure_moments
 from bidnerf_core.se3 import SE3
 
 LEAST_FOLLOWED = 6
@@ -79,6 +81,7 @@ class FollowedPoints:
             measured_depth(frame, self.pixels),
             torch.eye(3, dtype=torch.float64).expand(count, 3, 3),
             torch.zeros((count, 3), dtype=torch.float64),
+            exposure_moments(self.pixels, camera),
         )
 
 
@@ -124,6 +127,19 @@ def fit_pose(
     better = resect(data[consensus.inliers], consensus.T_world_rig, threshold / 2, correlation=correlation)
     other = PointFit(better, data, _inliers(data, better))
     return other if other.within(threshold) > found.within(threshold) else found
+
+
+def with_motion(found: PointFit, correlation: float) -> PointFit:
+    """Return a fit with the motion of the camera while its rows were exposed, if there evidently was one.
+
+    Its data are then the points as a camera that did not move would have seen them.
+    """
+    motion = evident_motion(found.data[found.inliers], found.fit, correlation)
+    if motion == STILL:
+        return found
+    fit = resect(found.data, found.T_world_camera, found.fit.noise, correlation=correlation, motion=motion)
+    data = found.data.at_once(fit.T_world_rig, fit.motion)
+    return PointFit(fit, data, _inliers(data, fit))
 
 
 def _inliers(data: ObservedPoints, fit: ReprojectionFit) -> Bool[Tensor, "m"]:

@@ -1,0 +1,55 @@
+"""A dataset of a scene of which there is only a map, such as weights that others trained.
+
+    bidnerf render MAP DATA --split train --out RENDERS/train
+    bidnerf render MAP DATA --split test --out RENDERS/test
+    python benchmarks/rendered_scene.py RENDERS DATA --out FOLDER
+
+Takes what ``bidnerf render`` wrote for the poses of ``DATA``, and writes a folder of ``transforms_SPLIT.json``, images with an
+alpha channel (0 where the map has no depth) and depth, on which maps can be trained and poses found as on any other.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import torch
+
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets.writing import write_transforms
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames import View
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def rendered(view: View, folder: Path) -> View:
+    """Return a view with the colours and the depth in ``folder`` instead of its own."""
+    name = view.frame.name
+    try:
+        rgb = torch.from_numpy(iio.imread(folder / f"{name}.png")).float() / 255
+        depth = torch.from_numpy(iio.imread(folder / f"{name}.depth.png").astype("int32")).float() / 1000
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}, expected what 'bidnerf render' wrote") from error
+    return replace(
+        view, frame=replace(view.frame, rgb=rgb, depth=depth, alpha=(depth > 0).float(), hidden=None)
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("renders", type=Path, help="folder with a folder of renderings for each split")
+    parser.add_argument("data", type=Path, help="dataset whose poses were rendered")
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    dataset = open_dataset(given.data, WHITE)
+    splits = [folder.name for folder in sorted(given.renders.iterdir()) if folder.is_dir()]
+    views = {split: [rendered(view, given.renders / split) for view in dataset.views(split)] for split in splits}
+    write_transforms(given.out, views, WHITE)
+    print(f"{given.out}: " + ", ".join(f"{len(part)} {split}" for split, part in views.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""Rolling shutters: the rows of an image are exposed one after the other, while the camera moves.
+
+The motion is the right update of the camera's pose from the first row to the last (translation first, in the camera's frame), at
+a constant velocity; the pose itself is that of the middle row (Hedborg et al., Rolling shutter bundle adjustment, CVPR 2012).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera import Intrinsics
+from bidnerf_core.rotations import cross_matrix
+
+MOVE, TURN = 0.005, 0.01
+"""Usual motion of a hand-held camera while its rows are exposed, some hundredths of a second: translation along each axis as a share
+of the distance of what it sees, and rotation about each axis, radians.
+"""
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """Standard deviations of the motion from the first row to the last."""
+
+    move: float = 0.0  # metres
+    turn: float = 0.0  # radians
+
+    @property
+    def deviations(self) -> Float[Tensor, "6"]:
+        return torch.tensor([self.move] * 3 + [self.turn] * 3, dtype=torch.float64)
+
+    @staticmethod
+    def usual(distance: float) -> MotionPrior:
+        """Return that of a hand-held camera which sees things at a ``distance``, metres."""
+        return MotionPrior(MOVE * distance, TURN)
+
+
+STILL = MotionPrior()
+"""A camera that does not move, or whose rows are exposed at once."""
+
+
+def exposure_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
+    """Return when each pixel was exposed, in times from the first row to the last, from the middle one on: -0.5 to 0.5.
+
+    Sensors are wider than high, so that the rows of an upright image are its columns. In which order they are exposed does not
+    matter: the motion is reversed with it.
+    """
+    upright = camera.height > camera.width
+    across, size = (pixels[:, 0], camera.width) if upright else (pixels[:, 1], camera.height)
+    return across.double() / size - 0.5
+
+
+def moved_points(
+    points: Float[Tensor, "m 3"], moments: Float[Tensor, "m"], motion: Float[Tensor, "6"]
+) -> Float[Tensor, "m 3"]:
+    """Return points in the frame of the camera at their moments, from those in its frame at the middle row."""
+    found = moved_array(points.double().numpy(), moments.numpy(), motion.numpy())
+    return torch.from_numpy(found).to(points.dtype)
+
+
+def moved_array(
+    points: Float[np.ndarray, "m 3"], moments: Float[np.ndarray, "m"], motion: Float[np.ndarray, "6"]
+) -> Float[np.ndarray, "m 3"]:
+    """Return ``moved_points`` of arrays: the inverse of the exponential of the motion so far, to second order."""
+    turning = cross_matrix(motion[3:]).T
+    velocity = motion[:3] + points @ turning
+    times = moments[:, None]
+    moved: np.ndarray = points - times * velocity + 0.5 * times**2 * (velocity @ turning)
+    return moved
