@@ -39,14 +39,18 @@ def rendered(view: View, folder: Path) -> View:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("renders", type=Path, help="folder with a folder of renderings for each split")
     parser.add_argument("data", type=Path, help="dataset whose poses were rendered")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     dataset = open_dataset(given.data, WHITE)
     splits = [folder.name for folder in sorted(given.renders.iterdir()) if folder.is_dir()]
-    views = {split: [rendered(view, given.renders / split) for view in dataset.views(split)] for split in splits}
+    views = {
+        split: [rendered(view, given.renders / split) for view in dataset.views(split)] for split in splits
+    }
     write_transforms(given.out, views, WHITE)
     print(f"{given.out}: " + ", ".join(f"{len(part)} {split}" for split, part in views.items()))
 

@@ -113,6 +113,9 @@ class LandmarkDiagnostics:
     searched: bool  # whether landmarks found the pose, or only confirm one that was found on the surface
     on_surface: float | None = None  # share of the measured points that lie on the surface
     colour_inliers: float | None = None  # share that lies there and has its colour
+    rolling_shutter: bool = (
+        False  # whether the motion of the camera while its rows were exposed was estimated along
+    )
 
 
 def landmark_diagnostics(
@@ -127,7 +130,7 @@ def landmark_diagnostics(
     return LandmarkDiagnostics(
         found.inliers, found.matches, found.agreeing, found.log10_nfa, found.chance, found.visible,
         found.keypoints, found.spread, found.noise_ratio, wrong, found.position_deviation / found.distance,
-        found.estimates_calibration, searched, near, both,
+        found.estimates_calibration, searched, near, both, found.has_motion,
     )  # fmt: skip
 
 
@@ -136,7 +139,7 @@ class LandmarkThresholds:
     """Thresholds for accepting a pose by landmarks. They have no units, so they suit every scene and image."""
 
     log10_nfa: float = -12.0  # logarithm of the number of such agreements expected by chance, at most
-    # correspondences within three standard deviations, at least; in proportion more if intrinsics are unknowns too
+    # correspondences within three standard deviations, at least; in proportion more if intrinsics or a motion are unknowns too
     inliers: int = 15
     above_chance: float = 3.0  # times as many as at a wrong pose, at least
     spread: float = 0.06  # share of the image's cells that hold one, at least
@@ -152,7 +155,7 @@ class LandmarkThresholds:
 def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = LandmarkThresholds()) -> Verdict:
     """Judge a pose by how many landmarks agree with it, compared with chance, and how much of the image they cover."""
     share = f"{found.inliers} landmarks agree"
-    unknowns = 10 if found.estimates_calibration else 6
+    unknowns = 6 + (4 if found.estimates_calibration else 0) + (6 if found.has_motion else 0)
     if found.log10_nfa > thresholds.log10_nfa or found.inliers < thresholds.inliers * unknowns / 6:
         return Verdict(Outcome.TOO_FEW_MATCHES, f"only {share} ({found.agreeing} of {found.matches} matches)")
     if found.inliers < thresholds.above_chance * found.chance:
@@ -191,7 +194,8 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         with_others = f", with {whose} intrinsics" + (
             f": {found.camera_sentence}" if found.changes_camera else ""
         )
-    return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{with_others}")
+    moving = ", with the motion of a rolling shutter" if found.has_motion else ""
+    return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{moving}{with_others}")
 
 
 def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> bool:

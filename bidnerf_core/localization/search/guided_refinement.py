@@ -129,7 +129,7 @@ def _settled(
     correlation = query.landmarks.correlation_of(len(found))
     free, crop = _with_free_camera(query, fit, found, open_camera=prior.log_focal > 0)
     motion = STILL  # views of a rig may be of different moments
-    if len(query.images) == 1:
+    if query.moving and len(query.images) == 1:
         motion = evident_motion(query.observed(found), free, correlation)
     if motion != STILL:
         fit, found = _guided(query, prior, fit, found, most, RADII[1:], motion)

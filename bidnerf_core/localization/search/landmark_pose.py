@@ -122,6 +122,11 @@ class LandmarkPose:
         return bool((self.calibration_deviations > 0).any())
 
     @property
+    def has_motion(self) -> bool:
+        """Whether the motion of the camera while its rows were exposed was estimated with the pose."""
+        return bool(self.motion.any())
+
+    @property
     def takes_map_camera(self) -> bool:
         """Whether the intrinsics are those of the map's images, in place of the given ones."""
         return self.intrinsics is not None

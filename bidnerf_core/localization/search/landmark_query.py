@@ -31,6 +31,7 @@ class LandmarkQuery:
     landmarks: LandmarkMap
     prior: CalibrationPrior
     evidence: CameraEvidence = NO_EVIDENCE
+    moving: bool = True  # whether the camera of a single image may have moved while its rows were exposed
 
     @property
     def threshold(self) -> float:

@@ -47,19 +47,21 @@ def propose(
     prior: CalibrationPrior | None = None,
     evidence: CameraEvidence = NO_EVIDENCE,
     seek_twin: bool = False,
+    moving: bool = True,
 ) -> LandmarkPose | None:
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
     ``prior`` says how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal
     length is approximate. One correction is estimated for all views; those of different cameras are taken as given.
-    ``evidence``: what else is known of the camera. ``seek_twin`` says to look for another place that the images may show.
+    ``evidence``: what else is known of the camera. ``seek_twin`` says to look for another place that the images may show, and
+    ``moving`` to estimate how the camera moved while the rows of its image were exposed, where that is evident.
     Raises ``InputError`` if there is no view.
     """
     if not views:
         raise InputError("nothing to localize: expected at least one view")
     prior = _calibration_prior(views) if prior is None else prior
     clock = Stopwatch()
-    query = LandmarkQuery(query_images(views, features), matcher.landmarks, prior, evidence)
+    query = LandmarkQuery(query_images(views, features), matcher.landmarks, prior, evidence, moving)
     clock.lap("descriptors")
     matches, first = _first_pose(query, matcher, seed, clock)
     if first is None:
