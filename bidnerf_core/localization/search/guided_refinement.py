@@ -126,14 +126,15 @@ def _settled(
     ``prior`` says how uncertain they are before that is known.
     """
     fit, found = _guided(query, prior, fit, found, most, RADII)
-    correlation = query.landmarks.correlation_of(len(found))
-    free, crop = _with_free_camera(query, fit, found, open_camera=prior.log_focal > 0)
-    motion = STILL  # views of a rig may be of different moments
-    if query.moving and len(query.images) == 1:
-        motion = evident_motion(query.observed(found), free, correlation)
+    open_camera, motion = prior.log_focal > 0, STILL
+    free, crop = _with_free_camera(query, fit, found, open_camera)
+    if query.moving and len(query.images) == 1:  # views of a rig may be of different moments
+        correlation = query.landmarks.correlation_of(len(found))
+        motion = evident_motion(query.observed(found), free, correlation, ANY if crop > POSSIBLE else NOMINAL)
     if motion != STILL:
         fit, found = _guided(query, prior, fit, found, most, RADII[1:], motion)
-        free, crop = _with_free_camera(query, fit, found, prior.log_focal > 0, motion)
+        free, crop = _with_free_camera(query, fit, found, open_camera, motion)
+    correlation = query.landmarks.correlation_of(len(found))
     evidence, approximate = query.evidence, query.prior.log_focal > 0
     camera = query.map_camera_near(free.calibration)
     taken = taken_intrinsics(free, query.landmarks, camera, approximate, evidence.map_camera)
