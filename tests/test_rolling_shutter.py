@@ -1,0 +1,83 @@
+"""Poses of images whose rows were exposed one after the other, while the camera turned."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core import Localizer, View
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.evaluation.faults.camera import rolling_shutter
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.se3 import SE3
+from textured_field import textured_map, unseen
+
+TRUTH = unseen().T_ref_camera
+CHI2_99 = 16.8  # of six degrees of freedom
+
+
+@functools.cache
+def matcher() -> LandmarkMatcher:
+    landmarks = textured_map().landmarks
+    assert landmarks is not None
+    scatter = torch.full((4,), 0.01, dtype=torch.float64)  # as a trial of these exact images would find
+    return LandmarkMatcher(replace(landmarks, calibration_scatter=scatter, correlation=1.0))
+
+
+def photo(degrees: float = 0.0, seed: int = 0) -> View:
+    """Return an image without depth, taken while the camera turned by so many degrees from the first row to the last."""
+    view = unseen()
+    frame = rolling_shutter(view.frame, degrees, torch.Generator().manual_seed(seed))
+    return replace(view, frame=replace(frame, depth=None))
+
+
+def found(*views: View, moving: bool = True) -> LandmarkPose:
+    pose = propose(matcher(), views, moving=moving)
+    assert pose is not None
+    return pose
+
+
+def squared_distance(T: SE3, covariance: Tensor) -> float:
+    """Return the squared Mahalanobis distance of the true pose."""
+    xi = (T.inverse() @ TRUTH).log()
+    return float(xi @ torch.linalg.solve(covariance, xi))
+
+
+def off(pose: LandmarkPose) -> float:
+    """Return the error of a pose in degrees."""
+    return float(pose_error(pose.T_world_camera, TRUTH).rotation_deg)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_motion_is_estimated_and_hardly_shifts_the_pose_any_longer(seed: int) -> None:
+    view = photo(2.0, seed)
+    pose, taken_as_still = found(view), found(view, moving=False)
+    assert pose.has_motion
+    assert not taken_as_still.has_motion
+    assert off(pose) < 0.6 * off(taken_as_still)
+    assert pose.noise < taken_as_still.noise
+    assert squared_distance(pose.T_world_camera, pose.full_covariance) < CHI2_99
+    assert squared_distance(taken_as_still.T_world_camera, taken_as_still.full_covariance) > CHI2_99
+
+
+def test_an_image_that_was_exposed_at_once_shows_no_motion() -> None:
+    assert not found(photo()).has_motion
+
+
+def test_views_of_a_rig_are_taken_as_still() -> None:
+    assert not found(photo(2.0), photo(2.0)).has_motion
+
+
+def test_answers_tell_of_the_motion() -> None:
+    answer = Localizer(replace(textured_map(), landmarks=matcher().landmarks))(photo(2.0).frame)
+    assert answer.converged
+    assert "rolling shutter" in answer.reason
+    assert isinstance(answer.diagnostics, LandmarkDiagnostics)
+    assert answer.diagnostics.rolling_shutter
