@@ -116,14 +116,27 @@ def test_a_file_that_cannot_be_read_is_left_out(bidnerf: Run, tmp_path: Path) ->
     assert len(images) == FRAMES
     images[2].write_bytes(images[2].read_bytes()[:200])
     status, out, err = bidnerf("track", "MAP", broken, "--out", tmp_path / "path.txt")
-    assert status == 0, err
+    assert status == 1
+    assert err.endswith(f"bidnerf track: 1 of {FRAMES} frames could not be read, see above\n")
     assert str(images[2]) in err
     assert "; left out" in err
     assert re.search(r"not read +1 frame\b", out)
     assert read_trajectory(tmp_path / "path.txt").times.tolist() == [0, 1, 3, 4, 5]
     status, _, err = bidnerf("track", "MAP", broken, "--out", tmp_path / "path.txt", "--every", "2")
-    assert status == 0, err
+    assert status == 1, err
     assert read_trajectory(tmp_path / "path.txt").times.tolist() == [0, 4]
+
+
+def test_frames_of_another_scene_are_doubted(bidnerf: Run, tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    (tmp_path / "images").mkdir()
+    for number in range(3):
+        noise = random.integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+        iio.imwrite(tmp_path / "images" / f"{number}.png", noise)
+    track = ("track", "MAP", tmp_path / "images", "--out", tmp_path / "path.json", "--hfov", "60")
+    status, _, err = bidnerf(*track)
+    assert status == 0, err
+    assert err.splitlines()[-1].endswith("no frame was recognised; do they show the scene of this map?")
 
 
 def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import imageio.v3 as iio
 from torch import Tensor
 
+from bidnerf_core.cli.another_scene import doubt
 from bidnerf_core.cli.common import UsageError, print_json, say, show
 from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.queries import Query
@@ -19,19 +20,13 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.trials import plain_localization
 from bidnerf_core.files import write_file
-from bidnerf_core.localization import Localization, Outcome
+from bidnerf_core.localization import Localization
 from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import Map
 
 TRANSFORMS = "transforms.json"
 WRITERS = {ending: write for ending, write in POSE_WRITERS.items() if ending != ".json"}
 """Files of poses alone, by the ending of their names; ``.json`` is the list of what ``--json`` prints."""
-RECOGNISED = {
-    Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN
-}  # fmt: skip
-"""Outcomes of images that show the scene."""
-SEVERAL = 3
-"""Least number of queries that all have to be rejected for the map to be doubted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,19 +132,14 @@ class Answers:
         """
         accepted = [answer.posed for answer in self._given if answer.found.converged]
         if self._total > 1:
-            doubt = "; do they show the scene of this map?" if self._shows_another_scene() else ""
-            say(f"{len(accepted)} of {self._total} converged{doubt}")
+            outcomes = [answer.found.outcome for answer in self._given]
+            say(f"{len(accepted)} of {self._total} converged{doubt(outcomes)}")
         if self._spec.out is not None:
             self._write(self._spec.out, accepted)
         if self.failures:
             raise InputError(
                 f"{self.failures} of {self._total} queries could not be read or localized, see above"
             )
-
-    def _shows_another_scene(self) -> bool:
-        """Whether several queries were all rejected, and none as one that shows the scene but does not tell its pose well enough."""
-        outcomes = {answer.found.outcome for answer in self._given}
-        return len(self._given) >= SEVERAL and not outcomes & RECOGNISED
 
     def _write(self, out: Path, accepted: list[PosedImage]) -> None:
         if _ending(out) == ".json":

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import tyro
 
+from bidnerf_core.cli.another_scene import doubt
 from bidnerf_core.cli.camera_options import (
     CameraFile,
     DepthSensorName,
@@ -146,6 +147,8 @@ def run(arguments: list[str]) -> None:
                 path.plot(plot, stored.surface)
             if not follow and path.frames:
                 print_table(path.table(seconds))
+                if question := doubt([frame.found.outcome for frame in path.frames]):
+                    say(f"no frame was recognised{question}")
 
     parse("track", track, arguments)
 
@@ -187,7 +190,10 @@ def _of_split(frames: FrameSequence, split: str) -> FileSequence:
 
 
 def _track(frames: FrameSequence, step: _Step, every: int) -> None:
-    """Track every n-th frame. One whose files cannot be read is named and left out, unless the first ones all are."""
+    """Track every n-th frame. One whose files cannot be read is named and left out, unless the first ones all are.
+
+    Raises ``InputError`` at the end if there was one.
+    """
     total = -(-len(frames) // every)
     with counted("tracking", "frames", total) as report:
         for number, timed in enumerate(_chosen(frames, every)):
@@ -199,6 +205,8 @@ def _track(frames: FrameSequence, step: _Step, every: int) -> None:
                 say(f"{timed}; left out")
                 step.path.unread += 1
             report(number + 1, total)
+    if step.path.unread:
+        raise InputError(f"{step.path.unread} of {amount(total, 'frame')} could not be read, see above")
 
 
 def _chosen(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:
