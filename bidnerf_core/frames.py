@@ -228,6 +228,9 @@ class View:
     frame: Frame
     T_ref_camera: SE3
     landmarks: SeenLandmarks | None = None  # those that training takes distances from
+    motion: Float[Tensor, "6"] | None = None
+    """Motion of the camera while its rows were exposed one after the other, see ``rolling_shutter``; the pose is then that of the
+    middle row."""
 
     def to(self, device: torch.device | str) -> View:
         """Return the view with its images and its pose on ``device``."""

@@ -16,7 +16,7 @@ from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.reprojection import ReprojectionErrors, State
 from bidnerf_core.mapping.resection import log_likelihood_ratio, resect
-from bidnerf_core.mapping.rolling_shutter import STILL, MotionPrior, exposure_moments
+from bidnerf_core.rolling_shutter import STILL, MotionPrior, exposure_moments
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
 FOCAL, HEIGHT = 400.0, 480.0

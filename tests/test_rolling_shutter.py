@@ -16,6 +16,7 @@ from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.pixels import observe
 from bidnerf_core.se3 import SE3
 from textured_field import textured_map, unseen
 
@@ -81,3 +82,17 @@ def test_answers_tell_of_the_motion() -> None:
     assert "rolling shutter" in answer.reason
     assert isinstance(answer.diagnostics, LandmarkDiagnostics)
     assert answer.diagnostics.rolling_shutter
+
+
+def test_rays_of_a_moving_view_start_where_the_camera_was_at_their_rows() -> None:
+    view = unseen()
+    camera = view.frame.intrinsics
+    motion = torch.tensor([0.02, -0.01, 0.03, 0.01, 0.03, -0.02], dtype=torch.float64)
+    pixels = torch.tensor([[10, 0], [10, camera.height // 2], [30, camera.height - 1]])
+    found = observe(replace(view, motion=motion), pixels, torch.float64)
+    for number, (_, row) in enumerate(pixels.tolist()):
+        moment = (row + 0.5) / camera.height - 0.5
+        there = replace(view, T_ref_camera=TRUTH @ SE3.exp(moment * motion))
+        expected = observe(there, pixels[number : number + 1], torch.float64)
+        torch.testing.assert_close(found.origins[number], expected.origins[0])
+        torch.testing.assert_close(found.points[number], expected.points[0])

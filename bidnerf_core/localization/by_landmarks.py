@@ -177,7 +177,7 @@ def _judged(answer: LandmarkAnswer, approximate: bool) -> LandmarkAnswer:
 
 
 def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Problem:
-    """Return the problem from the pose found, with its intrinsics and with measured depth on the map's scale.
+    """Return the problem from the pose found, with its intrinsics and its motion, and with measured depth on the map's scale.
 
     ``factor`` is what the fused pose corrects that scale by.
     """
@@ -185,7 +185,8 @@ def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Pro
     for view in problem.views:
         depth = None if view.frame.depth is None else view.frame.depth * scale
         camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics
-        views.append(replace(view, frame=replace(view.frame, depth=depth, intrinsics=camera)))
+        frame = replace(view.frame, depth=depth, intrinsics=camera)
+        views.append(replace(view, frame=frame, motion=found.motion))
     return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 

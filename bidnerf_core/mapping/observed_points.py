@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.mapping.calibration import Calibration
-from bidnerf_core.mapping.rolling_shutter import moved_points
+from bidnerf_core.rolling_shutter import moved_points
 from bidnerf_core.se3 import SE3
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.robust_equations import System, robust_spread
-from bidnerf_core.mapping.rolling_shutter import moved_array
+from bidnerf_core.rolling_shutter import moved_array
 from bidnerf_core.rotations import rotation_of
 from bidnerf_core.se3 import SE3
 

@@ -17,7 +17,7 @@ from bidnerf_core.mapping.calibration import FIXED, GIVEN, Calibration, Calibrat
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.reprojection import Linearization, ReprojectionErrors, State
 from bidnerf_core.mapping.robust_equations import System, damped_solution
-from bidnerf_core.mapping.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.se3 import SE3
 
 RESECTION_STEPS = 20

@@ -15,7 +15,7 @@ from bidnerf_core.mapping.features import Features, Keypoints
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.rolling_shutter import exposure_moments
+from bidnerf_core.rolling_shutter import exposure_moments
 from bidnerf_core.se3 import SE3
 
 

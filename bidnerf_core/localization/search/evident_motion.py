@@ -5,7 +5,7 @@ from __future__ import annotations
 from bidnerf_core.mapping.calibration import NOMINAL, CalibrationPrior
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
-from bidnerf_core.mapping.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
 EVIDENT = 3.0
 """Logarithm of the odds from which on a camera is taken to have moved while its rows were exposed."""

@@ -17,7 +17,7 @@ from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.reprojection import AT_REST
-from bidnerf_core.mapping.rolling_shutter import exposure_moments, moved_points
+from bidnerf_core.rolling_shutter import exposure_moments, moved_points
 from bidnerf_core.se3 import SE3
 
 CANDIDATES = 6

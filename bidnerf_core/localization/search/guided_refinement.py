@@ -38,7 +38,7 @@ from bidnerf_core.mapping.calibration import (
 from bidnerf_core.mapping.features import NORM
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
-from bidnerf_core.mapping.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.se3 import SE3
 
 RADII = (3.0, 1.5)

@@ -47,13 +47,20 @@ class CloudInCamera:
     T_world_camera: SE3
 
 
-def measured_cloud(frame: Frame, count: int, scale: float, generator: Generator) -> PointCloud:
+def measured_cloud(
+    frame: Frame,
+    count: int,
+    scale: float,
+    generator: Generator,
+    motion: Float[Tensor, "6"] | None = None,
+) -> PointCloud:
     """Return up to ``count`` of a frame's measured points in the camera's frame; depth is multiplied by ``scale``.
 
+    ``motion`` is that of the camera while its rows were exposed, where it is known.
     Pixels are drawn without a look at all of them, which would take longer than what is done with the few; a pixel may be
     drawn twice. Where the depth is sparse, every measured pixel is a candidate.
     """
-    view, depth = View(frame, SE3.identity()), frame.depth
+    view, depth = View(frame, SE3.identity(), motion=motion), frame.depth
     assert depth is not None
     drawn = torch.randint(depth.numel(), (DRAWN * count,), generator=generator)
     drawn = drawn[(depth.flatten()[drawn] > 0).nonzero()[:count, 0]]

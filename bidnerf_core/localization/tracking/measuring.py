@@ -13,7 +13,6 @@ from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
-from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import INDEPENDENT
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.problem import SceneMap, rig
@@ -209,7 +208,9 @@ class ByLandmarks:
         if scale.objection is not None:
             verdict = replace(verdict, reason=f"{verdict.reason}, without depth: {scale.objection}")
             return Measurement(pose, verdict, found.noise, state)
-        here = CloudInCamera(self._cloud(frame, scale, state.frames), found.T_world_camera)
+        drawn = Generator().manual_seed(state.frames)
+        points = measured_cloud(frame, self.config.depth_points, scale.estimate, drawn, found.motion)
+        here = CloudInCamera(points, found.T_world_camera)
         cloud = joined_clouds(here, state.window)
         pose = fused_with_surface(pose, surface, cloud, self.config.depth_steps, 1 + len(state.window))
         kept_clouds = (*state.window, here)[-(self.config.window - 1) :] if self.config.window > 1 else ()
@@ -222,10 +223,6 @@ class ByLandmarks:
         correlation = landmarks.correlation_of(len(found.correspondences))
         noise = (found.covariance - found.map_covariance) / correlation
         return PoseEstimate(found.T_world_camera, noise, found.full_covariance - noise)
-
-    def _cloud(self, frame: Frame, scale: DepthScale, seed: int) -> PointCloud:
-        generator = Generator().manual_seed(seed)
-        return measured_cloud(frame, self.config.depth_points, scale.estimate, generator)
 
 
 def search_radius(predicted: Motion, camera: Intrinsics) -> float:

@@ -18,7 +18,7 @@ from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, resect
-from bidnerf_core.mapping.rolling_shutter import STILL, exposure_moments
+from bidnerf_core.rolling_shutter import STILL, exposure_moments
 from bidnerf_core.se3 import SE3
 
 LEAST_FOLLOWED = 6

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.rotations import cross_matrix
+from bidnerf_core.se3 import SE3
 
 MOVE, TURN = 0.005, 0.01
 """Usual motion of a hand-held camera while its rows are exposed, some hundredths of a second: translation along each axis as a share
@@ -52,6 +53,11 @@ def exposure_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[
     upright = camera.height > camera.width
     across, size = (pixels[:, 0], camera.width) if upright else (pixels[:, 1], camera.height)
     return across.double() / size - 0.5
+
+
+def poses_of_rows(moments: Float[Tensor, "m"], motion: Float[Tensor, "6"]) -> SE3:
+    """Return T_middle_row, the pose of the camera at each moment in the frame of that at the middle row."""
+    return SE3.exp(moments[:, None] * motion.to(moments))
 
 
 def moved_points(
