@@ -36,19 +36,21 @@ class MotionPrior:
 
     @staticmethod
     def usual(distance: float) -> MotionPrior:
-        """Return that of a hand-held camera which sees things at a ``distance``, metres."""
+        """Return the prior of a hand-held camera that sees things at a ``distance``, metres."""
         return MotionPrior(MOVE * distance, TURN)
 
 
+AT_REST = torch.zeros(6, dtype=torch.float64)
+"""No motion."""
 STILL = MotionPrior()
 """A camera that does not move, or whose rows are exposed at once."""
 
 
 def exposure_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
-    """Return when each pixel was exposed, in times from the first row to the last, from the middle one on: -0.5 to 0.5.
+    """Return the time at which each pixel was exposed, as a share of the readout, zero at the middle row: -0.5 to 0.5.
 
-    Sensors are wider than high, so that the rows of an upright image are its columns. In which order they are exposed does not
-    matter: the motion is reversed with it.
+    Sensors are wider than high, so that the rows of an upright image are its columns. Their order does not matter: the motion is
+    reversed with it.
     """
     upright = camera.height > camera.width
     across, size = (pixels[:, 0], camera.width) if upright else (pixels[:, 1], camera.height)

@@ -32,11 +32,11 @@ def matcher() -> LandmarkMatcher:
     return LandmarkMatcher(replace(landmarks, calibration_scatter=scatter, correlation=1.0))
 
 
-def photo(degrees: float = 0.0, seed: int = 0) -> View:
-    """Return an image without depth, taken while the camera turned by so many degrees from the first row to the last."""
+def photo(degrees: float = 0.0, seed: int = 0, depth: bool = False) -> View:
+    """Return an image that was taken while the camera turned by so many degrees from the first row to the last."""
     view = unseen()
     frame = rolling_shutter(view.frame, degrees, torch.Generator().manual_seed(seed))
-    return replace(view, frame=replace(frame, depth=None))
+    return replace(view, frame=frame if depth else replace(frame, depth=None))
 
 
 def found(*views: View, moving: bool = True) -> LandmarkPose:
@@ -76,9 +76,17 @@ def test_views_of_a_rig_are_taken_as_still() -> None:
     assert not found(photo(2.0), photo(2.0)).has_motion
 
 
-def test_answers_tell_of_the_motion() -> None:
-    answer = Localizer(replace(textured_map(), landmarks=matcher().landmarks))(photo(2.0).frame)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("depth", [True, False], ids=["RGB-D", "RGB"])
+def test_fusion_does_not_put_back_what_the_motion_has_removed(depth: bool, seed: int) -> None:
+    stored = replace(textured_map(surface=True), landmarks=matcher().landmarks)
+    view = photo(2.0, seed, depth)
+    answer, alone = Localizer(stored)(view.frame), found(view)
     assert answer.converged
+    assert "fused with " + ("depth" if depth else "rendering") in answer.reason
+    assert answer.covariance is not None
+    by_landmarks = squared_distance(alone.T_world_camera, alone.full_covariance)
+    assert squared_distance(answer.T_world_camera, answer.covariance) < 2 * by_landmarks
     assert "rolling shutter" in answer.reason
     assert isinstance(answer.diagnostics, LandmarkDiagnostics)
     assert answer.diagnostics.rolling_shutter

@@ -11,7 +11,7 @@ from typing import Any
 import imageio.v3 as iio
 from torch import Tensor
 
-from bidnerf_core.cli.another_scene import doubt
+from bidnerf_core.cli.another_scene import question_about_scene
 from bidnerf_core.cli.common import UsageError, print_json, say, show
 from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.queries import Query
@@ -132,8 +132,8 @@ class Answers:
         """
         accepted = [answer.posed for answer in self._given if answer.found.converged]
         if self._total > 1:
-            outcomes = [answer.found.outcome for answer in self._given]
-            say(f"{len(accepted)} of {self._total} converged{doubt(outcomes)}")
+            question = question_about_scene([answer.found for answer in self._given])
+            say(f"{len(accepted)} of {self._total} converged{question}")
         if self._spec.out is not None:
             self._write(self._spec.out, accepted)
         if self.failures:

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import tyro
 
-from bidnerf_core.cli.another_scene import doubt
+from bidnerf_core.cli.another_scene import question_about_scene
 from bidnerf_core.cli.camera_options import (
     CameraFile,
     DepthSensorName,
@@ -147,7 +147,7 @@ def run(arguments: list[str]) -> None:
                 path.plot(plot, stored.surface)
             if not follow and path.frames:
                 print_table(path.table(seconds))
-                if question := doubt([frame.found.outcome for frame in path.frames]):
+                if question := question_about_scene([frame.found for frame in path.frames]):
                     say(f"no frame was recognised{question}")
 
     parse("track", track, arguments)

@@ -135,19 +135,19 @@ def run_trials(
     trials: Sequence[Trial],
     file: ResultsFile,
     executor: Executor,
-    at_once: int,
+    without_motion: int,
     finished: Callable[[TrialResult], None] = lambda result: None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> None:
     """Run the trials that ``file`` does not hold, and keep each result as it comes.
 
-    At most ``at_once`` trials are under way, so that a kill loses little. No trial begins once ``stopping`` returns true. A
+    At most ``without_motion`` trials are under way, so that a kill loses little. No trial begins once ``stopping`` returns true. A
     trial that fails ends the run with its error, after the results of the trials under way are kept.
     """
     waiting, under_way = iter(left_to_do(trials, file)), set[Future[TrialResult]]()
     failed: BaseException | None = None
     while True:
-        while len(under_way) < at_once and failed is None and not stopping():
+        while len(under_way) < without_motion and failed is None and not stopping():
             trial = next(waiting, None)
             if trial is None:
                 break

@@ -114,7 +114,7 @@ class LandmarkDiagnostics:
     on_surface: float | None = None  # share of the measured points that lie on the surface
     colour_inliers: float | None = None  # share that lies there and has its colour
     rolling_shutter: bool = (
-        False  # whether the motion of the camera while its rows were exposed was estimated along
+        False  # whether the motion of the camera while its rows were exposed was estimated too
     )
 
 
@@ -139,7 +139,7 @@ class LandmarkThresholds:
     """Thresholds for accepting a pose by landmarks. They have no units, so they suit every scene and image."""
 
     log10_nfa: float = -12.0  # logarithm of the number of such agreements expected by chance, at most
-    # correspondences within three standard deviations, at least; in proportion more if intrinsics or a motion are unknowns too
+    # correspondences within three standard deviations, at least; in proportion more if intrinsics are unknowns too
     inliers: int = 15
     above_chance: float = 3.0  # times as many as at a wrong pose, at least
     spread: float = 0.06  # share of the image's cells that hold one, at least
@@ -155,7 +155,7 @@ class LandmarkThresholds:
 def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = LandmarkThresholds()) -> Verdict:
     """Judge a pose by how many landmarks agree with it, compared with chance, and how much of the image they cover."""
     share = f"{found.inliers} landmarks agree"
-    unknowns = 6 + (4 if found.estimates_calibration else 0) + (6 if found.has_motion else 0)
+    unknowns = 10 if found.estimates_calibration else 6
     if found.log10_nfa > thresholds.log10_nfa or found.inliers < thresholds.inliers * unknowns / 6:
         return Verdict(Outcome.TOO_FEW_MATCHES, f"only {share} ({found.agreeing} of {found.matches} matches)")
     if found.inliers < thresholds.above_chance * found.chance:

@@ -206,7 +206,8 @@ def _fused(
     """Return the answer fused with measured points and rendered rays, as far as there are any and landmarks do not contradict.
 
     Where there are points, rays compare colours alone: depth is measured once, and its scale is not exact. The errors of the
-    poses of the map's images are in its surface and its field as in its landmarks, so that no fusion makes them smaller.
+    poses of the map's images are in its surface and its field as in its landmarks, and those of the motion of a rolling shutter in
+    rays and points too, so that no fusion makes them smaller.
     """
     scale = DepthScale.of(answer.found, problem.sensor)
     if points is not None and scale.objection is not None:
@@ -219,15 +220,15 @@ def _fused(
     effort = 1 if (answer.confidence or 0.0) >= TRUSTED else THOROUGHLY
     draw = _drawing(problem, effort * rays, about, points is None, generator) if rays else None
     scaled = None if points is None else ScaledPoints(points, scale, answer.found.T_world_camera)
-    by_map = answer.found.map_covariance
-    prior = GaussianPrior(answer.T, answer.covariance - by_map, about)
+    shared = answer.found.shared_covariance
+    prior = GaussianPrior(answer.T, answer.covariance - shared, about)
     measurements = Measurements(prior, len(problem.views), scaled, draw, effort**2)
     fused = fused_pose(measurements, STEPS if effort == 1 else MORE_STEPS)
     if not float(prior(fused.T[None]).cost[0]) <= CONTRADICTORY:
         without = replace(answer, left_out=f"{names[0]}, which contradicts the landmarks")
         rest = rays if points is not None else 0
         return _fused(problem.without_depth(), without, None, rest, generator)
-    covariance = fused.covariance + by_map
+    covariance = fused.covariance + shared
     return replace(answer, T=fused.T, covariance=covariance, terms=names, depth_factor=fused.factor)
 
 

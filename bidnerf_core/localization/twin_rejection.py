@@ -73,7 +73,8 @@ def _at_twin(
     if there is None or there.unguided is None:
         return there
     data, limit = there.unguided.matches, there.unguided.limit
-    elsewhere = torch.linalg.vector_norm(data.residuals(found.T_world_camera), dim=-1) <= limit
+    off = data.without_motion(found.T_world_camera, found.motion).residuals(found.T_world_camera)
+    elsewhere = torch.linalg.vector_norm(off, dim=-1) <= limit
     return replace(there, unguided=Unguided(data[~elsewhere], limit))
 
 

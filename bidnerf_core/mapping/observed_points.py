@@ -38,8 +38,10 @@ class ObservedPoints:
         undistorted = calibration.undistorted(self.image, self.focal)
         return replace(self, image=undistorted, focal=self.focal * calibration.focal_factor)
 
-    def at_once(self, T_world_rig: SE3, motion: Float[Tensor, "6"]) -> ObservedPoints:
-        """Return the points where a camera that did not move would have seen them as one did that moved about this pose."""
+    def without_motion(self, T_world_rig: SE3, motion: Float[Tensor, "6"]) -> ObservedPoints:
+        """Return the points displaced so that a camera at rest at this pose observes them where the moving one did."""
+        if not bool(motion.any()):
+            return self
         rig = T_world_rig.inverse().apply(self.points)
         return replace(self, points=T_world_rig.apply(moved_points(rig, self.moments, motion)))
 

@@ -15,15 +15,13 @@ from torch import Tensor
 
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.robust_equations import System, robust_spread
-from bidnerf_core.rolling_shutter import moved_array
+from bidnerf_core.mapping.robust_equations import RobustEquations, robust_spread
+from bidnerf_core.rolling_shutter import AT_REST, moved_array
 from bidnerf_core.rotations import rotation_of
 from bidnerf_core.se3 import SE3
 
 Array = np.ndarray
 
-AT_REST = torch.zeros(6, dtype=torch.float64)
-"""No motion."""
 SCALE = 2.0
 """Scale of the Cauchy loss: the residual, in standard deviations, whose weight is one half."""
 BEHIND = 30.0
@@ -105,7 +103,7 @@ class ReprojectionErrors:
         jacobian = self._jacobian(rig, flat, z, scale, radial, bend, free)
         return Linearization(state, front, projected - self._observed, jacobian)
 
-    def system(self, here: Linearization, noise: float) -> System:
+    def system(self, here: Linearization, noise: float) -> RobustEquations:
         """Return the normal equations for keypoints of this noise (pixels)."""
         deviation = np.sqrt(noise**2 + self._variance)[:, None]
         residual = np.where(here.front[:, None], here.off / deviation, BEHIND)
@@ -119,7 +117,7 @@ class ReprojectionErrors:
         # d(w r)/dr = w I - 2 w^2 r r^T / c^2 for w = 1 / (1 + r^2 / c^2).
         curvature = hessian - 2 / SCALE**2 * scatter
         spread = robust_spread(residual, jacobian.shape[-1])
-        return System(cost, single.sum(0), hessian, curvature, scatter, spread)
+        return RobustEquations(cost, single.sum(0), hessian, curvature, scatter, spread)
 
     def _jacobian(
         self, rig: Array, flat: Array, z: Array, scale: Array, radial: float, bend: Array, free: Array

@@ -16,9 +16,11 @@ from torch import Tensor
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.reprojection import Linearization, ReprojectionErrors, State
-from bidnerf_core.mapping.robust_equations import System, damped_solution
+from bidnerf_core.mapping.robust_equations import RobustEquations, damped_solution
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.se3 import SE3
+
+Array = np.ndarray
 
 RESECTION_STEPS = 20
 """Largest number of steps; from a good start, four or five suffice."""
@@ -41,7 +43,9 @@ class ReprojectionFit:
     # Of the right update (translation, rotation), with the uncertainty of the calibration and of the motion.
     covariance: Float[Tensor, "6 6"]
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
-    motion_covariance: Float[Tensor, "6 6"]
+    covariance_by_motion: Float[Tensor, "6 6"]  # the part of the pose's that is of the motion
+    # Of the motion, by the curvature of the cost; 0x0 for a camera at rest.
+    motion_posterior: Float[Tensor, "k k"]
     slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each parameter of the calibration
 
     def log_occam_factor(self, prior: MotionPrior) -> float:
@@ -51,7 +55,7 @@ class ReprojectionFit:
         if that of the fit without motion is that for none.
         """
         scaled = self.motion / prior.deviations
-        narrowed = self.motion_covariance / torch.outer(prior.deviations, prior.deviations)
+        narrowed = self.motion_posterior / torch.outer(prior.deviations, prior.deviations)
         return float(0.5 * (torch.logdet(narrowed) - scaled.square().sum()))
 
 
@@ -75,7 +79,7 @@ def resect(
     deviations = torch.cat([prior.deviations, motion.deviations]).numpy()
     free = deviations.nonzero()[0]
 
-    def equations(here: Linearization, noise: float) -> System:
+    def equations(here: Linearization, noise: float) -> RobustEquations:
         system = errors.system(here, noise).weighted(1 / correlation)
         return system.with_prior(here.state.camera[free], deviations[free])
 
@@ -99,16 +103,22 @@ def resect(
             system = equations(here, noise)
         elif size < SMALL_STEP:
             break
-    covariance = torch.from_numpy(system.covariance())
-    every = covariance.new_zeros((16, 16))
-    known = torch.tensor([*range(6), *(6 + free)])
-    every[known[:, None], known] = covariance
-    state = here.state
+    covariance, state = torch.from_numpy(system.covariance()), here.state
+    of_calibration = covariance.new_zeros(10)
+    of_calibration[torch.from_numpy(free)] = covariance.diagonal()[6:].clamp(min=0).sqrt()
+    moving = 6 + len(prior.deviations.nonzero())  # where the motion begins, if it is free
     return ReprojectionFit(
-        state.pose(), state.calibration, state.motion, noise, every[:6, :6].clone(),
-        every.diagonal()[6:10].clamp(min=0).sqrt(), every[10:, 10:].clone(),
+        state.pose(), state.calibration, state.motion, noise, covariance[:6, :6].clone(), of_calibration[:4].clone(),
+        _by_last(system.hessian, covariance, moving),
+        torch.from_numpy(system.inverse_curvature())[moving:, moving:].clone(),
         _slope(errors, state, noise, correlation, motion),
     )  # fmt: skip
+
+
+def _by_last(hessian: Array, covariance: Float[Tensor, "p p"], first: int) -> Float[Tensor, "6 6"]:
+    """Return the part of the pose's covariance that is of the unknowns from the ``first`` one on, which the others follow."""
+    follows = torch.from_numpy(-damped_solution(hessian[:first, :first], 1e-9, hessian[:first, first:])[:6])
+    return follows @ covariance[first:, first:] @ follows.mT
 
 
 def _slope(

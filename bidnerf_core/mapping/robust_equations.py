@@ -12,7 +12,7 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class System:
+class RobustEquations:
     """A robust cost at some values of the unknowns, with its derivatives."""
 
     cost: float
@@ -22,13 +22,13 @@ class System:
     scatter: Array  # (p, p) of the gradients of single observations and priors
     spread: float  # residuals in standard deviations, robustly: 1 where the noise is right
 
-    def weighted(self, share: float) -> System:
-        return System(
+    def weighted(self, share: float) -> RobustEquations:
+        return RobustEquations(
             share * self.cost, share * self.gradient, share * self.hessian, share * self.curvature,
             share * self.scatter, self.spread,
         )  # fmt: skip
 
-    def with_prior(self, value: Array, deviations: Array) -> System:
+    def with_prior(self, value: Array, deviations: Array) -> RobustEquations:
         """Add a Gaussian prior about zero of the last unknowns, which have this value."""
         first = len(self.gradient) - len(value)
         precision = deviations**-2
@@ -36,13 +36,20 @@ class System:
         information[first:, first:] = np.diag(precision)
         gradient[first:] += precision * value
         cost = self.cost + 0.5 * float((precision * value**2).sum())
-        return System(
+        return RobustEquations(
             cost, gradient, self.hessian + information, self.curvature + information,
             self.scatter + information, self.spread,
         )  # fmt: skip
 
     def covariance(self) -> Array:
         """Return the covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3)."""
+        inverse = self.inverse_curvature()
+        with np.errstate(over="ignore", invalid="ignore"):
+            found: Array = inverse @ self.scatter @ inverse
+            return (found + found.T) / 2
+
+    def inverse_curvature(self) -> Array:
+        """Return the inverse of the curvature: the covariance of the posterior in Laplace's approximation."""
         # With few residuals or many outliers the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
         unit = 1 / np.sqrt(np.diag(self.hessian).clip(min=1e-300))
         values, vectors = np.linalg.eigh(unit[:, None] * self.curvature * unit)
@@ -50,9 +57,8 @@ class System:
         inverse = vectors @ np.diag(1 / np.maximum(values, least).clip(min=1e-12)) @ vectors.T
         # What the residuals do not determine at all overflows; a covariance that is not finite says so.
         with np.errstate(over="ignore", invalid="ignore"):
-            inverse = unit[:, None] * inverse * unit
-            found: Array = inverse @ self.scatter @ inverse
-            return (found + found.T) / 2
+            found: Array = unit[:, None] * inverse * unit
+            return found
 
 
 def robust_spread(residual: Array, unknowns: int) -> float:

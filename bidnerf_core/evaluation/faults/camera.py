@@ -14,7 +14,7 @@ from bidnerf_core.evaluation.faults.fault import random_direction
 from bidnerf_core.evaluation.faults.warp import nearest, warped
 from bidnerf_core.evaluation.protocols import random_units
 from bidnerf_core.frames import Frame
-from bidnerf_core.se3 import SE3
+from bidnerf_core.rolling_shutter import exposure_moments, poses_of_rows
 
 
 def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
@@ -82,13 +82,14 @@ def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
 def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame:
     """Expose the rows one after the other while the camera turns by ``degrees`` about a random axis through its centre.
 
-    The middle row is exposed at the frame's pose. A camera that only turns sees the same points, so no depth is needed.
+    The rows are those of the sensor, the columns of an upright image. The middle one is exposed at the frame's pose. A camera that only
+    turns sees the same points, so no depth is needed.
     """
-    camera, height = frame.intrinsics, frame.intrinsics.height
+    camera = frame.intrinsics
     axis = random_units(1, generator)[0] * math.radians(degrees)
-    moments = (torch.arange(height, dtype=torch.float64) + 0.5) / height - 0.5
-    turns = torch.cat([torch.zeros((height, 3), dtype=torch.float64), moments[:, None] * axis], dim=-1)
-    seen = _rays(camera) @ SE3.exp(turns).rotation.mT  # T_middle_row: from the row's camera to the middle one
+    moments = exposure_moments(camera.pixel_centres(torch.float64).reshape(-1, 2), camera)
+    turns = poses_of_rows(moments, torch.cat([torch.zeros_like(axis), axis]))
+    seen = turns.rotate(_rays(camera).reshape(-1, 3)).reshape(camera.height, camera.width, 3)
     pixels = camera.project(seen)
     turned = warped(frame, pixels.nan_to_num(-1.0))
     if frame.depth is None:

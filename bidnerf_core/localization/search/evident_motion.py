@@ -2,27 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from bidnerf_core.mapping.calibration import NOMINAL, CalibrationPrior
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
-EVIDENT = 3.0
-"""Logarithm of the odds from which on a camera is taken to have moved while its rows were exposed."""
+ENOUGH_POINTS = 20
+"""Least number of points that tell a motion: with fewer, the noise is as uncertain as the motion itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class EvidentMotion:
+    """How far the camera may have moved, and what the doubt about that adds to the covariance of its pose."""
+
+    prior: MotionPrior = STILL  # ``STILL`` if it is more probable that the camera did not move
+    doubt: Float[Tensor, "6 6"] = field(default_factory=lambda: torch.zeros((6, 6), dtype=torch.float64))
 
 
 def evident_motion(
     data: ObservedPoints, fit: ReprojectionFit, correlation: float, camera: CalibrationPrior = NOMINAL
-) -> MotionPrior:
-    """Return how far the camera may have moved; ``STILL`` unless the points that it observed show that it did.
+) -> EvidentMotion:
+    """Return the more probable of a camera at rest and one that moved, for which the odds are even before its points are looked at.
 
     ``fit`` is one to these points. The intrinsics are free in both fits that are compared, as far as the prior ``camera`` leaves them
     open: what they explain is no motion.
     """
+    if len(data) < ENOUGH_POINTS:
+        return EvidentMotion()
     motion = MotionPrior.usual(float(data.in_camera(fit.T_world_rig)[:, 2].median()))
     moving, still = (
         resect(data, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, prior)
         for prior in (motion, STILL)
     )
     evidence = log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
-    return motion if evidence > EVIDENT else STILL
+    if not abs(evidence) < float("inf"):
+        return EvidentMotion()
+    probability = float(torch.tensor(evidence, dtype=torch.float64).sigmoid())
+    shift = (still.T_world_rig.inverse() @ moving.T_world_rig).log()
+    doubt = min(probability, 1 - probability) * torch.outer(shift, shift)
+    return EvidentMotion(motion if probability > 0.5 else STILL, doubt)

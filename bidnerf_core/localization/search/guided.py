@@ -16,8 +16,7 @@ from bidnerf_core.localization.search.correspondences import LandmarkMatches, Qu
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.reprojection import AT_REST
-from bidnerf_core.rolling_shutter import exposure_moments, moved_points
+from bidnerf_core.rolling_shutter import AT_REST, exposure_moments, moved_points
 from bidnerf_core.se3 import SE3
 
 CANDIDATES = 6
@@ -84,7 +83,7 @@ class ProjectedLandmarks:
         local = local[self._index]
         self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
         if bool(motion.any()):
-            moments = exposure_moments(self._pixels + _principal_point(image), image.intrinsics)
+            moments = exposure_moments(_image_pixels(self._pixels, image), image.intrinsics)
             local = moved_points(local, moments, motion)
             self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
         self._tree = cKDTree(self._pixels.numpy()) if len(self._pixels) else None
@@ -121,8 +120,11 @@ class ProjectedLandmarks:
         return rows, index[rows, columns]
 
 
-def _principal_point(image: QueryImage) -> Float[Tensor, "2"]:
-    return torch.tensor([image.intrinsics.cx, image.intrinsics.cy])
+def _image_pixels(pixels: Float[Tensor, "m 2"], image: QueryImage) -> Float[Tensor, "m 2"]:
+    """Return where pixels from the principal point, by the mean focal length, are in the image, but for its distortion."""
+    camera = image.intrinsics
+    across = torch.tensor([camera.fx, camera.fy]) / image.focal
+    return pixels * across + torch.tensor([camera.cx, camera.cy])
 
 
 def _visible(

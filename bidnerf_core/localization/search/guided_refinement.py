@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.evident_motion import evident_motion
+from bidnerf_core.localization.search.evident_motion import EvidentMotion, evident_motion
 from bidnerf_core.localization.search.guided import (
     ProjectedLandmarks,
     guided_matches,
@@ -77,6 +77,9 @@ class GuidedPose:
     chance: float  # matches that the last round would find at a wrong pose
     taken: TakenIntrinsics
     miscalibration: Miscalibration
+    motion_doubt: Float[
+        Tensor, "6 6"
+    ]  # what the doubt about a motion between rows adds to the pose's covariance
 
 
 def refined_pose(
@@ -126,12 +129,16 @@ def _settled(
     ``prior`` says how uncertain they are before that is known.
     """
     fit, found = _guided(query, prior, fit, found, most, RADII)
-    open_camera, motion = prior.log_focal > 0, STILL
+    open_camera, evident = prior.log_focal > 0, EvidentMotion()
     free, crop = _with_free_camera(query, fit, found, open_camera)
     if query.moving and len(query.images) == 1:  # views of a rig may be of different moments
         correlation = query.landmarks.correlation_of(len(found))
-        motion = evident_motion(query.observed(found), free, correlation, ANY if crop > POSSIBLE else NOMINAL)
+        camera_prior = ANY if crop > POSSIBLE else NOMINAL
+        evident = evident_motion(query.observed(found), free, correlation, camera_prior)
+    motion = evident.prior
     if motion != STILL:
+        data = query.observed(found)
+        fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation, motion)
         fit, found = _guided(query, prior, fit, found, most, RADII[1:], motion)
         free, crop = _with_free_camera(query, fit, found, open_camera, motion)
     correlation = query.landmarks.correlation_of(len(found))
@@ -161,7 +168,7 @@ def _settled(
         query.images, query.landmarks, fit.T_world_rig, fit.calibration, radius, fit.motion
     )
     visible, chance = sum(map(len, projections)), matches_by_chance(projections, radius, most)
-    return GuidedPose(query, fit, found, visible, chance, taken, wrong)
+    return GuidedPose(query, fit, found, visible, chance, taken, wrong, evident.doubt)
 
 
 def _with_free_camera(

@@ -28,17 +28,17 @@ def described(
 ) -> LandmarkPose:
     """Return a refined pose with the evidence for it; ``matches`` are those by descriptors alone."""
     fit = answer.fit
-    given = query.observed(matches).at_once(fit.T_world_rig, fit.motion)
+    given = query.observed(matches)
     query, camera = answer.query, answer.taken.camera
     data, by_descriptors = (
-        query.observed(found).at_once(fit.T_world_rig, fit.motion).corrected(fit.calibration)
+        query.observed(found).without_motion(fit.T_world_rig, fit.motion).corrected(fit.calibration)
         for found in (answer.correspondences, matches)
     )
     off = by_descriptors.residuals(fit.T_world_rig)
     agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= query.threshold).sum())
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
-        covariance=fit.covariance + query.landmarks.pose_covariance,
+        covariance=fit.covariance + answer.motion_doubt + query.landmarks.pose_covariance,
         map_covariance=query.landmarks.pose_covariance,
         noise=fit.noise,
         correspondences=answer.correspondences,
@@ -59,6 +59,7 @@ def described(
         calibration_deviations=fit.calibration_deviations,
         slope=fit.slope,
         motion=fit.motion,
+        motion_covariance=fit.covariance_by_motion + answer.motion_doubt,
         miscalibration=answer.miscalibration,
         calibration_scatter=query.landmarks.calibration_scatter,
         depth_scale=depth_scale(data, fit.T_world_rig),

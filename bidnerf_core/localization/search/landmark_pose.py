@@ -70,9 +70,9 @@ class LandmarkPose:
     )
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
     slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each of them
-    motion: Float[
-        Tensor, "6"
-    ]  # of the camera while its rows were exposed, as of ``rolling_shutter``; 0 if none is evident
+    # Of the camera while its rows were exposed, see ``rolling_shutter``; 0 if none is evident.
+    motion: Float[Tensor, "6"]
+    motion_covariance: Float[Tensor, "6 6"]  # the part of the pose's covariance that is of the motion
     miscalibration: Miscalibration
     calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
@@ -89,9 +89,8 @@ class LandmarkPose:
         if self.has_other_camera or self.unguided is None:
             return None
         least = 1.0 if self.estimates_calibration else UNSUSPECTED
-        return better_camera(
-            self.unguided.matches, self.T_world_camera, self.calibration, self.unguided.limit, least
-        )
+        matches = self.unguided.matches.without_motion(self.T_world_camera, self.motion)
+        return better_camera(matches, self.T_world_camera, self.calibration, self.unguided.limit, least)
 
     @property
     def focal_factor(self) -> float:
@@ -164,6 +163,17 @@ class LandmarkPose:
         shift = self.alternative_shift
         by_alternative = judged.alternative_probability * torch.outer(shift, shift)
         return self.slope * added @ self.slope.mT + by_alternative
+
+    @property
+    def shared_covariance(self) -> Float[Tensor, "6 6"]:
+        """The part of the covariance that rendered rays and measured points have in common with the landmarks.
+
+        It is that of the poses of the map's own images and of the motion, at most nine tenths of the whole in any direction.
+        """
+        rest = self.covariance - self.map_covariance
+        root = torch.linalg.inv(torch.linalg.cholesky(rest))
+        largest = float(torch.linalg.eigvalsh(root @ self.motion_covariance @ root.mT)[-1])
+        return self.map_covariance + min(1.0, 0.9 / max(largest, 1e-12)) * self.motion_covariance
 
     @property
     def position_deviation(self) -> float:

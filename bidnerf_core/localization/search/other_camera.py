@@ -79,7 +79,8 @@ def _like_map_camera(
     camera = None if own is None else camera_like(own, query.landmarks.cameras, deviation)
     if own is None or camera is None or found.takes_map_camera:
         return None
-    off = query.seen_by([own] * count).observed(matches).residuals(found.T_world_camera)
+    data = query.seen_by([own] * count).observed(matches)
+    off = data.without_motion(found.T_world_camera, found.motion).residuals(found.T_world_camera)
     first = Hypothesis(found.T_world_camera, torch.linalg.vector_norm(off, dim=-1) <= query.threshold, 0)
     return _with_map_camera(query, matches, camera, first, AS_MANY * found.agreeing, clock)
 

@@ -56,7 +56,8 @@ def _elsewhere(
     order = ratio[row, column].argsort(stable=True)
     row, column = row[order], column[order]
     others = LandmarkMatches(chosen.view[row], chosen.keypoint[row], index[row, column], torch.ones(len(row)))
-    off = torch.linalg.vector_norm(query.observed(others).residuals(found.T_world_camera), dim=-1)
+    data = query.observed(others).without_motion(found.T_world_camera, found.motion)
+    off = torch.linalg.vector_norm(data.residuals(found.T_world_camera), dim=-1)
     return others[~(off <= RADII[0] * query.threshold)]
 
 

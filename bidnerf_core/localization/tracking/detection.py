@@ -104,7 +104,7 @@ class LandmarkDetector:
         if seen is None:
             return None
         points, found, _ = seen
-        found = with_motion(found, self.landmarks.correlation_of(len(points)))
+        found = with_motion(found, self.landmarks.correlation_of(int(found.inliers.sum())))
         evidence = _guided_evidence(query, found, tight, most_distance)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
         points = replace(points, landmark=number[points.landmark])
@@ -145,7 +145,7 @@ class LandmarkDetector:
         """Judge the given intrinsics by those that fit the landmarks best."""
         free = resect(
             found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL, GIVEN,
-            self.landmarks.correlation_of(int(found.inliers.sum())),
+            self.landmarks.correlation_of(int(found.inliers.sum())), found.evident.prior,
         )  # fmt: skip
         return Miscalibration.of(free, self.landmarks, TakenIntrinsics())
 
@@ -180,10 +180,10 @@ def landmark_pose(
     camera: Intrinsics,
 ) -> LandmarkPose:
     """Return a pose by landmarks in the form that ``landmark_verdict`` judges."""
-    fit, data, every = found.fit, found.data, torch.arange(len(points))
+    fit, data, every = found.fit, found.still_data, torch.arange(len(points))
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
-        covariance=fit.covariance + landmarks.pose_covariance,
+        covariance=fit.covariance + found.evident.doubt + landmarks.pose_covariance,
         map_covariance=landmarks.pose_covariance,
         noise=fit.noise,
         correspondences=LandmarkMatches(
@@ -205,6 +205,7 @@ def landmark_pose(
         calibration_deviations=fit.calibration_deviations,
         slope=fit.slope,
         motion=fit.motion,
+        motion_covariance=fit.covariance_by_motion + found.evident.doubt,
         miscalibration=miscalibration,
         calibration_scatter=landmarks.calibration_scatter,
         intrinsics=None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import poselib
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization.search.evident_motion import evident_motion
+from bidnerf_core.localization.search.evident_motion import EvidentMotion, evident_motion
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
@@ -92,10 +92,16 @@ class PointFit:
     fit: ReprojectionFit
     data: ObservedPoints
     inliers: Bool[Tensor, "m"]
+    evident: EvidentMotion = EvidentMotion()  # of the camera while its rows were exposed
 
     @property
     def T_world_camera(self) -> SE3:
         return self.fit.T_world_rig
+
+    @property
+    def still_data(self) -> ObservedPoints:
+        """The points as a camera at rest at the pose would have observed them."""
+        return self.data.without_motion(self.fit.T_world_rig, self.fit.motion)
 
     @property
     def share(self) -> float:
@@ -103,7 +109,7 @@ class PointFit:
 
     def within(self, threshold: float) -> int:
         """Return how many points have a reprojection error of at most ``threshold`` pixels."""
-        off = torch.linalg.vector_norm(self.data.residuals(self.T_world_camera), dim=-1)
+        off = torch.linalg.vector_norm(self.still_data.residuals(self.T_world_camera), dim=-1)
         return int((off <= threshold).sum())
 
 
@@ -130,20 +136,18 @@ def fit_pose(
 
 
 def with_motion(found: PointFit, correlation: float) -> PointFit:
-    """Return a fit with the motion of the camera while its rows were exposed, if there evidently was one.
-
-    Its data are then the points as a camera that did not move would have seen them.
-    """
-    motion = evident_motion(found.data[found.inliers], found.fit, correlation)
-    if motion == STILL:
-        return found
-    fit = resect(found.data, found.T_world_camera, found.fit.noise, correlation=correlation, motion=motion)
-    data = found.data.at_once(fit.T_world_rig, fit.motion)
-    return PointFit(fit, data, _inliers(data, fit))
+    """Return a fit with the motion of the camera while its rows were exposed, if there evidently was one, and with the doubt about it."""
+    evident = evident_motion(found.data[found.inliers], found.fit, correlation)
+    if evident.prior == STILL:
+        return replace(found, evident=evident)
+    start, noise, motion = found.T_world_camera, found.fit.noise, evident.prior
+    fit = resect(found.data, start, noise, correlation=correlation, motion=motion)
+    return PointFit(fit, found.data, _inliers(found.data, fit), evident)
 
 
 def _inliers(data: ObservedPoints, fit: ReprojectionFit) -> Bool[Tensor, "m"]:
-    off = data.normalized_residuals(fit.T_world_rig, fit.noise)
+    still = data.without_motion(fit.T_world_rig, fit.motion)
+    off = still.normalized_residuals(fit.T_world_rig, fit.noise)
     return torch.linalg.vector_norm(off, dim=-1) <= INLIER
 
 
