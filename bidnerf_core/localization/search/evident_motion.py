@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -15,6 +16,10 @@ from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
 ENOUGH_POINTS = 20
 """Least number of points that tell a motion: with fewer, the noise is as uncertain as the motion itself."""
+MOVING = 1 / 30
+"""Share of images that are taken to show a motion before their points are looked at: lens stabilisers and lenses that the intrinsics do not
+describe bend images in similar ways.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +33,7 @@ class EvidentMotion:
 def evident_motion(
     data: ObservedPoints, fit: ReprojectionFit, correlation: float, camera: CalibrationPrior = NOMINAL
 ) -> EvidentMotion:
-    """Return the more probable of a camera at rest and one that moved, for which the odds are even before its points are looked at.
+    """Return the more probable of a camera at rest and one that moved.
 
     ``fit`` is one to these points. The intrinsics are free in both fits that are compared, as far as the prior ``camera`` leaves them
     open: what they explain is no motion.
@@ -41,9 +46,10 @@ def evident_motion(
         for prior in (motion, STILL)
     )
     evidence = log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
-    if not abs(evidence) < float("inf"):
+    if not math.isfinite(evidence):
         return EvidentMotion()
-    probability = float(torch.tensor(evidence, dtype=torch.float64).sigmoid())
+    log_odds = evidence + math.log(MOVING / (1 - MOVING))
+    probability = float(torch.tensor(log_odds, dtype=torch.float64).sigmoid())
     shift = (still.T_world_rig.inverse() @ moving.T_world_rig).log()
     doubt = min(probability, 1 - probability) * torch.outer(shift, shift)
     return EvidentMotion(motion if probability > 0.5 else STILL, doubt)
