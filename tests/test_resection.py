@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3, Intrinsics
 from bidnerf_core.localization.search.evident_motion import ENOUGH_POINTS, evident_motion
+from bidnerf_core.localization.tracking.points import PointFit, with_motion
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.reprojection import ReprojectionErrors, State
@@ -259,3 +260,40 @@ def test_a_change_of_the_calibration_moves_the_pose_by_its_slope_if_the_motion_f
         moved = resect(data, TRUE, 0.05, calibration=changed, motion=OPEN).T_world_rig
         update = (still.T_world_rig.inverse() @ moved).log() / 1e-3
         torch.testing.assert_close(update, still.slope[:, number], rtol=0.1, atol=0.1)
+
+
+def test_a_principal_point_is_told_from_a_motion_if_both_are_free() -> None:
+    wrong = Calibration(shift_v=0.01)
+    data = observed_while_moving(MOTION, noise=0.3)
+    data = replace(data, image=data.image + torch.tensor([0.0, wrong.shift_v]))
+    both = resect(data, TRUE, 0.5, NOMINAL, motion=OPEN)
+    deviation = float(both.calibration_deviations[2])
+    assert deviation < 0.003
+    assert both.calibration.shift_v == pytest.approx(wrong.shift_v, abs=3 * deviation)
+    torch.testing.assert_close(both.motion[3:], MOTION[3:], atol=3e-3, rtol=0)
+
+
+def test_the_part_of_the_covariance_by_the_motion_is_what_a_known_motion_lacks() -> None:
+    data = observed_while_moving(MOTION, noise=0.5)
+    unknown = resect(data, TRUE, 0.5, motion=OPEN)
+    known = resect(data.without_motion(unknown.T_world_rig, unknown.motion), TRUE, 0.5)
+    rest = unknown.covariance - unknown.covariance_by_motion
+    torch.testing.assert_close(rest.diagonal(), known.covariance.diagonal(), rtol=0.3, atol=0)
+    assert not resect(data, TRUE, 0.5).covariance_by_motion.any()
+
+
+def test_followed_points_get_the_motion_that_they_show() -> None:
+    data = observed_while_moving(MOTION, noise=0.3)
+    still = resect(data, TRUE, 0.5)
+    every = torch.ones(len(data), dtype=torch.bool)
+    found = with_motion(PointFit(still, data, every), 1.0)
+    assert found.evident.prior != STILL
+    assert error(found.T_world_camera) < 0.5 * error(still.T_world_rig)
+    residuals = found.still_data.residuals(found.T_world_camera).norm(dim=-1)
+    assert float(residuals.median()) < 0.7 * float(data.residuals(still.T_world_rig).norm(dim=-1).median())
+
+
+def test_followed_points_of_which_none_agrees_show_no_motion() -> None:
+    data = observed_while_moving(MOTION)
+    found = PointFit(resect(data, TRUE, 0.5), data, torch.zeros(len(data), dtype=torch.bool))
+    assert with_motion(found, 1.0).evident.prior == STILL

@@ -129,19 +129,16 @@ def _settled(
     ``prior`` says how uncertain they are before that is known.
     """
     fit, found = _guided(query, prior, fit, found, most, RADII)
-    open_camera, evident = prior.log_focal > 0, EvidentMotion()
+    open_camera = prior.log_focal > 0
     free, crop = _with_free_camera(query, fit, found, open_camera)
-    if query.moving and len(query.images) == 1:  # views of a rig may be of different moments
-        correlation = query.landmarks.correlation_of(len(found))
-        camera_prior = ANY if crop > POSSIBLE else NOMINAL
-        evident = evident_motion(query.observed(found), free, correlation, camera_prior)
-    motion = evident.prior
+    evident = _evident_motion(query, free, found, ANY if crop > POSSIBLE else NOMINAL)
+    motion, correlation = evident.prior, query.landmarks.correlation_of(len(found))
     if motion != STILL:
         data = query.observed(found)
         fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation, motion)
         fit, found = _guided(query, prior, fit, found, most, RADII[1:], motion)
         free, crop = _with_free_camera(query, fit, found, open_camera, motion)
-    correlation = query.landmarks.correlation_of(len(found))
+        correlation = query.landmarks.correlation_of(len(found))
     evidence, approximate = query.evidence, query.prior.log_focal > 0
     camera = query.map_camera_near(free.calibration)
     taken = taken_intrinsics(free, query.landmarks, camera, approximate, evidence.map_camera)
@@ -169,6 +166,15 @@ def _settled(
     )
     visible, chance = sum(map(len, projections)), matches_by_chance(projections, radius, most)
     return GuidedPose(query, fit, found, visible, chance, taken, wrong, evident.doubt)
+
+
+def _evident_motion(
+    query: LandmarkQuery, free: ReprojectionFit, found: LandmarkMatches, camera: CalibrationPrior
+) -> EvidentMotion:
+    """Return the motion of a single image's camera; the views of a rig may be of different moments and are taken as still."""
+    if not query.moving or len(query.images) > 1:
+        return EvidentMotion()
+    return evident_motion(query.observed(found), free, query.landmarks.correlation_of(len(found)), camera)
 
 
 def _with_free_camera(
