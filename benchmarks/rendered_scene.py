@@ -32,7 +32,7 @@ def rendered(view: View, folder: Path) -> View:
         rgb = torch.from_numpy(iio.imread(folder / f"{name}.png")).float() / 255
         depth = torch.from_numpy(iio.imread(folder / f"{name}.depth.png").astype("int32")).float() / 1000
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}, expected what 'bidnerf render' wrote") from error
+        raise InputError(f"{folder}, frame {name}: {error}; expected what 'bidnerf render' wrote") from error
     return replace(
         view, frame=replace(view.frame, rgb=rgb, depth=depth, alpha=(depth > 0).float(), hidden=None)
     )
@@ -47,7 +47,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     dataset = open_dataset(given.data, WHITE)
-    splits = [folder.name for folder in sorted(given.renders.iterdir()) if folder.is_dir()]
+    splits = [folder.name for folder in sorted(given.renders.glob("*")) if folder.is_dir()]
+    if not splits:
+        parser.error(f"{given.renders}: no folders, expected one for each split")
     views = {
         split: [rendered(view, given.renders / split) for view in dataset.views(split)] for split in splits
     }

@@ -49,12 +49,19 @@ STILL = MotionPrior()
 def exposure_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
     """Return the time at which each pixel was exposed, as a share of the readout, zero at the middle row: -0.5 to 0.5.
 
-    Sensors are wider than high, so that the rows of an upright image are its columns. Their order does not matter: the motion is
-    reversed with it.
+    Sensors are wider than high, so that the rows of an image that is higher than wide are its columns; square images count as wide.
+    Their order does not matter: the motion is reversed with it.
     """
-    upright = camera.height > camera.width
-    across, size = (pixels[:, 0], camera.width) if upright else (pixels[:, 1], camera.height)
-    return across.double() / size - 0.5
+    return _moments_along(pixels, camera, 0 if camera.height > camera.width else 1)
+
+
+def turned_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
+    """Return ``exposure_moments`` if the rows run the other way, as in a high part of a wide image."""
+    return _moments_along(pixels, camera, 1 if camera.height > camera.width else 0)
+
+
+def _moments_along(pixels: Float[Tensor, "m 2"], camera: Intrinsics, axis: int) -> Float[Tensor, "m"]:
+    return pixels[:, axis].double() / (camera.width, camera.height)[axis] - 0.5
 
 
 def poses_of_rows(moments: Float[Tensor, "m"], motion: Float[Tensor, "6"]) -> SE3:

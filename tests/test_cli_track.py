@@ -135,8 +135,11 @@ def test_frames_of_another_scene_are_doubted(bidnerf: Run, tmp_path: Path) -> No
         iio.imwrite(tmp_path / "images" / f"{number}.png", noise)
     track = ("track", "MAP", tmp_path / "images", "--out", tmp_path / "path.json", "--hfov", "60")
     status, _, err = bidnerf(*track)
-    assert status == 0, err
-    assert err.splitlines()[-1].endswith("no frame was recognised; do they show the scene of this map?")
+    assert status == 1
+    assert err.splitlines()[-1] == (
+        "bidnerf track: no pose of 3 frames was accepted; do they show the scene of this map?"
+    )
+    assert len(json.loads((tmp_path / "path.json").read_text())) == 3
 
 
 def test_one_split_of_a_dataset_is_tracked(bidnerf: Run, tmp_path: Path) -> None:

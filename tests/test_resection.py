@@ -21,7 +21,7 @@ from bidnerf_core.mapping.resection import log_likelihood_ratio, resect
 from bidnerf_core.rolling_shutter import STILL, MotionPrior, exposure_moments
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
-FOCAL, HEIGHT = 400.0, 480.0
+FOCAL, WIDTH, HEIGHT = 400.0, 640.0, 480.0
 
 
 def observed(
@@ -39,7 +39,7 @@ def observed(
     focal = torch.full((count,), FOCAL, dtype=torch.float64)
     along = nothing + torch.tensor([0.0, 0.0, 1.0])
     return ObservedPoints(
-        points, nothing[:, :2], along, pixels / FOCAL, focal, nothing[:, 0], eye, nothing, pixels[:, 1] / HEIGHT
+        points, nothing[:, :2], along, pixels / FOCAL, focal, nothing[:, 0], eye, nothing, pixels[:, 1] / HEIGHT, pixels[:, 0] / WIDTH,
     )  # fmt: skip
 
 
@@ -163,7 +163,7 @@ def observed_while_moving(motion: Tensor, noise: float = 0.0, seed: int = 0) -> 
         moments = image[:, 1] * FOCAL / HEIGHT
     random = torch.Generator().manual_seed(seed + 1)
     off = noise / FOCAL * torch.randn(image.shape, generator=random, dtype=torch.float64)
-    return replace(data, image=image + off, moments=moments)
+    return replace(data, image=image + off, moments=moments, turned_moments=image[:, 0] * FOCAL / WIDTH)
 
 
 @pytest.mark.parametrize(("moved", "tolerance"), [(0.0, 2e-3), (1.0, 0.02)])
@@ -211,6 +211,17 @@ def test_a_motion_is_evident_where_there_was_one(motion: Tensor, evident: bool, 
         found = evident_motion(data, resect(data, TRUE, 0.5), 1.0)
         chosen += found.prior != STILL
     assert chosen >= 19 if evident else chosen <= 1
+
+
+def test_rows_that_may_run_the_other_way_are_part_of_the_doubt() -> None:
+    """A shear along the columns looks like one along the rows of a camera that rolled, with another motion."""
+    for motion in (MOTION, 2 * MOTION):
+        data = observed_while_moving(motion, 0.3)
+        data = replace(data, moments=data.turned_moments, turned_moments=data.moments)
+        found = evident_motion(data, resect(data, TRUE, 0.5), 1.0)
+        fit = resect(data, TRUE, 0.5, motion=found.prior)
+        off = (fit.T_world_rig.inverse() @ TRUE).log()
+        assert float(off @ torch.linalg.solve(fit.covariance + found.doubt, off)) < 16.8
 
 
 def test_few_points_tell_no_motion() -> None:

@@ -147,8 +147,9 @@ def run(arguments: list[str]) -> None:
                 path.plot(plot, stored.surface)
             if not follow and path.frames:
                 print_table(path.table(seconds))
-                if question := question_about_scene([frame.found for frame in path.frames]):
-                    say(f"no frame was recognised{question}")
+        if not follow and not path.accepted:
+            question = question_about_scene([frame.found for frame in path.frames])
+            raise InputError(f"no pose of {amount(len(path.frames), 'frame')} was accepted{question}")
 
     parse("track", track, arguments)
 
@@ -200,7 +201,10 @@ def _track(frames: FrameSequence, step: _Step, every: int) -> None:
             if isinstance(timed, TimedFrame):
                 step(timed.frame, timed.time, timed.truth, every * number)
             elif not step.path.frames and number + 1 >= min(TRIED, total):
-                raise InputError(f"none of the first {amount(number + 1, 'frame')} can be read: {timed}")
+                first = (
+                    "the first frame cannot" if number == 0 else f"none of the first {number + 1} frames can"
+                )
+                raise InputError(f"{first} be read: {timed}")
             else:
                 say(f"{timed}; left out")
                 step.path.unread += 1

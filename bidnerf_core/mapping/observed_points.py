@@ -25,7 +25,8 @@ class ObservedPoints:
     depth: Float[Tensor, "m"]  # metres, 0 where none was measured
     rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
     translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
-    moments: Float[Tensor, "m"]  # of exposure, as of ``exposure_moments``
+    moments: Float[Tensor, "m"]  # of exposure, see ``exposure_moments``
+    turned_moments: Float[Tensor, "m"]  # the same if the rows run the other way
 
     def __len__(self) -> int:
         return len(self.points)

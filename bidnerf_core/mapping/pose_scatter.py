@@ -68,7 +68,7 @@ def _observed_points(sightings: Sightings, positions: Float[Tensor, "n 3"]) -> O
     eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
     return ObservedPoints(
         positions[sightings.point], zeros[:, :2], zeros + torch.tensor([0.0, 0.0, 1.0]),
-        sightings.image, sightings.focal, zeros[:, 0], eye, zeros, zeros[:, 0],
+        sightings.image, sightings.focal, zeros[:, 0], eye, zeros, zeros[:, 0], zeros[:, 0],
     )  # fmt: skip
 
 

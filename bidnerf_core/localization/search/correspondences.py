@@ -15,7 +15,7 @@ from bidnerf_core.mapping.features import Features, Keypoints
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.rolling_shutter import exposure_moments
+from bidnerf_core.rolling_shutter import exposure_moments, turned_moments
 from bidnerf_core.se3 import SE3
 
 
@@ -29,11 +29,6 @@ class QueryImage:
     intrinsics: Intrinsics
     T_rig_camera: SE3  # float64
     hidden: Bool[Tensor, "h w"] | None = None  # pixels of what the map does not have, as ``Frame`` has them
-
-    @property
-    def moments(self) -> Float[Tensor, "n"]:
-        """When each keypoint was exposed, as of ``exposure_moments``."""
-        return exposure_moments(self.keypoints.pixels, self.intrinsics)
 
     @property
     def focal(self) -> float:
@@ -106,5 +101,8 @@ def observed_points(
         torch.cat([image.depth for image in images])[number],
         T_camera_rig.rotation[found.view],
         T_camera_rig.translation[found.view],
-        torch.cat([image.moments for image in images])[number],
+        *(
+            torch.cat([of(image.keypoints.pixels, image.intrinsics) for image in images])[number]
+            for of in (exposure_moments, turned_moments)
+        ),
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.mapping.calibration import NOMINAL, CalibrationPrior
+from bidnerf_core.mapping.calibration import FIXED, NOMINAL, CalibrationPrior
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
@@ -20,6 +20,11 @@ MOVING = 1 / 30
 """Share of images that are taken to show a motion before their points are looked at: lens stabilisers and lenses that the intrinsics do not
 describe bend images in similar ways.
 """
+
+NEGLIGIBLE = 1e-3
+"""Probability of a motion below which it adds nothing to the doubt about a pose."""
+TURNED = 0.1
+"""Share of these whose rows run the other way than the shape of the image says: parts of images, turned square ones, other sensors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +38,7 @@ class EvidentMotion:
 def evident_motion(
     data: ObservedPoints, fit: ReprojectionFit, correlation: float, camera: CalibrationPrior = NOMINAL
 ) -> EvidentMotion:
-    """Return the more probable of a camera at rest and one that moved.
+    """Return the more probable of a camera at rest and one that moved, and the doubt that is left about the pose.
 
     ``fit`` is one to these points. The intrinsics are free in both fits that are compared, as far as the prior ``camera`` leaves them
     open: what they explain is no motion.
@@ -41,15 +46,47 @@ def evident_motion(
     if len(data) < ENOUGH_POINTS:
         return EvidentMotion()
     motion = MotionPrior.usual(float(data.in_camera(fit.T_world_rig)[:, 2].median()))
-    moving, still = (
+    still, moving = (
         resect(data, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, prior)
-        for prior in (motion, STILL)
+        for prior in (STILL, motion)
     )
-    evidence = log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
-    if not math.isfinite(evidence):
+    turned_data = replace(data, moments=data.turned_moments)
+    turned = resect(turned_data, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, motion)
+    log_odds = [
+        _log_evidence(points, found, still, motion, correlation) + math.log(share)
+        for points, found, share in (
+            (data, moving, MOVING * (1 - TURNED)), (turned_data, turned, MOVING * TURNED)
+        )
+    ]  # fmt: skip
+    of_still, of_moving, of_turned = torch.tensor([math.log(1 - MOVING), *log_odds]).softmax(0).tolist()
+    if not all(map(math.isfinite, (of_still, of_moving, of_turned))):
         return EvidentMotion()
-    log_odds = evidence + math.log(MOVING / (1 - MOVING))
-    probability = float(torch.tensor(log_odds, dtype=torch.float64).sigmoid())
-    shift = (still.T_world_rig.inverse() @ moving.T_world_rig).log()
-    doubt = min(probability, 1 - probability) * torch.outer(shift, shift)
-    return EvidentMotion(motion if probability > 0.5 else STILL, doubt)
+    if max(of_moving, of_turned) < NEGLIGIBLE:
+        return EvidentMotion()
+    # The pose is found with known intrinsics, so that the doubt about it is that of fits with the same ones.
+    still, moving, turned = (
+        resect(points, fit.T_world_rig, found.noise, FIXED, fit.calibration, correlation, prior)
+        for points, found, prior in (
+            (data, still, STILL),
+            (data, moving, motion),
+            (turned_data, turned, motion),
+        )
+    )
+    chosen = moving if of_moving > of_still else still
+    doubt = of_turned * _square(chosen, turned)
+    if chosen is moving:
+        return EvidentMotion(motion, doubt + of_still * _square(chosen, still))
+    return EvidentMotion(STILL, doubt + of_moving * (_square(chosen, moving) + moving.covariance_by_motion))
+
+
+def _log_evidence(
+    data: ObservedPoints, moving: ReprojectionFit, still: ReprojectionFit, motion: MotionPrior, correlation: float
+) -> float:  # fmt: skip
+    """Return the logarithm of how many times as much evidence there is for a motion as for none."""
+    return log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
+
+
+def _square(fit: ReprojectionFit, other: ReprojectionFit) -> Float[Tensor, "6 6"]:
+    """Return the square of the right update from one fit to another."""
+    shift = (fit.T_world_rig.inverse() @ other.T_world_rig).log()
+    return torch.outer(shift, shift)
