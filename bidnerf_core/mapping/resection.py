@@ -54,9 +54,12 @@ class ReprojectionFit:
         The likelihood of the fit times this factor is the evidence for a motion (MacKay 2003, ch. 28), in Laplace's approximation,
         if that of the fit without motion is that for none.
         """
-        scaled = self.motion / prior.deviations
         narrowed = self.motion_posterior / torch.outer(prior.deviations, prior.deviations)
-        return float(0.5 * (torch.logdet(narrowed) - scaled.square().sum()))
+        return 0.5 * (float(torch.logdet(narrowed)) - self.motion_in_deviations(prior))
+
+    def motion_in_deviations(self, prior: MotionPrior) -> float:
+        """Return the squared size of the motion in the standard deviations of its prior."""
+        return float((self.motion / prior.deviations).square().sum())
 
 
 def resect(

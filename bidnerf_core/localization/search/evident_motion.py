@@ -21,6 +21,10 @@ MOVING = 1 / 30
 describe bend images in similar ways.
 """
 
+LARGEST = 22.5
+"""Largest squared motion in its prior's standard deviations (99.9 % of six degrees of freedom). More would be needed to make up for an
+image that was resized to another shape, which is another camera.
+"""
 NEGLIGIBLE = 1e-3
 """Probability of a motion below which it adds nothing to the doubt about a pose."""
 TURNED = 0.1
@@ -54,6 +58,8 @@ def evident_motion(
     turned = resect(turned_data, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, motion)
     log_odds = [
         _log_evidence(points, found, still, motion, correlation) + math.log(share)
+        if found.motion_in_deviations(motion) <= LARGEST
+        else -math.inf
         for points, found, share in (
             (data, moving, MOVING * (1 - TURNED)), (turned_data, turned, MOVING * TURNED)
         )
