@@ -135,9 +135,9 @@ def test_frames_of_another_scene_are_doubted(bidnerf: Run, tmp_path: Path) -> No
         iio.imwrite(tmp_path / "images" / f"{number}.png", noise)
     track = ("track", "MAP", tmp_path / "images", "--out", tmp_path / "path.json", "--hfov", "60")
     status, _, err = bidnerf(*track)
-    assert status == 1
-    assert err.splitlines()[-1] == (
-        "bidnerf track: no pose of 3 frames was accepted; do they show the scene of this map?"
+    assert status == 0, err
+    assert err.splitlines()[-1].endswith(
+        "no pose of 3 frames was accepted; do they show the scene of this map?"
     )
     assert len(json.loads((tmp_path / "path.json").read_text())) == 3
 

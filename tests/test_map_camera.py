@@ -151,8 +151,18 @@ def test_the_farther_the_cameras_are_apart_the_less_likely_they_are_one() -> Non
 
 def fit(apparent: float, deviation: float) -> ReprojectionFit:
     """A fit with free intrinsics that asks for a longer focal length."""
-    eye, deviations = torch.eye(6, dtype=torch.float64), torch.full((4,), deviation, dtype=torch.float64)
-    return ReprojectionFit(SE3.identity(), Calibration(apparent), 0.3, eye, deviations, torch.zeros(6, 4))
+    zeros = torch.zeros((6, 6), dtype=torch.float64)
+    return ReprojectionFit(
+        SE3.identity(),
+        Calibration(apparent),
+        motion=zeros[0],
+        noise=0.3,
+        covariance=torch.eye(6, dtype=torch.float64),
+        calibration_deviations=torch.full((4,), deviation, dtype=torch.float64),
+        covariance_by_motion=zeros,
+        motion_posterior=zeros[:0, :0],
+        slope=zeros[:, :4],
+    )
 
 
 def test_the_image_decides_where_it_can(landmarks: LandmarkMap) -> None:

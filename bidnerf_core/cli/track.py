@@ -147,9 +147,9 @@ def run(arguments: list[str]) -> None:
                 path.plot(plot, stored.surface)
             if not follow and path.frames:
                 print_table(path.table(seconds))
-        if not follow and not path.accepted:
-            question = question_about_scene([frame.found for frame in path.frames])
-            raise InputError(f"no pose of {amount(len(path.frames), 'frame')} was accepted{question}")
+                if not path.accepted:
+                    question = question_about_scene([frame.found for frame in path.frames])
+                    say(f"no pose of {amount(len(path.frames), 'frame')} was accepted{question}")
 
     parse("track", track, arguments)
 

@@ -121,7 +121,8 @@ def resect(
 def _by_last(hessian: Array, covariance: Float[Tensor, "p p"], first: int) -> Float[Tensor, "6 6"]:
     """Return the part of the pose's covariance that is of the unknowns from the ``first`` one on, which the others follow."""
     follows = torch.from_numpy(-damped_solution(hessian[:first, :first], 1e-9, hessian[:first, first:])[:6])
-    return follows @ covariance[first:, first:] @ follows.mT
+    by_last = follows @ covariance[first:, first:] @ follows.mT
+    return (by_last + by_last.mT) / 2
 
 
 def _slope(
