@@ -329,13 +329,19 @@ def replaced_while_read(sound: Path, work: Path, seconds: float) -> dict[str, in
 
 
 def threads(sound: Path, seconds: float) -> dict[str, Any]:
-    """Localize on eight threads for some time; compare with one thread, and the memory at the end with that at a third."""
-    localizer = Localizer(load_map(sound / "map"), "bid", settings_of("bid", {"rays": 64, "max_steps": 5}))
+    """Localize on eight threads for some time, by ``bid`` and by ``auto`` in turn; compare with one thread, and the memory at the
+    end with that at a third.
+    """
+    stored = load_map(sound / "map")
+    methods = [
+        Localizer(stored, "bid", settings_of("bid", {"rays": 64, "max_steps": 5})),
+        Localizer(stored, "auto", settings_of("auto", {"points": 100, "hypotheses": 8, "rounds": 1})),
+    ]
     view = open_dataset(sound / "data").views("test")[0]
     starts = [perturb(view.T_ref_camera, 0.1, 3.0, seed) for seed in range(32)]
 
     def answer(number: int) -> torch.Tensor:
-        return localizer(view.frame, starts[number % 32], seed=number % 32).poses.matrix()
+        return methods[number % 2](view.frame, starts[number], seed=number).poses.matrix()
 
     alone = [answer(number) for number in range(32)]
     calls, other, memory, began = 0, 0, list[int](), time.monotonic()
