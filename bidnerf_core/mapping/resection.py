@@ -148,7 +148,22 @@ def log_likelihood_ratio(
     those of the points depend on the pose, and larger ones would make residuals less unlikely at no price.
     """
     better = min(fit, other, key=lambda fit: fit.noise)
-    errors, none_free = ReprojectionErrors(data, better.T_world_rig), np.arange(0)
-    states = [State.of(f.T_world_rig, f.calibration, f.motion) for f in (other, fit)]
-    costs = [errors.system(errors.linearized(s, none_free), better.noise).cost for s in states]
+    errors = ReprojectionErrors(data, better.T_world_rig)
+    costs = [_cost(errors, each, better.noise) for each in (other, fit)]
     return (costs[0] - costs[1]) / correlation
+
+
+def log_likelihood(
+    data: ObservedPoints, fit: ReprojectionFit, noise: float, correlation: float = 1.0
+) -> float:
+    """Return the logarithm of the likelihood of the observations with a fit, up to a constant.
+
+    It compares fits whose cameras differ, and with them the ``data``. ``noise`` (pixels) is that of the better fit.
+    """
+    return -_cost(ReprojectionErrors(data, fit.T_world_rig), fit, noise) / correlation
+
+
+def _cost(errors: ReprojectionErrors, fit: ReprojectionFit, noise: float) -> float:
+    """Return the loss of ``resect``, without priors."""
+    state = State.of(fit.T_world_rig, fit.calibration, fit.motion)
+    return errors.system(errors.linearized(state, np.arange(0)), noise).cost

@@ -142,12 +142,17 @@ def _from_far(
 
 
 def told_apart(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
+    """Return the stretch, if it is more than the errors of lenses, and what remains of the change of the focal length."""
+    if abs(log_stretch) <= LEAST_STRETCH:
+        return UNSTRETCHED, log_focal
+    return least_change(log_stretch, log_focal)
+
+
+def least_change(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
     """Return the stretch, and what remains of the change of the focal length.
 
     An image that was resized in one direction keeps its focal length in the other, so that the least change is the most probable.
     """
-    if abs(log_stretch) <= LEAST_STRETCH:
-        return UNSTRETCHED, log_focal
     across = min((0.5, 0.0, 1.0), key=lambda share: abs(log_focal + (0.5 - share) * log_stretch))
     stretch = Stretch(math.exp(across * log_stretch), math.exp((across - 1) * log_stretch))
     return stretch, log_focal + (0.5 - across) * log_stretch

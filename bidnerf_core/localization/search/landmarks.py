@@ -18,6 +18,7 @@ from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
 from bidnerf_core.localization.search.other_camera import with_other_camera
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
+from bidnerf_core.localization.search.resized_image import with_resized_map_camera
 from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.localization.search.twins import twin_of
 from bidnerf_core.localization.search.unguided import unguided_matches
@@ -71,6 +72,7 @@ def propose(
     found = described(query, matches, answer, clock.seconds)
     clock.lap("assessment")
     found = with_other_camera(query, matches, found, clock)
+    found = with_resized_map_camera(query, matches, found, clock)
     return _with_twin(query, matcher, found, clock) if seek_twin else found
 
 

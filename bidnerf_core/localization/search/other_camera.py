@@ -9,7 +9,14 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.camera_shapes import median_camera, stretched_cameras
-from bidnerf_core.localization.search.camera_fit import FURTHER, MORE, SUSPECTED, CameraFit, told_apart
+from bidnerf_core.localization.search.camera_fit import (
+    FURTHER,
+    MORE,
+    SUSPECTED,
+    CameraFit,
+    least_change,
+    told_apart,
+)
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import LEAST_GUIDED_MATCHES, refined_pose
 from bidnerf_core.localization.search.landmark_evidence import described
@@ -46,7 +53,8 @@ def with_other_camera(
         found = estimated or found
         return _like_map_camera(query, matches, found, clock) or found
     if found.agreeing < SUSPECTED * found.matches and not found.takes_map_camera:
-        return _sampled_with_map_camera(query, matches, found, clock) or found
+        enough = MORE * found.agreeing + FURTHER
+        return sampled_with_map_camera(query, matches, enough, clock) or found
     return found
 
 
@@ -85,13 +93,13 @@ def _like_map_camera(
     return _with_map_camera(query, matches, camera, first, AS_MANY * found.agreeing, clock)
 
 
-def _sampled_with_map_camera(
-    query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose, clock: Stopwatch
+def sampled_with_map_camera(
+    query: LandmarkQuery, matches: LandmarkMatches, enough: float, clock: Stopwatch
 ) -> LandmarkPose | None:
-    """Return the pose by minimal samples with the map's intrinsics, resized to the image whatever its shape, if far more agree."""
+    """Return the pose by minimal samples with the map's camera, resized to the image whatever its shape, if ``enough`` matches agree."""
     given = query.images[-1].intrinsics
     groups = stretched_cameras(query.landmarks.cameras, given.width, given.height)
-    best, enough = None, MORE * found.agreeing + FURTHER
+    best = None
     for camera in dict.fromkeys(median_camera(group) for group in groups):
         if camera == given:
             continue
@@ -128,6 +136,9 @@ def _with_map_camera(
 def _correction(given: Intrinsics, camera: Intrinsics) -> tuple[Stretch, Calibration] | None:
     """Return how a camera differs from the given one; None if ``Calibration`` does not describe that."""
     across, down = math.log(camera.fx / given.fx), math.log(camera.fy / given.fy)
-    stretch, _ = told_apart(across - down, 0.5 * (across + down))
-    correction = correction_between(stretch.applied(given), camera)
-    return None if correction is None else (stretch, Calibration(*correction.tolist()))
+    for split in (told_apart, least_change):  # without a stretch, if that describes it
+        stretch, _ = split(across - down, 0.5 * (across + down))
+        correction = correction_between(stretch.applied(given), camera)
+        if correction is not None:
+            return stretch, Calibration(*correction.tolist())
+    return None

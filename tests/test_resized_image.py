@@ -1,0 +1,91 @@
+"""Images resized to another aspect ratio, and images of other cameras that only look as if they were."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bidnerf_core import Intrinsics
+from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.frames import View
+from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.mapping.landmark_building import build_landmarks
+from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.se3 import SE3
+from landmark_scene import PINHOLE, Points, looking_in, ring
+
+POINTS = Points(noise=0.3)
+POSES = [looking_in(0.43, 0.45, 3.6), looking_in(2.5, 0.6, 4.0)]
+
+
+@pytest.fixture(scope="module")
+def landmarks() -> LandmarkMap:
+    built = build_landmarks(ring(POINTS), POINTS)
+    scatter = torch.full((4,), 3e-3, dtype=torch.float64)
+    return replace(built, cameras=(PINHOLE,), correlation=4.0, calibration_scatter=scatter)
+
+
+def found_with(landmarks: LandmarkMap, view: View, stated: Intrinsics) -> LandmarkPose:
+    view = replace(view, frame=replace(view.frame, intrinsics=stated))
+    found = propose(LandmarkMatcher(landmarks), [view], POINTS)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("across", [0.75, 0.95, 0.97, 1.03, 1.05, 1.33])
+def test_an_image_of_the_maps_camera_that_was_resized_is_recognised(
+    landmarks: LandmarkMap, across: float, pose: SE3
+) -> None:
+    """By 3 and 5 %, motions between the rows, focal lengths and other poses explain it nearly as well."""
+    stated = replace(PINHOLE, fx=PINHOLE.fx / across)
+    found = found_with(landmarks, POINTS.view(pose, PINHOLE), stated)
+    assert landmark_verdict(found).accepted
+    assert found.intrinsics == PINHOLE
+    assert not found.has_motion
+    error = pose_error(found.T_world_camera, pose)
+    assert error.translation < 0.01
+    assert error.rotation_deg < 0.1
+
+
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize(("rows", "columns"), [(14, 0), (24, 0), (0, 20), (0, 32), (120, 0)])
+def test_an_image_of_another_aspect_ratio_keeps_its_own_intrinsics(
+    landmarks: LandmarkMap, rows: int, columns: int, pose: SE3
+) -> None:
+    """The middle of an image with the right camera: resized to it, the map's camera has pixels that are not square."""
+    part = replace(
+        PINHOLE,
+        width=PINHOLE.width - columns,
+        height=PINHOLE.height - rows,
+        cx=PINHOLE.cx - columns / 2,
+        cy=PINHOLE.cy - rows / 2,
+    )
+    found = found_with(landmarks, POINTS.view(pose, part), part)
+    assert landmark_verdict(found).accepted
+    assert found.intrinsics_of(part) is None
+    assert pose_error(found.T_world_camera, pose).translation < 0.01
+
+
+def test_the_doubt_between_two_cameras_is_part_of_the_covariance(landmarks: LandmarkMap) -> None:
+    """With keypoints that count for little, the evidence is weak, and the covariance covers both hypotheses."""
+    pose = POSES[0]
+    view, stated = POINTS.view(pose, PINHOLE), replace(PINHOLE, fx=PINHOLE.fx / 1.03)
+    vague = replace(landmarks, correlation=400.0)
+    unaware = found_with(replace(vague, cameras=()), view, stated)
+    found = found_with(vague, view, stated)
+    off = (found.T_world_camera.inverse() @ pose).log()
+    between = (found.T_world_camera.inverse() @ unaware.T_world_camera).log()
+    for shift in (off, between):
+        assert float(shift @ torch.linalg.solve(found.covariance, shift)) < 16.8
+
+
+def test_a_map_that_does_not_know_its_cameras_takes_the_given_one(landmarks: LandmarkMap) -> None:
+    stated = replace(PINHOLE, fx=PINHOLE.fx / 1.33)
+    found = found_with(replace(landmarks, cameras=()), POINTS.view(POSES[0], PINHOLE), stated)
+    assert not found.takes_map_camera
