@@ -82,7 +82,7 @@ class SurfaceDiagnostics:
 
 
 def surface_diagnostics(judge: SurfaceCost, T: SE3, margin: float) -> SurfaceDiagnostics:
-    """Measure how well the points of ``judge`` lie on the surface from one pose.
+    """Measure how well the points of ``judge``, placed by one pose, lie on the surface.
 
     Each point counts by its inlier weight, so no hard threshold on single points is involved. Points without a colour are
     left out of the colour inliers, unless no point has a colour.
@@ -102,7 +102,7 @@ class LandmarkDiagnostics:
     matches: int  # by descriptors alone
     agreeing: int  # of these, those that agree with the pose
     log10_nfa: float  # logarithm of the number of such agreements expected by chance
-    chance: float  # correspondences at a wrong pose
+    chance: float  # correspondences expected at a wrong pose
     visible: int  # landmarks that should be visible
     keypoints: int  # in the images
     spread: float  # share of the image's cells that hold a correspondence
@@ -144,10 +144,10 @@ class LandmarkThresholds:
     above_chance: float = 3.0  # times as many as at a wrong pose, at least
     spread: float = 0.06  # share of the image's cells that hold one, at least
     miscalibration: float = 0.1  # probability that the given intrinsics are wrong, at most
-    # probability that the intrinsics not taken, given or the map's, are right, at most, ...
+    # probability that the intrinsics that were not taken, the given ones or the map's, are right, at most, ...
     alternative: float = 0.2
-    # ... if they move the camera by more than this share of the landmarks' distance; at most as well of the expected motion, the
-    # product of both, since the farther off a pose may be, the less probable that has to be
+    # ... if they would move the camera by more than this share of the landmarks' distance. Also the limit of the expected
+    # motion, probability times motion: the farther off a pose may be, the less probable that must be.
     alternative_motion: float = 0.005
     precision: float = 0.03  # standard deviation of the position, as a share of that distance, at most
 
@@ -199,7 +199,7 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
 
 
 def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> bool:
-    """Return whether the intrinsics that were not taken, the given or the map's, may be right and would move the pose far."""
+    """Return whether the intrinsics that were not taken, given or the map's, may be right and would move the pose far."""
     motion = float(torch.linalg.vector_norm(found.alternative_shift[:3])) / found.distance
     probability = float(found.miscalibration.alternative_probability)
     most = thresholds.alternative_motion
@@ -245,10 +245,10 @@ def rendered_verdict(
 def descent_verdict(
     mean_loss: float, threshold: float, finite: bool, reason: str, plain_limit: float = math.inf
 ) -> Verdict:
-    """Judge a first-order descent by the mean loss of its last steps; ``reason`` says why it ended.
+    """Judge a first-order descent by the mean loss of its last steps; ``reason`` explains why it ended.
 
-    ``plain_limit`` is a share of the loss that the images' mean colours have, and infinite where more than colours was compared: at a
-    wrong pose photos of little contrast have a small loss too, but not a much smaller one than their mean colours.
+    ``plain_limit`` is a share of the loss of the images' mean colours, and infinite where more than colours was compared: at a
+    wrong pose, images of little contrast have a small loss too, but not a much smaller one than their mean colours.
     """
     if not finite or not math.isfinite(mean_loss):
         return Verdict(Outcome.DIVERGED, reason)

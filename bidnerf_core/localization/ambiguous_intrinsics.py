@@ -1,8 +1,11 @@
-"""Rejects poses without landmarks whose focal length is approximate, or, by colour alone, slightly other than that of the map's images.
+"""Rejection of poses found without landmarks and with intrinsics that may be wrong.
 
-Focal length and distance can hardly be separated without landmarks: a camera with a slightly longer focal length a little
-further away takes nearly the same image. Measured points are spread sideways by a wrong focal length, for which a shifted pose partly
-makes up. If the intrinsics are wrong, the pose is off by the difference.
+Either the focal length is approximate or, where only colours were compared, the intrinsics differ slightly from those of the
+map's images.
+
+Without landmarks, focal length and distance can hardly be separated: a camera with a slightly longer focal length a little
+farther away takes nearly the same image. A wrong focal length spreads measured points sideways, and a shifted pose partly
+compensates for this. Wrong intrinsics therefore make the pose wrong too.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, MapCamera,
 
 
 def may_be_miscalibrated(problem: Problem) -> bool:
-    """Whether the focal length is approximate, or the intrinsics are others than the map's but so near that they may be a mistake."""
+    """Return whether the focal length is approximate, or the intrinsics are near the map's but not the same, as by mistake."""
     if problem.focal_is_approximate:
         return True
     cameras = () if problem.matcher is None else problem.matcher.landmarks.cameras
@@ -29,10 +32,10 @@ def _differs_a_little(camera: MapCamera) -> bool:
 
 
 def without_ambiguous_intrinsics(found: Localization, problem: Problem) -> Localization:
-    """Reject an accepted pose where ``may_be_miscalibrated`` and no landmarks tell the intrinsics.
+    """Reject an accepted pose if its intrinsics may be wrong (see ``may_be_miscalibrated``) and no landmarks confirm them.
 
-    Where depth is measured, only an approximate focal length is a reason, and none where the pose is by the rays of a lidar alone, which
-    do not depend on it.
+    Where depth is measured, only an approximate focal length is a reason to reject, and not even that where the pose is based
+    on lidar rays alone, which do not depend on it.
     """
     if not found.converged or isinstance(found.diagnostics, LandmarkDiagnostics):
         return found
@@ -46,6 +49,6 @@ def without_ambiguous_intrinsics(found: Localization, problem: Problem) -> Local
 
 
 def _is_by_lidar(found: Localization, problem: Problem) -> bool:
-    """Whether a pose is by measured points of which none come from an image's depth."""
+    """Return whether a pose is based on measured points none of which come from a depth image."""
     by_points = isinstance(found.diagnostics, SurfaceDiagnostics)
     return by_points and not any(view.frame.has_depth for view in problem.views)

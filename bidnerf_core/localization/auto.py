@@ -1,4 +1,4 @@
-"""Method ``auto``: find the pose with a start or without one, by whatever was measured, and say whether to trust it.
+"""Method ``auto``: find the pose with or without a start, from whatever was measured, and decide whether to trust it.
 
 All its decisions are made here. If the map has landmarks, they are matched first, and their pose is fused with measured
 depth and rendered rays. If that pose is not accepted, the surface is searched: measured points are aligned with it where
@@ -48,21 +48,21 @@ from bidnerf_core.localization.twin_rejection import between_twins, twin_rejecti
 from bidnerf_core.se3 import SE3
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
-"""Reasons for which landmarks reject a pose that nothing else can put right: with wrong intrinsics, the surface is not found at
-the right place either.
+"""Outcomes of a pose by landmarks that no other measurement can put right: with wrong intrinsics, aligning points with the
+surface goes wrong too.
 """
 UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
-"""Reasons for which a pose that landmarks determine is rejected: it is not accurate, or not probable, enough."""
+"""Outcomes of a pose that landmarks determine, but not accurately enough or not with enough confidence."""
 FEWER = 0.05
-"""Share of the measured points by which landmarks may take a pose off the surface."""
+"""Largest share of the measured points that landmarks may move off the surface."""
 IN_FRONT = 0.9
 """Least share of the points of an occluder that must lie before the surface."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=math.inf)
-"""Thresholds for landmarks that match near a pose that was not found by them."""
+"""Thresholds for landmarks that match near a pose found by other means."""
 MISLEADING = 0.5
-"""Probability that the intrinsics are wrong, by the landmarks near a pose by colour alone, from which on it is rejected."""
+"""Probability of wrong intrinsics, estimated from the landmarks near a pose by colour alone, above which that is rejected."""
 SUPPORTED, MOVING = 0.5, 0.8
-"""Least confidence of landmarks in a pose that the surface accepts, and with which they may move one by depth."""
+"""Least confidence with which landmarks support a pose accepted on the surface, and with which they may move one by depth."""
 
 
 def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
@@ -140,14 +140,14 @@ def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
 
 
 def _without_landmarks(found: Localization) -> Localization:
-    """Return an answer in a map without landmarks, which says so where they might have led to a pose."""
+    """Return an answer in a map without landmarks, with a hint at this where landmarks might have led to a pose."""
     if found.converged or found.outcome is Outcome.UNDETERMINED:
         return found
     return replace(found, reason=f"{found.reason}; the map has no landmarks ('bidnerf bake' makes them)")
 
 
 def _is_settled(found: Localization) -> bool:
-    """Whether a pose is accepted and nothing suggests that something in front hides part of the scene."""
+    """Return whether a pose is accepted and nothing suggests that something in front hides part of the scene."""
     said = found.diagnostics
     if not found.converged or not isinstance(said, LandmarkDiagnostics) or said.on_surface is None:
         return found.converged
@@ -155,7 +155,7 @@ def _is_settled(found: Localization) -> bool:
 
 
 def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
-    """Whether landmarks in a partly hidden scene gave a pose from which the measured points are off the surface."""
+    """Return whether landmarks in a partly hidden scene gave a pose that places the measured points off the surface."""
     if problem.surface is None or not answer.verdict.accepted or (answer.confidence or 0.0) >= TRUSTED:
         return False
     if not _partly_hidden(problem) or not _keeps_points(problem, answer.found):
@@ -165,7 +165,7 @@ def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
 
 
 def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
-    """Whether the surface has nothing to add to what landmarks found.
+    """Return whether the surface has nothing to add to what landmarks found.
 
     Colours do not determine a position that landmarks leave imprecise because the intrinsics are unknown.
     """
@@ -177,7 +177,7 @@ def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
 
 
 def _rejected(found: Localization, why: Verdict) -> Localization:
-    """Return a pose as rejected; its confidence, which follows from how well it fits, does not hold."""
+    """Return a localization as rejected, and without its confidence, which follows from how well the pose fits."""
     return replace(found, outcome=why.outcome, reason=f"{why.reason}; {found.reason}", confidence=None)
 
 
@@ -190,10 +190,10 @@ def _compared_with_landmarks(
     seed: int,
     began: float,
 ) -> Localization:
-    """Refine an answer of the surface by the landmarks that match there, or reject it if they should and do not.
+    """Refine a pose found on the surface by the landmarks that match there, or reject it if they should match and do not.
 
     ``start`` is what the user gave.
-    Landmarks with less confidence than ``MOVING`` confirm an accepted pose by measured points, but do not move it if the points
+    Landmarks with less confidence than ``MOVING`` confirm an accepted pose by depth, but do not move it if the measured points
     determine it better.
     """
     near = confirm(matcher, problem.views, found.T_world_camera, seek_twin=True)
@@ -242,19 +242,19 @@ def _unless_twin(
     config: AutoConfig,
     seed: int,
 ) -> Localization:
-    """Return an accepted pose that landmarks did not find, rejected if those ``near`` it match at another place as well."""
+    """Return an accepted pose that was not found by landmarks, rejected if those ``near`` it match at another place as well."""
     rejection = None if near is None else twin_rejection(problem, near, start, config.fused_rays, seed)
     return found if rejection is None else _rejected(found, rejection)
 
 
 def _is_misled(near: LandmarkPose, problem: Problem) -> bool:
-    """Whether landmarks say that the intrinsics are wrong, with which colours agree at a wrong pose; measured depth would not."""
+    """Return whether landmarks contradict the intrinsics of a pose by colour, which fits wrong ones at a wrong pose."""
     doubted = near.miscalibration.worst[1] > MISLEADING or near.better_camera is not None
     return doubted and not near.estimates_calibration and _measured_points(problem) < LEAST_POINTS
 
 
 def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:
-    """Whether landmarks would move a pose found on the surface to where fewer of the measured points lie on it."""
+    """Return whether landmarks would move a pose found on the surface to where fewer of the measured points lie on it."""
     if problem.surface is None or not _partly_hidden(problem) or _measured_points(problem) < LEAST_POINTS:
         return False
     before = share_on_surface(problem, problem.surface, found.T_world_camera)
@@ -263,20 +263,20 @@ def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswe
 
 
 def _is_surer(found: Localization, answer: LandmarkAnswer) -> bool:
-    """Whether the position of a pose by depth is more certain than by landmarks."""
+    """Return whether the position is more certain by depth than by landmarks."""
     if found.covariance is None:
         return False
     return position_deviation(found.covariance) < position_deviation(answer.full_covariance)
 
 
 def _keeps_points(problem: Problem, found: LandmarkPose) -> bool:
-    """Whether there are measured points, and landmarks do not correct the intrinsics by which these are placed."""
+    """Return whether there are measured points, and landmarks do not correct the intrinsics that place them."""
     kept = found.intrinsics_of(problem.views[-1].frame.intrinsics) is None
     return kept and _measured_points(problem) >= LEAST_POINTS
 
 
 def _partly_hidden(problem: Problem) -> bool:
-    """Whether something hides part of the scene, so that few landmarks are left and measured points tell more.
+    """Return whether something hides part of the scene, so that few landmarks are left and measured points weigh more.
 
     Elsewhere landmarks are trusted more than the scale of a depth sensor.
     """

@@ -1,7 +1,7 @@
 """Poses of blurred images: the whole image is compared with renderings that are blurred to match.
 
-Keypoints are inaccurate in blurred images, and rendered rays are as sharp as the field, so that the edges, which tell most about
-the pose, count as outliers. A rendering blurred like the image has the same edges.
+Keypoints are inaccurate in blurred images, and rendered rays are as sharp as the field, so the edges, which constrain the pose
+most, count as outliers. A rendering blurred like the image has the same edges.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ NOTICEABLE_BLUR = 0.7
 CLEARLY_LESS = 0.85
 """Cost with the best blur, as a share of that without, below which an image counts as blurred."""
 ROUNDS, STEPS = 3, 4
-"""The blur is estimated that often, each time followed by that many steps."""
+"""Number of times that the blur is estimated, and number of steps after each estimate."""
 HALF_AN_INLIER = 0.1
-"""Norm of a colour difference at which a pixel is half an inlier."""
+"""Norm of a colour difference at which a pixel's inlier weight is one half."""
 LEAST_EXPLAINED = 0.75
 """Least share of the image's contrast that an accepted pose explains."""
 PRECISE = 0.01
@@ -50,15 +50,15 @@ INDEPENDENT_PIXELS = 60
 UNSUITABLE = (
     Outcome.AMBIGUOUS, Outcome.DIVERGED, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.TOO_FEW_MATCHES
 )  # fmt: skip
-"""Outcomes of poses that a closer comparison does not put right."""
+"""Outcomes of poses that a closer comparison cannot put right."""
 
 
 def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: int) -> Localization:
     """Return a doubtful pose refined and judged anew if the images are blurrier than what the field renders from there.
 
-    Poses are returned as they are where depth was measured, part of an image is hidden, the intrinsics were corrected, approximate or differ
-    a little from those of the map's images, the field is itself not sharp, or the map has no surface. ``rays`` and ``seed`` are those of ``mirror_rejection``, which judges poses that
-    are accepted here only.
+    A pose is returned as it is where depth was measured, part of an image is hidden, the intrinsics were corrected, are
+    approximate or differ a little from those of the map's images, the field itself is not sharp, or the map has no surface.
+    ``rays`` and ``seed`` are passed to ``mirror_rejection``, which judges only the poses that were not accepted before.
     """
     if not _is_eligible(problem, found):
         return found
@@ -102,7 +102,7 @@ def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: i
 
 
 def _is_eligible(problem: Problem, found: Localization) -> bool:
-    """Whether an answer is doubtful, and whole images with the intrinsics given can be compared with the field's renderings."""
+    """Return whether an answer is doubtful and whole images, with the given intrinsics, can be compared with renderings."""
     hidden = any(view.frame.hidden is not None for view in problem.views)
     unsuited_map = problem.surface is None or not is_sharp(problem)
     if problem.has_depth or hidden or unsuited_map or found.intrinsics is not None:

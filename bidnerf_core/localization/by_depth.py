@@ -32,7 +32,7 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
 WORSE = 0.05
-"""Largest increase of the cost on the surface by refinement; with more, field and surface contradict each other."""
+"""Largest increase in the cost on the surface due to refinement; beyond it, field and surface contradict each other."""
 JUDGED_POINTS = 1000
 """Number of points by which two poses are compared."""
 LOSS_POINTS = 200
@@ -124,7 +124,7 @@ def _refined(
 
 @torch.no_grad()
 def share_on_surface(problem: Problem, surface: SurfaceMap, T_world_camera: SE3) -> float:
-    """Return the share of the measured points that lie on the surface from a pose."""
+    """Return the share of the measured points that a pose places on the surface."""
     cloud = PointCloud.measured(problem.views, problem.depth_rays, JUDGED_POINTS, Generator().manual_seed(0))
     judge = finest_cost(surface, cloud)
     return float(judge.inliers(judge.correspondences(T_world_camera[None]))[0].mean())

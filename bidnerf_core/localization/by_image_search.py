@@ -37,16 +37,16 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
 COMPARED_WIDTH = 96
-"""Pixels of the longer side of thumbnails on which the answers of different rounds are compared, as in the last stage of the first."""
+"""Longer side (pixels) of the thumbnails on which answers of all rounds are compared: that of the first round's last stage."""
 MANY_RAYS = 4
-"""How many times as many rays are rendered where something may hide part of the scene."""
+"""Factor by which more rays are rendered where something may hide part of the scene."""
 MANY_LANDMARKS = 500
-"""The number of landmarks from which on a scene is textured."""
+"""Least number of landmarks of a scene that counts as textured."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """A search by images, and what refines and judges the poses that it leaves."""
+    """A search by images, and the function that refines and judges the poses it finds."""
 
     search: ImageSearch
     stages: Sequence[ImageStage]
@@ -99,7 +99,7 @@ def _refined_robustly(
 
 
 def _is_hopeless(problem: Problem) -> bool:
-    """Whether an image without recognised landmarks cannot be found: the scene is textured, and its field blurred."""
+    """Return whether an image without recognised landmarks cannot be found: the scene is textured, and its field blurred."""
     textured = problem.matcher is not None and len(problem.matcher.landmarks) >= MANY_LANDMARKS
     return textured and not is_sharp(problem)
 

@@ -49,11 +49,11 @@ from bidnerf_core.se3 import SE3
 POINTS = 2000
 """Largest number of measured points that are fused."""
 STEPS, MORE_STEPS = 5, 8
-"""Largest number of steps on the sum of all terms, and that from poses that landmarks leave doubtful."""
+"""Largest number of steps on the sum of all terms, and the same from poses that landmarks leave doubtful."""
 CONTRADICTORY = 30.0
-"""Squared distance from the landmarks' pose, in its standard deviations, beyond which what moved it there contradicts the landmarks."""
+"""Squared Mahalanobis distance from the landmarks' pose beyond which the fused measurements contradict the landmarks."""
 THOROUGHLY = 4
-"""How many times as many rays such poses get; each ray then counts so many times as much."""
+"""Factor by which poses that landmarks leave doubtful get more rays; the weight of each ray grows by the same factor."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
 MOSTLY = 0.5
@@ -70,15 +70,15 @@ class LandmarkAnswer:
     covariance: Float[Tensor, "6 6"]
     diagnostics: LandmarkDiagnostics
     terms: tuple[str, ...] = ()  # what was fused with the landmarks
-    depth_factor: float = 1.0  # by which depths are longer with the fused pose than ``corrected`` makes them
+    depth_factor: float = 1.0  # by which the fused pose lengthens depths beyond what ``corrected`` does
     left_out: str = ""  # what was not fused because it contradicts them
     confidence: float | None = None  # probability that the pose is right
 
     @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:
-        """The covariance with the errors of the intrinsics that the image does not rule out.
+        """The covariance, including that due to errors of the intrinsics that the image does not rule out.
 
-        Landmarks and rendered colours are misled by them alike, and the scale of measured depth is no better known.
+        These errors mislead landmarks and rendered colours alike, and the scale of measured depth is no better known.
         """
         return self.covariance + self.found.unresolved_calibration
 
@@ -88,8 +88,8 @@ def answer_by_landmarks(
 ) -> LandmarkAnswer | None:
     """Find the pose by landmarks and, if it is accepted, refine it on all terms at once.
 
-    Returns None if too few features match. ``rays`` is the number of rays rendered for the refinement; 0 leaves rendering
-    out, also where it would tell which intrinsics are right.
+    Returns None if too few features match. ``rays`` is the number of rays rendered for the refinement; 0 disables rendering,
+    even where it would show which intrinsics are right.
     """
     found = propose(matcher, problem.views, seed=seed, seek_twin=True)
     if found is not None and rays:
@@ -100,7 +100,7 @@ def answer_by_landmarks(
 def _with_camera_judged(
     problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, seed: int
 ) -> LandmarkPose:
-    """Return a pose again with what renderings say about the camera, where landmarks do not tell which intrinsics are right."""
+    """Return a pose, found again with evidence from renderings if landmarks leave open which intrinsics are right."""
     if landmark_verdict(found).outcome is not Outcome.MISCALIBRATED or found.has_other_camera:
         return found
     evidence, limits = NO_EVIDENCE, LandmarkThresholds()
@@ -133,9 +133,9 @@ def _log_odds_of(
     corrected_camera: Callable[[Intrinsics], Intrinsics],
     seed: int,
 ) -> float:
-    """Return the logarithm of the odds, by renderings, that a correction of the intrinsics taken is right and not these.
+    """Return the log odds, by renderings, of corrected intrinsics against the intrinsics that were taken.
 
-    ``correction`` tells how far the pose moves with it.
+    ``correction`` determines how the pose moves along with the intrinsics.
     """
     taken = corrected(problem, found)
     views = tuple(
@@ -177,9 +177,9 @@ def _judged(answer: LandmarkAnswer, approximate: bool) -> LandmarkAnswer:
 
 
 def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Problem:
-    """Return the problem from the pose found, with its intrinsics and its motion, and with measured depth on the map's scale.
+    """Return the problem with a pose as its start, that pose's intrinsics and motion, and measured depth on the map's scale.
 
-    ``factor`` is what the fused pose corrects that scale by.
+    ``factor`` is the fused pose's correction of that scale.
     """
     scale, views = factor * DepthScale.of(found, problem.sensor).estimate, []
     for view in problem.views:
@@ -191,23 +191,23 @@ def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Pro
 
 
 def is_sharp(problem: Problem) -> bool:
-    """Whether the field is sharp enough for rendered rays to add to what landmarks tell."""
+    """Return whether the field is sharp enough for rendered rays to add to the landmarks' information."""
     return problem.colour_noise is None or problem.colour_noise <= SHARPEST
 
 
 def _cost_of_points(problem: Problem, surface: SurfaceMap, generator: Generator) -> SurfaceCost:
-    """Return the cost of measured points, which are drawn, on the surface."""
+    """Return the cost on the surface of measured points drawn at random."""
     return finest_cost(surface, PointCloud.measured(problem.views, problem.depth_rays, POINTS, generator))
 
 
 def _fused(
     problem: Problem, answer: LandmarkAnswer, points: SurfaceCost | None, rays: int, generator: Generator
 ) -> LandmarkAnswer:
-    """Return the answer fused with measured points and rendered rays, as far as there are any and landmarks do not contradict.
+    """Return the answer fused with measured points and rendered rays, as far as there are any that agree with the landmarks.
 
-    Where there are points, rays compare colours alone: depth is measured once, and its scale is not exact. The errors of the
-    poses of the map's images are in its surface and its field as in its landmarks, and those of the motion of a rolling shutter in
-    rays and points too, so that no fusion makes them smaller.
+    Where there are points, rays compare colours alone: depth is measured once, and its scale is not exact. Errors in the poses
+    of the map's images affect its surface and its field as they do its landmarks, and errors in the motion of a rolling shutter
+    affect rays and points too, so fusion does not reduce them.
     """
     scale = DepthScale.of(answer.found, problem.sensor)
     if points is not None and scale.objection is not None:
@@ -235,7 +235,10 @@ def _fused(
 def _drawing(
     problem: Problem, rays: int, about: Pivot, by_depth: bool, generator: Generator
 ) -> Callable[[SE3, float], RenderedCost]:
-    """Return what draws rays about a pose, for an uncertainty of the surfaces; the loss of colours leaves out what hides the scene."""
+    """Return a function that draws rays from a pose, given the uncertainty of the surfaces (metres).
+
+    Its colour loss is redescending, so what hides the scene counts as outliers.
+    """
     depth = DepthSettings() if problem.has_depth and by_depth else None
     colour = ColourSettings(colour_loss="geman-mcclure")
     settings = RenderedCostSettings(colour, depth, RefinementSettings(exposure=True))

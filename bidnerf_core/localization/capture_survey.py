@@ -31,9 +31,9 @@ from bidnerf_core.mapping.triangulation import noise
 
 NOT_TRIED = HeldOutTrial()
 LEAST_EXPOSURE = 1.0
-"""Stops by which a photo must at least differ to be badly exposed; training corrects less."""
+"""Least difference, in stops, from the median exposure of a badly exposed photo; training corrects smaller ones."""
 CLIPPED = 0.25
-"""Share of the pixels that may be clipped in a photo beyond those in its neighbours."""
+"""Largest excess of the share of clipped pixels in a photo over that in its neighbours."""
 
 
 def surveyed(
@@ -46,7 +46,7 @@ def surveyed(
     """Return the record of the capture whose keypoints are matched in ``tracked``, in the order of ``views``.
 
     Photos that share few landmarks with others are localized by the landmarks of those that share many, as they are and
-    mirrored: that tells a wrong pose from a photo that shows something else. ``trial`` is how held-out photos were found.
+    mirrored: this distinguishes a wrong pose from a photo of something else. ``trial`` holds the errors of held-out photos.
     """
     seen, positions = tracked.triangulated(config)
     links, measures = linked(seen), photo_measures(views)

@@ -18,11 +18,12 @@ from bidnerf_core.localization.result import Outcome, Verdict
 ACCEPTED = 0.8
 """Least confidence with which a pose is accepted."""
 ACCEPTED_ESTIMATED = 0.6
-"""Least confidence of a pose whose intrinsics were estimated along because landmarks contradict the given ones: that takes evidence of its
-own, which the model does not count.
+"""Least confidence of a pose whose intrinsics were estimated too because landmarks contradict the given ones.
+
+The contradiction takes evidence of its own, which the model does not count.
 """
 TRUSTED = 0.95
-"""Confidence from which on a pose by landmarks needs no further measurements to be trusted."""
+"""Least confidence at which a pose by landmarks is trusted without further measurements."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def judged(
 ) -> Judgement:
     """Return the confidence in a pose, and the verdict, which it can turn into a rejection.
 
-    ``approximate``: whether the focal length was given as such, so that it was estimated whatever landmarks say.
+    ``approximate``: whether the focal length was given as approximate, so that it was estimated in any case.
     """
     value = confidence(diagnostics)
     estimated = isinstance(diagnostics, LandmarkDiagnostics) and diagnostics.estimated_calibration

@@ -72,7 +72,7 @@ def scale_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
 
 
 def offset_slope(cloud: PointCloud) -> Float[Tensor, "6"]:
-    """Return the update about the cloud's pivot that keeps it in place while all distances grow by a metre, metres a metre."""
+    """Return the update about the cloud's pivot that keeps it in place while distances grow by a metre, metres per metre."""
     sight = torch.nn.functional.normalize((cloud.points - cloud.origins).double(), dim=-1)
     return torch.cat([-sight.mean(0).cpu(), torch.zeros(3, dtype=torch.float64)])
 

@@ -1,4 +1,4 @@
-"""What is known of the factor that corrects all depths of an image, and measured points that share it."""
+"""What is known about the factor that corrects all depths of an image, and measured points that share it."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from bidnerf_core.se3 import SE3
 LANDMARK_SCALE_NOISE = 0.01
 """Relative standard deviation of the depth scale that a few landmarks give, from the right pose."""
 PRIOR_WIDTH = 2.0
-"""Standard deviation of the prior of the depth scale over that of the sensor's scale, since single sensors are off by far more."""
+"""Ratio of the standard deviation of the depth scale's prior to that of the sensor model: some sensors are off by far more."""
 PLAUSIBLE = 5.0
-"""Standard deviations of the depth scale by landmarks beyond which the depth is of another unit, or otherwise wrong."""
+"""Deviation of the depth scale by landmarks, in standard deviations, beyond which the depth has another unit or is wrong."""
 LEAST_SCALE_DEVIATION = 1e-4
 """Least standard deviation of the factor, so that a sensor without errors can be fused."""
 
 
 @dataclass(frozen=True)
 class DepthScale:
-    """What a sensor's tolerance and landmarks say of the factor that corrects measured depth."""
+    """What a sensor's tolerance and landmarks imply for the factor that corrects measured depth."""
 
-    deviation: float  # of the factor about 1, by the sensor
+    deviation: float  # standard deviation of the factor about 1, from the sensor's tolerance
     # Factor from the pose at which landmarks were matched; None if too little was measured.
     by_landmarks: float | None = None
 
     @staticmethod
     def of(found: LandmarkPose, sensor: DepthSensorModel) -> DepthScale:
-        """Return what is known of the depths that a sensor measured with a pose by landmarks."""
+        """Return what is known about the scale of a sensor's depths, given a pose by landmarks."""
         return DepthScale(PRIOR_WIDTH * sensor.scale, found.depth_scale)
 
     @property
@@ -80,20 +80,20 @@ class ScaledPoints:
         return replace(self.cost, cloud=self.cost.cloud.scaled(factor))
 
     def cost_at(self, at: PoseAndFactor) -> Float[Tensor, "1"]:
-        """Return the value of that cost at a pose."""
+        """Return the cost at a pose and a factor, without derivatives."""
         return self.at(at.factor).cost(at.T[None])
 
     def about_middle(self, cost: SurfaceCost, equations: NormalEquations) -> NormalEquations:
-        """Return the equations of points of some factor about the middle of those of ``self.cost``."""
+        """Convert equations about the middle of the points of ``cost`` to ones about the middle of those of ``self.cost``."""
         updates = torch.eye(7, dtype=torch.float64)
         updates[:6, :6] = cost.cloud.pivot.adjoint_from(self.cost.cloud.pivot)
         return equations.of_others(updates)
 
     def assumed(self, at: PoseAndFactor) -> NormalEquations:
-        """Return the cost of what the sensor's tolerance and the landmarks say of the factor.
+        """Return the equations of what the sensor's tolerance and the landmarks imply for the factor.
 
-        Landmarks give the ratio of their depths to the measured ones, which changes with the pose as the distances of what
-        lay at the measured points do.
+        Landmarks give the ratio of their depths to the measured ones. With the pose, it changes in proportion to the distances
+        of the points of the scene that were measured.
         """
         applied = self.scale.estimate
         by_factor = torch.zeros(7, dtype=torch.float64)
@@ -109,7 +109,10 @@ class ScaledPoints:
         return whole + residual_equations(residual, jacobian, LANDMARK_SCALE_NOISE)
 
     def _relative_distance(self, T: SE3) -> tuple[float, Float[Tensor, "6"]]:
-        """Return how far what lay at the points from the start is from a pose, relative to the start, and its derivative."""
+        """Return the mean ratio of the points' distances from a pose to those from ``start``, and its derivative.
+
+        The points are fixed in the world, where ``start`` places them.
+        """
         cloud = self.cost.cloud.to("cpu")
         points, origins = cloud.points.double(), cloud.origins.double()
         lines = points - origins
@@ -122,7 +125,7 @@ class ScaledPoints:
 
 
 def residual_equations(residual: float, jacobian: Float[Tensor, "k"], deviation: float) -> NormalEquations:
-    """Return the cost of a single residual with that standard deviation."""
+    """Return the normal equations of a single residual whose standard deviation is ``deviation``."""
     whitened, value = jacobian / deviation, residual / deviation
     return NormalEquations(
         whitened.new_tensor([value**2]), value * whitened[None], torch.outer(whitened, whitened)[None]
@@ -130,5 +133,5 @@ def residual_equations(residual: float, jacobian: Float[Tensor, "k"], deviation:
 
 
 def with_factor(equations: NormalEquations) -> NormalEquations:
-    """Return the equations of a pose as those of pose and factor, on which they do not depend."""
+    """Extend the equations of a pose by the factor as a seventh unknown, on which they do not depend."""
     return equations.of_others(torch.eye(6, 7, dtype=torch.float64))

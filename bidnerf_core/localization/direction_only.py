@@ -1,4 +1,4 @@
-"""Answers in maps of photos from one place, which show directions and no distances."""
+"""Answers in maps of photos from one place, which determine directions but no distances."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ NO_DISTANCES = "the map's photos are from one place and show no distances"
 
 
 def has_distances(scene: SceneMap) -> bool:
-    """Return whether the images of a map showed how far things are; a map that does not say so is taken to know it."""
+    """Return whether a map's images determine distances; this is assumed of a map without an attribute ``has_distances``."""
     return bool(getattr(scene, "has_distances", True))
 
 
 def direction_only(found: Localization) -> Localization:
-    """Return an answer that does not claim to know a position; one that was rejected for another reason stays so."""
+    """Return an answer that claims no position: it is rejected as imprecise, or for its own reason if it had one already."""
     outcome = Outcome.IMPRECISE if found.converged else found.outcome
     return replace(
         found,

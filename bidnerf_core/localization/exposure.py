@@ -30,9 +30,9 @@ class Exposure:
 
 
 def clipped(seen: Float[Tensor, "*s"], measured: Float[Tensor, "#*s"]) -> Bool[Tensor, "*s"]:
-    """Return which colours are black or white in the image, and carried beyond that by an exposure, which makes them ``seen``.
+    """Return which colours are black or white in the image while the exposure takes the rendered ones, ``seen``, even further.
 
-    They agree with the exposure, whatever the difference, but do not determine it.
+    Such colours agree with the exposure, whatever the difference, but do not determine it.
     """
     return ((measured > 1 - NEARLY_CLIPPED) & (seen >= 1)) | ((measured < NEARLY_CLIPPED) & (seen <= 0))
 
@@ -62,9 +62,10 @@ def fit_exposure(
 def robust_exposure(
     rendered: Float[Tensor, "h c n"], measured: Float[Tensor, "c n"], weights: Float[Tensor, "c n"], robust: Robust
 ) -> Exposure:  # fmt: skip
-    """Fit the exposure of each pose by iteratively reweighted least squares; colours that it clips have no weight.
+    """Fit the exposure at each pose by iteratively reweighted least squares; colours that it clips have no weight.
 
-    The rounds begin at a gain of 1. With a redescending loss they find images of up to two stops less, but one stop more.
+    The rounds begin at a gain of 1. With a redescending loss, they succeed for images up to two stops darker, but only one stop
+    brighter.
     """
     rendered = torch.where(weights > 0, rendered, 0)
     exposure = Exposure(torch.ones_like(rendered[..., 0]), torch.zeros_like(rendered[..., 0]))

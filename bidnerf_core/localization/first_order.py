@@ -21,7 +21,7 @@ from bidnerf_core.residuals import Objective
 from bidnerf_core.se3 import SE3
 
 PAPERS_REACH = ReachSettings()
-"""Nothing is added to the paper's objective."""
+"""The paper's objective, with nothing added."""
 
 
 def descended(

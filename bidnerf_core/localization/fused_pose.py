@@ -1,4 +1,4 @@
-"""The pose that explains best a prior, measured points on the surface and rendered rays together."""
+"""The pose that best explains a prior, measured points on the surface and rendered rays together."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.se3 import SE3
 
 LEAST_DECREASE = 0.3
-"""Decrease that a step promises of the sum of all terms, below which it is the last."""
+"""Predicted decrease of the sum of all terms below which a step is the last."""
 FIRST_DAMPING = 1e-3
 """Damping of the first step."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """What is fused: a prior of the pose, measured points, and rendered rays, of which fresh ones are drawn for each step."""
+    """What is fused: a prior on the pose, measured points, and rendered rays, which are drawn anew for each step."""
 
     prior: GaussianPrior
     views: int
     points: ScaledPoints | None = None  # about the prior's pivot
-    # Returns the cost of fresh rays, about that pivot too, from a pose and for an uncertainty of the surfaces, metres.
+    # Returns the cost of fresh rays, about that pivot too, given a pose and the uncertainty of the surfaces (metres).
     draw: Callable[[SE3, float], RenderedCost] | None = None
-    effort: float = 1.0  # how many times each rendered ray counts
+    effort: float = 1.0  # factor on the weight of the rendered rays together
 
     def at(self, here: PoseAndFactor, deviation: float) -> WeightedTerms:
-        """Weight the terms by how well they fit a pose, from which what is seen is uncertain by ``deviation``, metres."""
+        """Weight the terms by how well they fit a pose; what is seen from it is uncertain by ``deviation`` (metres)."""
         terms = []
         if self.points is not None:
             cost = self.points.at(here.factor)
@@ -61,7 +61,7 @@ class Measurements:
         return WeightedTerms(self, self.assumed(here), tuple(terms))
 
     def assumed(self, at: PoseAndFactor) -> NormalEquations:
-        """Return the equations of what is known beside the measurements: of the pose, and of the factor on depths.
+        """Return the equations of what is known besides the measurements, about the pose and about the factor on depths.
 
         Without points the factor is tied to 1, so that the equations can be solved.
         """
@@ -78,7 +78,7 @@ class WeightedTerm:
     cost: Callable[[PoseAndFactor], Float[Tensor, "1"]]
     equations: NormalEquations
     variance: float
-    measurements: float  # independent ones that it counts for in a step
+    measurements: float  # number of independent measurements that it counts as in a step
 
     @property
     def weight(self) -> float:
@@ -118,7 +118,7 @@ class WeightedTerms:
 
 @dataclass(frozen=True, eq=False)
 class FusedPose:
-    """A pose by several measurements, its covariance, and the factor on measured depths that suits it."""
+    """A pose estimated from several measurements, its covariance, and the factor on measured depths estimated with it."""
 
     T: SE3
     covariance: Float[Tensor, "6 6"]  # metres, radians; of a right update
@@ -128,10 +128,11 @@ class FusedPose:
 def fused_pose(measurements: Measurements, most_steps: int) -> FusedPose:
     """Return the pose that explains all terms best.
 
-    Each step takes fresh rays, so that the pose does not fit the noise of one draw, and weights the terms by how well they fit
-    before it: a start that is far off would make them count for little to the end. Rays whose rendering changes steeply over
-    the distance by which what is seen may be off count for less, since their derivatives do not hold so far. A step that does
-    not lower the sum is not taken, and none follows where equations are not finite. The covariance allows for the last step.
+    Each step takes fresh rays, so that the pose does not fit the noise of one draw, and weights the terms anew by how well they
+    fit before it: with weights from a start that is far off, they would count for little until the end. Rays whose rendering
+    changes steeply over the distance by which what is seen may be off count less, since their linearization does not hold that
+    far. A step that does not lower the sum is not taken, and the steps end where equations are not finite. The covariance
+    allows for the last step.
     """
     prior = measurements.prior
     here, covariance = PoseAndFactor(prior.mean), prior.at_pivot

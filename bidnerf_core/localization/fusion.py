@@ -1,4 +1,4 @@
-"""Fusion of costs in different units: each counts by the inverse variance of its residuals."""
+"""Fusion of costs in different units: each is weighted by the inverse variance of its residuals."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.se3 import SE3
 
 SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
-"""Numbers of independent measurements that a view's points on the surface and its rendered rays count as."""
+"""Numbers of independent measurements that a view's points on the surface, and its rendered rays, count as."""
 SCALED_MEASUREMENTS = 30.0
-"""Number of independent measurements that a view's points count as where their scale is an unknown and no error in common."""
+"""Number of independent measurements that a view's points count as where their scale is an unknown, not an error they share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class FusedTerm:
 
     cost: Cost
     variance: float
-    measurements: float  # independent ones that it counts for
+    measurements: float  # number of independent measurements that it counts as
 
     @property
     def weight(self) -> float:

@@ -1,8 +1,8 @@
 """Method ``inerf``: the colours of one image, in full detail (Yen-Chen et al. 2021, iNeRF).
 
 "In full detail" is the field itself, which a NeRF renders hierarchically with its coarse and its fine network. iNeRF
-descends by the magnitude and the axis of one screw motion from the start; here each step is an update of its own in the same
-frame, the world's. The two differ in second order, and an update has no axis that is undefined at magnitude 0.
+optimizes the magnitude and the axis of one screw motion from the start; here each step is an update of its own in the same
+frame, the world's. The two differ to second order, and updates have no axis that would be undefined at magnitude 0.
 """
 
 from __future__ import annotations

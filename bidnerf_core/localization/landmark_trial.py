@@ -1,6 +1,6 @@
 """A trial of a map's landmarks: localize some of its own images by landmarks that are built without them.
 
-The errors tell how accurate poses by landmarks are in this map, and how many keypoints count as one measurement: triangulated
+The errors show how accurate poses by landmarks are in this map, and how many keypoints count as one measurement: triangulated
 points, lenses, rolling shutters and the given poses all have errors that the keypoints of an image share.
 """
 
@@ -31,7 +31,7 @@ from bidnerf_core.mapping.landmarks import HeldOutTrial, LandmarkMap
 from bidnerf_core.se3 import SE3
 
 HELD_OUT, MOST_HELD_OUT = 8, 24
-"""One image in so many is held out, and at most so many images."""
+"""One image in ``HELD_OUT`` is held out, and at most ``MOST_HELD_OUT`` in all."""
 ENOUGH_ANSWERS = 6
 """Least number of localized images from which scatter is estimated."""
 QUANTILE = 0.9
@@ -111,7 +111,7 @@ def _answers(
     for number in held_out:
         T = views[number].T_ref_camera.to("cpu", torch.float64)
         view = View(views[number].frame, SE3.identity())
-        # The poses that it is compared with contain no motion either.
+        # The given poses that it is compared with contain no motion either.
         found = propose(matcher, [view], features, moving=False)
         if found is not None and landmark_verdict(found).accepted:
             answers.append(_Answer(found, (T.inverse() @ found.T_world_camera).log()))
@@ -129,7 +129,7 @@ def _trial(answers: Sequence[_Answer], images: int) -> HeldOutTrial:
 
 
 def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
-    """Return the ``correlation`` with which the errors have the size that the covariances of the fits say."""
+    """Return the ``correlation`` with which the errors are as large as the covariances of the fits predict."""
     updates = torch.stack([answer.update for answer in answers])
     covariances = torch.stack([answer.found.covariance for answer in answers])
     expected = float(chi2.ppf(QUANTILE, 6))
@@ -144,12 +144,12 @@ def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
 
 
 def _factors(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
-    """Return the factors on the covariances of answers whose keypoints were taken to be independent."""
+    """Return the factors by which to scale the covariances of answers that treat keypoints as independent."""
     return torch.tensor([landmarks.correlation_of(answer.matches) for answer in answers], dtype=torch.float64)
 
 
 def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "4"]:
-    """Return the standard deviations of the corrections that the images' right intrinsics seem to need.
+    """Return the standard deviations of the corrections that the images' intrinsics, although right, seem to need.
 
     What the fits' own uncertainty explains is left out.
     """

@@ -63,7 +63,7 @@ def objective_of(
     depth_scale: float | None = None,
     miss_scales: float | None = None,
 ) -> Objective:
-    """Return the objective that the settings describe; a stage may replace their scales by its own.
+    """Return the objective that the settings describe; a stage may replace their scales with its own.
 
     ``miss_scales`` is the depth residual, in depth scales, of a ray that meets nothing; None stands for the paper's.
     """
@@ -84,10 +84,10 @@ def objective_of(
 class DescentSettings(Settings):
     """Settings of the rays of a step, and of the frame of updates."""
 
-    rays: Count = 2048  # number of rays a step, shared out equally among the views
+    rays: Count = 2048  # number of rays per step, shared out equally among the views
     level: int | None = None  # level of the field: 0 is the coarsest, None the field itself
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
-    pivot: PivotName = "camera"  # what an update turns about: camera, world, or the middle of the scene
+    pivot: PivotName = "camera"  # what an update rotates about: camera, world, or the middle of the scene
     # length of the sampled interval, in units of [near, far]; the paper's "wide" is 2
     wide: Annotated[float, Above(0.0, 100.0)] = 1.0
     renew: Annotated[bool, EXPERT] = True  # draw pixels anew at each step instead of once
@@ -145,7 +145,7 @@ class RefinementSettings(Settings):
     """Settings of second-order steps on rendered rays."""
 
     pixels: DrawerName = "uniform"  # where pixels are drawn: anywhere, at corners, around corners
-    # what an update turns about: middle of the scene, camera, world
+    # what an update rotates about: middle of the scene, camera, world
     pivot: Annotated[PivotName, EXPERT] = "scene"
     exposure: bool = False  # estimate a gain and a bias of each colour channel
     surface_sigma: NotNegative = 0.03  # uncertainty of the map's surfaces in coarse steps, metres
@@ -171,23 +171,23 @@ class RefinementStage:
     """A stage of refinement: steps at one level of detail on one draw of rays; without steps, poses are only ranked."""
 
     steps: int
-    rays: int  # a pose
-    keep: int = 1  # poses that the stage begins with: the best so far
+    rays: int  # per pose
+    keep: int = 1  # number of poses that the stage begins with: the best so far
     level: int | None = None  # of the field: 0 is the coarsest, None the field itself
-    blur: int = 1  # observed colours are means over squares of so many pixels
+    blur: int = 1  # width, in pixels, of the squares over which observed colours are averaged
     colour_scale: float = 0.1  # colour difference at which outliers begin
     depth_scale: float = 0.1  # depth difference, metres, at which outliers begin
-    surface_sigma: float = 0.0  # metres by which surfaces may be off: steep residuals count for less
+    surface_sigma: float = 0.0  # metres by which surfaces may be off: steep residuals count less
     window: float = 0.0  # metres about the measured depth that are sampled; 0: the whole ray
-    damping: float = 1e-3  # at first
-    # times that each pose is first shifted to bring what it renders to the middle of what was measured
+    damping: float = 1e-3  # of the first step
+    # number of times that each pose is first shifted to bring the middle of what it renders to that of what was measured
     centring: int = 0
 
 
 def rendered_depth_scale(bounds: SceneBounds) -> float:
     """Return the depth difference (metres) at which outliers begin in rendered rays.
 
-    A field divides its box into parts whose size is a share of the box, and its depth errs accordingly. How fine a baked
-    surface is has no influence: it may be of measured depth, which is more accurate than what the field renders.
+    A field divides its box into parts whose size is a share of the box, and its depth errs accordingly. The resolution of a
+    baked surface does not matter: it may be made of measured depth, which is more accurate than what the field renders.
     """
     return RENDERED_DEPTH_SHARE * math.prod(bounds.size) ** (1 / 3)

@@ -71,7 +71,7 @@ METHODS = {
 }
 
 RENAMED = {"play": "surface_sigma"}
-"""Current names of settings, by the names under which earlier versions stored them."""
+"""Current names of renamed settings, by the names under which earlier versions stored them."""
 
 
 def find_method(name: str) -> Method:
@@ -83,14 +83,14 @@ def find_method(name: str) -> Method:
 
 
 def require_use_of_depth(method: str) -> None:
-    """Raise ``InputError`` for a method that would leave depth points out, where they were given on purpose."""
+    """Raise ``InputError`` for a method that would ignore depth points, which were given on purpose."""
     if not find_method(method).uses_depth:
         others = " or ".join(name for name, other in METHODS.items() if other.uses_depth)
         raise InputError(f"method {method!r} uses colour alone, got depth points; take method {others}")
 
 
 def settings_of(method: str, values: dict[str, Any], where: str = "config", preset: str | None = None) -> Any:
-    """Return a method's settings from those that differ from its defaults, or from a preset, by their flat names.
+    """Return a method's settings; ``values`` are those that differ from its defaults or from a preset, by their flat names.
 
     Raises ``InputError``, which begins with ``where``, for an unknown method or name, or a value that is not allowed.
     """

@@ -15,7 +15,7 @@ from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidenc
 from bidnerf_core.se3 import SE3
 
 TOLD_FROM_MIRROR = 3.0
-"""Logarithm of the odds from which on renderings decide between an image and its mirror image."""
+"""Log odds beyond which renderings decide between an image and its mirror image."""
 HARDLY_MATCHED = -60.0
 """Logarithm of the number of false alarms above which renderings are compared even if the mirror image is not recognised."""
 
@@ -23,10 +23,10 @@ HARDLY_MATCHED = -60.0
 def mirror_rejection(
     problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, rays: int, seed: int
 ) -> Verdict | None:
-    """Return why the start of ``problem`` is rejected, because the mirror image fits as well or better, or None.
+    """Return a rejection of the start of ``problem`` if the mirror image fits as well or better, else None.
 
-    ``log10_nfa``: logarithm of the number of false alarms of the pose. Where landmarks recognise the mirror image, or the image
-    hardly, renderings of both decide, unless ``rays`` is 0.
+    ``log10_nfa``: logarithm of the number of false alarms of the pose. Where landmarks recognise the mirror image, or hardly
+    recognise the image, renderings of both decide, unless ``rays`` is 0.
     """
     if log10_nfa < SUSPICIOUS:
         return None

@@ -36,11 +36,11 @@ class NormalEquations:
         return NormalEquations(factor * self.cost, factor * self.gradient, factor * self.hessian)
 
     def of_others(self, updates: Float[Tensor, "k n"]) -> NormalEquations:
-        """Return the equations of n other unknowns, of which ``updates`` are the linear map to these."""
+        """Return the equations in n other unknowns, which the matrix ``updates`` maps to these unknowns."""
         return NormalEquations(self.cost, self.gradient @ updates, updates.mT @ self.hessian @ updates)
 
     def without_last(self) -> NormalEquations:
-        """Return the equations of the other unknowns, for each value of which the last one takes its best (Schur complement)."""
+        """Eliminate the last unknown, which takes its best value for each value of the others (Schur complement)."""
         coupling, own, pull = self.hessian[:, :-1, -1], self.hessian[:, -1, -1], self.gradient[:, -1]
         share = coupling / own[:, None]
         return NormalEquations(
@@ -50,7 +50,7 @@ class NormalEquations:
         )
 
     def best_last(self, others: Float[Tensor, "h n"]) -> Float[Tensor, "h"]:
-        """Return the best step of the last unknown for a step of the others."""
+        """Return the best step of the last unknown, given a step of the others."""
         row = self.hessian[:, -1]
         return -(self.gradient[:, -1] + (row[:, :-1] * others).sum(-1)) / row[:, -1]
 

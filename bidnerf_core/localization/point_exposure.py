@@ -10,23 +10,23 @@ from bidnerf_core.robust import Robust
 from bidnerf_core.se3 import SE3
 
 STRONGEST, MOST_BIAS = 4.0, 0.25
-"""Gain up to which, and down to whose inverse, and bias up to which an exposure is accepted: two stops, a quarter of the range."""
+"""Largest gain (the least is its inverse) and largest bias of an exposure: two stops, and a quarter of the range."""
 LEAST_COLOURED = 0.2
 """Least share of the points whose colours the camera did not clip."""
 CLEARLY_MORE = 0.05
-"""Share of the points that have to agree in colour in addition for an exposure to be taken.
+"""Share of all points that an exposure must add to those that agree in colour, for it to be applied.
 
-Blur also lowers contrast, but to restore that only enlarges the differences.
+Blur lowers contrast too, but restoring that contrast only enlarges the differences.
 """
 
 
 def cloud_with_exposure_of_map(cost: SurfaceCost, T: SE3) -> PointCloud:
     """Return the points of ``cost`` with the colours that they would have with the map's exposure.
 
-    The exposure, one gain and bias for each channel, is fitted to the points that lie on the surface from pose T. Points in which
-    the camera clipped a colour that the surface and the exposure carry beyond black or white count as uncoloured. The points are
-    returned as they are where the exposure is too far from the map's, too few keep their colour, or hardly any more of them have
-    the surface's colour with it.
+    The exposure, one gain and bias for each channel, is fitted to the points that pose T places on the surface. Points count as
+    uncoloured where the camera clipped a colour, and the exposure takes the surface's colour beyond black or white. The points
+    are returned as they are if the exposure is too far from the map's, too few keep their colour, or the exposure makes hardly
+    any more of them agree with the surface's colour.
     """
     found, cloud = cost.correspondences(T[None]), cost.cloud
     near, alike = cost.inliers(found)

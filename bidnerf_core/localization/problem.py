@@ -69,13 +69,13 @@ class Problem:
     field: RadianceField
     bounds: SceneBounds
     views: tuple[View, ...]
-    start: SE3 | None  # T_world_K; None where nothing is known of it
-    depth_rays: Observations | None = None  # of a lidar or the like, in the frame of the last camera
+    start: SE3 | None  # T_world_K; None where nothing is known about it
+    depth_rays: Observations | None = None  # from a lidar or the like, in the frame of the last camera
     surface: SurfaceMap | None = None  # baked from the field
     matcher: LandmarkMatcher | None = None  # of the map's landmarks
     # Root mean square difference of the field's colours from its own training images; None where unknown.
     colour_noise: float | None = None
-    sensor: DepthSensorModel = UNKNOWN  # that measured the depth
+    sensor: DepthSensorModel = UNKNOWN  # model of the sensor that measured the depth
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -154,9 +154,9 @@ def rig(
 
 
 def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> tuple[_Item, ...]:
-    """Return item ``last`` and those before it, ``size`` of them, ``stride`` apart; fewer at the sequence's beginning.
+    """Return the ``size`` items up to item ``last``, ``stride`` apart; fewer at the sequence's beginning.
 
-    Views in the order of time give the paper's moving window. Raises ``InputError`` where there is no such item.
+    Views in temporal order give the paper's moving window. Raises ``InputError`` if there is no such item.
     """
     if size < 1 or stride < 1:
         raise InputError(f"a window of {size} with stride {stride}, expected 1 or more of both")

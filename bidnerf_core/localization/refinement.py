@@ -34,7 +34,7 @@ class RefinementResult:
     """The best pose, and its assessment on rays to which it was not fitted."""
 
     T: SE3
-    loss: float  # by the measure of the last stage
+    loss: float  # as the last stage measures it
     inliers: float  # share of the rays that render what was measured
     covariance: Float[
         Tensor, "6 6"
@@ -111,7 +111,7 @@ def take_few_steps(
                 break
             poses.append(trial[0])
             inliers.append(here.inliers_by_depth()[0])
-    # Where the host must not wait, steps were taken beyond the first that did not lower the cost: they are left out here.
+    # Where the host must not wait, steps were taken after the first one that did not lower the cost: they are left out here.
     count = 1 + int(torch.stack(lower).cpu().cumprod(0).sum() if lower else 0)
     return FewSteps(SE3.stack(poses[:count]).to("cpu"), float(inliers[count - 1]))
 

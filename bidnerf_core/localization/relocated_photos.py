@@ -24,26 +24,27 @@ from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.se3 import SE3
 
 SUSPECT = 0.5
-"""A photo is a suspect if the share of its keypoints that are landmarks is below so much of the capture's median."""
+"""A photo is a suspect if the share of its keypoints that are landmarks is below this fraction of the capture's median."""
 MOST_SUSPECTS = 32
 """Largest number of photos that are localized anew."""
 POSE_DEVIATIONS, POSE_PIXELS = 6.0, 4.0
-"""A pose is bad if the landmarks' pose is so many standard deviations away and the image moves by so many pixels between
-them, which is twice as far as a match may lie from its epipolar line.
+"""Standard deviations, and pixels of image motion, by which a bad pose at least differs from the landmarks' pose.
+
+The latter is twice as far as a match may lie from its epipolar line.
 """
 TURNED_ANGLE = 60.0
-"""Degrees of rotation about the optical axis from which on a photo is turned rather than badly posed."""
+"""Least rotation about the optical axis, in degrees, of a photo that counts as turned rather than badly posed."""
 ALONG_AXIS = 0.9
 """Least cosine between that rotation's axis and the optical axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relocation:
-    """The pose of a photo by the landmarks of others, compared with the given one."""
+    """A photo's pose by the landmarks of other photos, compared with the given one."""
 
     update: Float[Tensor, "6"]  # right update from the given pose, translation (metres) first
-    deviations: float
-    pixels: float  # how far the image moves by the update
+    deviations: float  # length of the update, in standard deviations
+    pixels: float  # how far the image moves with the update
     mirrored: bool = False
 
     @property
@@ -57,7 +58,7 @@ class Relocation:
         return "turned" if about_axis and math.degrees(angle) >= TURNED_ANGLE else "badly posed"
 
     def onto(self, record: PhotoRecord) -> PhotoRecord:
-        """Return the record with how far the given pose is off; a mirrored photo has no pose to compare."""
+        """Return the record, completed by how far off the given pose is; a mirrored photo has no pose to compare."""
         if self.mirrored:
             return record
         translation, rotation = (float(torch.linalg.vector_norm(part)) for part in self.update.split(3))
@@ -68,7 +69,7 @@ class Relocation:
 
 
 def suspects(seen: TrackedKeypoints, count: Int[Tensor, "v"], group: Int[Tensor, "v"]) -> list[int]:
-    """Return the photos outside the largest group, or whose keypoints are much seldomer landmarks than those of others."""
+    """Return the photos outside the largest group, and those whose keypoints are landmarks much more rarely than usual."""
     keypoints = torch.tensor([len(image.keypoints) for image in seen.images])
     share = count / keypoints.clamp(min=1)
     main = group == 0
@@ -114,6 +115,6 @@ def _compared(found: LandmarkPose, view: View, mirrored: bool) -> Relocation:
 
 
 def image_motion(update: Float[Tensor, "6"], view: View, distance: float) -> float:
-    """Return how far the image of a point at ``distance`` (metres) moves by an update of the pose, at most."""
+    """Return how far, in pixels and at most, an update of the pose moves the image of a point at ``distance`` (metres)."""
     translation, rotation = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
     return view.frame.intrinsics.fx * (rotation + translation / max(distance, 1e-9))

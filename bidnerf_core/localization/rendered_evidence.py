@@ -1,7 +1,8 @@
-"""Which of two explanations of an image is right, judged by what the field renders from the pose that suits each best.
+"""Evidence for one of two explanations of an image: what the field renders from the pose that suits each best.
 
-Keypoints are few and in a few places. A wrong focal length can nearly be made up for by moving the camera, and symmetric things
-resemble their mirror images, so that keypoints hardly tell. Thousands of rendered rays cover the whole image and tell more.
+Keypoints are few and in a few places. Moving the camera nearly compensates for a wrong focal length, and symmetric things
+resemble their mirror images, so keypoints hardly distinguish them. Thousands of rendered rays, which cover the whole image,
+distinguish them better.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
 
 COMPARED_RAYS = 8192
-"""Number of rays on which two explanations are compared, at most that of the pixels that are not hidden."""
+"""Number of rays on which two explanations are compared; fewer if fewer pixels are not hidden."""
 FITTED = RefinementStage(steps=2, rays=1024)
 """The steps to the pose that suits an explanation best. The comparison draws other rays."""
 LOG_ODDS_PER_DEVIATION = 0.5
-"""Logarithm of the odds by which a standard error of the difference counts.
+"""Log odds for each standard error of the difference between the two costs.
 
-With independent rays it would be more, but the rays of a field err together. Chosen on frames that were held out for tuning.
+Independent rays would justify more, but the errors of a field's rays are correlated. Chosen on frames held out for tuning.
 """
 NOISIEST = 0.15
-"""Colour noise of a field on its own training images above which it does not tell explanations apart: it has hardly been trained."""
+"""Colour noise of a field on its own training images above which it provides no evidence: it has hardly been trained."""
 
 
 def log_odds_by_rendering(one: Problem, other: Problem, seed: int, steps: int = FITTED.steps) -> float:
-    """Return the logarithm of the odds, by rendered colours alone, that ``one`` is right and not ``other``.
+    """Return the log odds, by rendered colours alone, of ``one`` against ``other``.
 
-    Both hold images of the same size with intrinsics, and the pose found with them as the start, from which ``steps`` are taken to
-    that which suits them best. 0 where the field is too noisy, or renders what is not finite.
+    Both hold images of the same size with intrinsics and, as the start, the pose found with them; ``steps`` steps lead from
+    there to the pose that suits them best. Returns 0 where the field is too noisy or renders values that are not finite.
     """
     if one.colour_noise is not None and one.colour_noise > NOISIEST:
         return 0.0

@@ -31,9 +31,7 @@ class Outcome(StrEnum):
     NOT_SETTLED = "not settled"  # newly drawn rays still call for a large step
     HIGH_LOSS = "high loss"  # a descent ended above the loss that counts as converged
     DIVERGED = "diverged"  # the loss or the pose became infinite or not a number
-    MISCALIBRATED = (
-        "miscalibrated"  # the image contradicts the intrinsics, or cannot tell them from the map's
-    )
+    MISCALIBRATED = "miscalibrated"  # the image contradicts the intrinsics, or the map's may be right instead
     MIRRORED = "mirrored"  # the mirror image fits the map better than the image
     IMPRECISE = "imprecise"  # the pose is too uncertain, compared with the distance of what is in view
     UNCERTAIN = "uncertain"  # the diagnostics together make a wrong pose too likely
@@ -74,7 +72,7 @@ class Localization:
     losses: Float[Tensor, "s"]  # at the start and before each further step
     # Covariance of a right update at the camera: translation (metres) before rotation (radians). None if unknown.
     covariance: Float[Tensor, "6 6"] | None = None
-    focal_factor: float = 1.0  # true over given focal length; 1 if it was not corrected
+    focal_factor: float = 1.0  # ratio of the estimated to the given focal length; 1 if it was not corrected
     # Probability that the pose is right, from the diagnostics; None where no model of it was learned.
     confidence: float | None = None
     diagnostics: Diagnostics | None = None  # the measures by which the pose was judged
@@ -86,7 +84,7 @@ class Localization:
         return self.outcome is Outcome.CONVERGED
 
     def frame_as_taken(self, frame: Frame) -> Frame:
-        """Return the last image's frame with the intrinsics with which the pose was found: the given ones or corrected ones."""
+        """Return the last image's frame with the intrinsics that go with the pose: the given or the corrected ones."""
         return frame if self.intrinsics is None else replace(frame, intrinsics=self.intrinsics)
 
     def plain(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""``Tracker``: finds the poses of a sequence's frames, one after another, and says at once when it has lost its way."""
+"""``Tracker``: finds the poses of a sequence's frames, one after another, and reports at once when it is lost."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from bidnerf_core.mapping.features import Sift, grey_image
 from bidnerf_core.se3 import SE3
 
 START = 0.03, 0.1
-"""Standard deviations of a start whose uncertainty is not given: shares of the scene's extent, and radians."""
+"""Standard deviations of a start whose uncertainty is not given: share of the scene's extent, and radians."""
 VELOCITY_KEPT = 0.6
 """Share of the velocity that is kept with each lost frame."""
 NOTHING_SEEN = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised around the prediction")
@@ -60,11 +60,11 @@ NOTHING_SEEN = Verdict(Outcome.TOO_FEW_MATCHES, "no landmarks were recognised ar
 class Tracker:
     """Finds the pose of each frame of a sequence from the frames before it.
 
-    It predicts the pose by a constant velocity and refines it from there, without a search, by the landmarks that optical
+    It predicts the pose with a constant velocity and refines it from there, without a search, by the landmarks that optical
     flow carries from image to image, by measured depth, or by colour. The localizer's acceptance judges each pose. When one
-    is not accepted, the answer says so; the tracker then relocalizes in the following frames and meanwhile continues by
-    odometry. Its memory does not grow. Trackers may share a localizer, also in different threads; a tracker itself belongs to
-    one thread.
+    is not accepted, the answer is marked as such; the tracker then relocalizes in the following frames and meanwhile continues
+    by odometry. Its memory does not grow. Trackers may share a localizer, even across threads; a tracker itself belongs to one
+    thread.
     """
 
     def __init__(
@@ -95,10 +95,10 @@ class Tracker:
     def __call__(self, frame: Frame, time: float | None = None) -> Localization:
         """Find T_world_camera of the next frame.
 
-        ``time`` (seconds, from any origin) is when it was taken; frames without one come at the interval of those before.
+        ``time`` (seconds, from any origin) is when it was taken; frames without one are taken to come at the last interval.
         The answer's ``outcome`` is other than ``CONVERGED`` where the acceptance rejects the pose; the pose is then the best
-        guess, and its covariance says how good. Raises ``InputError`` for a time that is not finite, and where the map
-        cannot be searched for the first frame without a start.
+        guess, with a covariance to match. Raises ``InputError`` for a time that is not finite, and where the map cannot be
+        searched for the first frame without a start.
         """
         began = clocks.perf_counter()
         clock, seconds = self._state.clock.step(time)
@@ -119,7 +119,7 @@ class Tracker:
         save_state(Path(path), self._state, self._key)
 
     def restore(self, path: str | Path) -> None:
-        """Continue where the tracker that wrote the file was. Raises ``InputError`` for another map's file, or a damaged one."""
+        """Continue where the tracker that wrote the file stopped. Raises ``InputError`` for another map's or a damaged file."""
         self._state = load_tracker_state(Path(path), self._key)
 
     def _begun(
@@ -196,7 +196,7 @@ class Tracker:
     def _by_odometry(
         self, frame: Frame, points: FollowedPoints, motion: Motion, predicted: Motion, seconds: float
     ) -> tuple[Motion, FollowedPoints, str]:
-        """Return a prediction by the motion between the images, where corners of the last one were followed."""
+        """Return a prediction from the motion between the images, where corners of the last one were followed."""
         corners = points[points.landmark == FRESH]
         if len(corners):
             moved = self._odometry.moved(frame, corners, motion, predicted.T_world_camera, seconds)

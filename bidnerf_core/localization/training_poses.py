@@ -18,7 +18,7 @@ from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
 from bidnerf_core.mapping.pose_refinement import AdjustedPoses, adjusted_poses
 
 INCONSISTENT = 0.25
-"""Deviation (pixels) that errors of the given poses must at least add to that of the keypoints for the poses to be refined.
+"""Least deviation (pixels) that errors of the given poses must add to that of the keypoints for the poses to be refined.
 Poses by structure from motion or a renderer add less than a tenth.
 """
 
@@ -67,7 +67,7 @@ def training_poses(
 def _chosen(
     tracked: TrackedViews, fit: AdjustedPoses | None, wrong: list[int], least: float
 ) -> TrainingPoses:
-    """Return the refined poses if they are wanted, else the present ones, of which those that were wrong are refined."""
+    """Return the refined poses if needed, else the present ones, of which only those that were wrong are refined."""
     still = torch.zeros(len(tracked.observations.images), dtype=torch.float64)
     if fit is None:
         return TrainingPoses(tracked, still, wrong, False, None)

@@ -18,16 +18,16 @@ from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.se3 import SE3
 
 TOLD_FROM_TWIN = 10.0
-"""Logarithm of the odds from which on renderings decide between two places.
+"""Log odds beyond which renderings decide between two places.
 
-At exact copies the odds are not 0 either, since keypoints determine the pose at one of them better.
+Even at exact copies the odds are not 0, since keypoints determine the pose at one of them better.
 """
 FITTING_STEPS = 5
 """Number of steps to the poses near both places that suit the images best."""
 NEARER = 0.5
 """Ratio of the motions from a start to one place and to the other one below which the start decides."""
 NEARLY_AS_MANY = 0.8
-"""Share of the correspondences that match at another place from which on these do not decide by themselves."""
+"""Share of the correspondences that match at another place, at and above which their number alone does not decide."""
 
 
 def between_twins(
@@ -38,7 +38,7 @@ def between_twins(
     rays: int,
     seed: int,
 ) -> LandmarkAnswer:
-    """Return an answer as it is, or that at its twin if it is from there, or the answer as rejected if nothing tells the two apart.
+    """Return an answer as it is, the one at its twin if that is right, or a rejection if nothing distinguishes the two.
 
     A ``start`` that is far nearer to one of them decides. Otherwise renderings of both are compared, unless ``rays`` is 0.
     """
@@ -59,7 +59,7 @@ def between_twins(
 def twin_rejection(
     problem: Problem, found: LandmarkPose, start: SE3 | None, rays: int, seed: int
 ) -> Verdict | None:
-    """Return why a pose is rejected whose twin fits about as well, or None; ``start`` and ``rays`` are as in ``between_twins``."""
+    """Return a rejection of a pose whose twin fits about as well, else None; ``start`` and ``rays`` as in ``between_twins``."""
     if found.twin is None or _is_told(_log_odds(problem, found, found.twin, start, rays, seed), found.twin):
         return None
     return _rejection(found.twin)
@@ -68,7 +68,7 @@ def twin_rejection(
 def _at_twin(
     problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, twin: Twin
 ) -> LandmarkPose | None:
-    """Return the pose at the twin. Matches by descriptors that agree with the pose itself say nothing of the camera there."""
+    """Return the pose at the twin, without the matches by descriptors that agree with the pose itself."""
     there = confirm(matcher, problem.views, twin.T_world_rig).pose
     if there is None or there.unguided is None:
         return there
@@ -86,14 +86,14 @@ def _rejection(twin: Twin) -> Verdict:
 
 
 def _is_told(log_odds: float, twin: Twin) -> bool:
-    """Return whether an image is told from one of the twin: without other evidence, by clearly more landmarks."""
+    """Return whether a pose is distinguished from its twin: without other evidence, by clearly more landmarks."""
     return log_odds > TOLD_FROM_TWIN or (log_odds == 0 and twin.share < NEARLY_AS_MANY)
 
 
 def _log_odds(
     problem: Problem, found: LandmarkPose, twin: Twin, start: SE3 | None, rays: int, seed: int
 ) -> float:
-    """Return the logarithm of the odds that the images show the pose and not its twin; 0 where nothing tells."""
+    """Return the log odds of the pose against its twin; 0 without evidence."""
     if start is not None:
         here, there = (_motion(start, T, found.distance) for T in (found.T_world_camera, twin.T_world_rig))
         if here < NEARER * there or there < NEARER * here:
@@ -105,6 +105,6 @@ def _log_odds(
 
 
 def _motion(start: SE3, T: SE3, distance: float) -> float:
-    """Return how far what is seen at a ``distance`` (metres) moves on the way from one pose to another, about."""
+    """Return about how far (metres) what is seen at a ``distance`` (metres) moves between two poses."""
     update = (start.to("cpu", T.translation.dtype).inverse() @ T).log()
     return float(update[:3].norm() + distance * update[3:].norm())

@@ -1,7 +1,7 @@
 """Bundle adjustment: estimate the poses of images and the points that they show together (Triggs et al. 2000).
 
-The given poses are a prior, which also fixes what images do not show: the place, the orientation and, without depth, the
-scale of everything. Robust Levenberg-Marquardt; the points are eliminated by the Schur complement.
+The given poses are a prior, which also fixes what the images leave free: the position, orientation and, without depth, scale
+of everything. Robust Levenberg-Marquardt; the points are eliminated by the Schur complement.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ ADJUSTMENT_STEPS = 30
 SETTLED = 1e-4
 """Relative decrease of the cost below which the iteration has converged."""
 LARGEST_DAMPING = 1e6
-"""Damping (relative to the diagonal) at which no smaller step is tried."""
+"""Damping (relative to the diagonal) beyond which no smaller step is tried."""
 RESIDUAL_SCALE, PRIOR_SCALE = 2.0, 5.0
 """Scales of the Cauchy losses in standard deviations: that of a sighting or depth, and that of a pose, which has six
 components. A pose that is plainly wrong is hardly held by its prior.
 """
 ALMOST_SINGULAR = 1e-9
-"""Damping, relative to the mean diagonal, with which points without parallax have an inverse."""
+"""Damping, relative to the mean diagonal, which makes the blocks of points without parallax invertible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ class AdjustmentSystem:
     point_gradient: Float[Tensor, "n 3"]
     pose_blocks: Float[Tensor, "v 6 6"]
     point_blocks: Float[Tensor, "n 3 3"]
-    mixed_blocks: Float[Tensor, "m 6 3"]  # one a sighting
+    mixed_blocks: Float[Tensor, "m 6 3"]  # one per sighting
     image: Int[Tensor, "m"]
     point: Int[Tensor, "m"]
 
@@ -164,7 +164,7 @@ def linearized(seen: MeasuredSightings, state: Adjustment, prior: PosePrior) -> 
 def _measured(
     seen: MeasuredSightings, local: Float[Tensor, "m 3"]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 3"]]:
-    """Return the residuals (u, v, depth) in standard deviations, and their derivatives by the points in the camera.
+    """Return the residuals (u, v, depth) in standard deviations, and their Jacobian with respect to points in the camera.
 
     Points behind the camera and depth that was not measured have zeros.
     """

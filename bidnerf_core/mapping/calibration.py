@@ -17,16 +17,16 @@ PRINCIPAL_POINT = "a principal point "
 
 @dataclass(frozen=True)
 class Calibration:
-    """A correction of given intrinsics: what is estimated of the camera along with its pose."""
+    """A correction of given intrinsics, which may be estimated along with the pose."""
 
-    log_focal: float = 0.0  # logarithm of the true over the given focal length
+    log_focal: float = 0.0  # logarithm of the ratio of the true to the given focal length
     shift_u: float = 0.0  # of the principal point, as a share of the given focal length
     shift_v: float = 0.0
     radial: float = 0.0  # first coefficient of radial distortion, added to the given distortion
 
     @property
     def focal_factor(self) -> float:
-        """True over given focal length."""
+        """Ratio of the true to the given focal length."""
         return math.exp(self.log_focal)
 
     def applied(self, given: Intrinsics) -> Intrinsics:
@@ -41,7 +41,7 @@ class Calibration:
         )  # fmt: skip
 
     def pixels(self, flat: Float[Tensor, "m 2"], focal: float) -> Float[Tensor, "m 2"]:
-        """Return where points on the plane z = 1 appear, in pixels from the given principal point, by the given focal length."""
+        """Return where points on the plane z = 1 appear: pixels from the given principal point, at the given focal length."""
         bent = flat * (1 + self.radial * flat.square().sum(-1, keepdim=True))
         shift = torch.tensor([self.shift_u, self.shift_v], dtype=flat.dtype)
         return (bent * self.focal_factor + shift) * focal
@@ -100,7 +100,7 @@ GIVEN = Calibration()
 
 @dataclass(frozen=True)
 class Stretch:
-    """Factors of the given focal lengths: the image was resized to another shape, which its intrinsics do not tell."""
+    """Factors of the given focal lengths: the image was resized to another shape, which its intrinsics do not reflect."""
 
     across: float = 1.0
     down: float = 1.0
@@ -119,7 +119,7 @@ class Stretch:
 
 
 UNSTRETCHED = Stretch()
-"""The shape that the intrinsics tell."""
+"""No stretch: the shape is the one that the intrinsics state."""
 
 
 @dataclass(frozen=True)
@@ -141,16 +141,16 @@ FIXED = CalibrationPrior()
 CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002)
 """Intrinsics from a good calibration."""
 USUAL, USUALLY = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01), 0.35
-"""Standard deviations of intrinsics as many devices state them, and the share of cameras whose intrinsics are so: they belong to
+"""Standard deviations of intrinsics as many devices state them, and the share of cameras with such intrinsics: they belong to
 another unit of the model, or to another focus and temperature.
 """
 DOUBTED = CalibrationPrior(log_focal=0.005, shift=0.005, radial=0.005)
-"""Intrinsics that are right as far as can be told, of a camera of which others are wrong."""
+"""Intrinsics that are right as far as is known, of a camera whose other intrinsics are wrong."""
 MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
-"""Standard deviations of intrinsics that are wrong, and the share of cameras whose intrinsics are."""
+"""Standard deviations of intrinsics that are wrong, and the share of cameras with such intrinsics."""
 CROPPED, CROPS = CalibrationPrior(log_focal=DOUBTED.log_focal, shift=0.1, radial=DOUBTED.radial), 0.02
-"""Standard deviations of intrinsics that take the middle of a cropped image for its principal point, and the share of such images."""
+"""Standard deviations of intrinsics that take the middle of a cropped image for its principal point, and their share."""
 NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
 """Intrinsics from EXIF or a field of view, without distortion."""
 ANY = CalibrationPrior(log_focal=NOMINAL.log_focal, shift=CROPPED.shift, radial=NOMINAL.radial)
-"""Intrinsics of which nothing is known but that a lens of usual distortion took the image, which may be a part of another one."""
+"""Intrinsics of which nothing is known except that the lens has the usual distortion; the image may be a crop."""

@@ -11,11 +11,11 @@ SUMMARY_LINES = 5
 MOST_NAMES = 6
 """Number of photos that a sentence lists before it counts the others."""
 SAME_HEIGHT = 10.0
-"""Degrees between the lowest and the highest cameras below which all are called equally high."""
+"""Degrees between the lowest and the highest cameras below which all count as equally high."""
 THIN = 0.6
-"""Share of landmarks in only two photos from which on more overlap is advised."""
+"""Share of landmarks in only two photos above which more overlap is advised."""
 DRIFTING = 1.0
-"""Stops between the darkest and the brightest tenth from which on a locked exposure is advised."""
+"""Stops between the darkest and the brightest tenth above which a locked exposure is advised."""
 LEAST_PHOTOS = 8
 """Number of photos below which a map is hardly possible."""
 
@@ -48,7 +48,7 @@ PROBLEMS: dict[PhotoProblem, tuple[str, str]] = {
 
 
 def sentences(report: CaptureReport) -> list[str]:
-    """Return all that is worth saying of a capture, one sentence or two a line, the gravest problems first."""
+    """Return all that is worth saying about a capture, one or two sentences per line, the gravest problems first."""
     return [_overview(report), *_trial(report), *_problems(report), *_advice(report)]
 
 

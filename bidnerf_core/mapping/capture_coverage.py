@@ -1,4 +1,4 @@
-"""The coverage of a capture: from where it sees its scene, and from where it does not."""
+"""The coverage of a capture: from where its scene was photographed, and from where it was not."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
 
 FACING = 0.9
-"""Share of the cameras that must have the centre before them for the capture to be around it."""
+"""Share of the cameras that must have the centre in front of them for the capture to be around it."""
 CONVERGING = 0.5
 """Largest distance at which a typical optical axis passes the centre, as a share of the cameras' distance."""
 OPEN_SIDE = 120.0
-"""Degrees without a camera from which on a capture is of one side."""
+"""Least range of directions without a camera, in degrees, with which a capture is from one side."""
 LEAST_GAP = 15.0
-"""Degrees: SIFT matches well across less, so that a narrower gap costs nothing."""
+"""Least width of a gap in degrees: SIFT matches well across narrower ones, which therefore cost nothing."""
 WIDE_GAP = 45.0
-"""Degrees from which on a gap counts however irregular the capture is: from its middle, SIFT matches neither side well."""
+"""Degrees above which a gap counts however irregular the capture is: from its middle, SIFT matches neither side well."""
 RARE = 0.01
 """Probability that a capture whose cameras are spread at random has a gap that counts."""
 STEEP = 75.0
-"""Degrees above or below the horizon from which on a camera has no direction along it."""
+"""Degrees above or below the horizon from which on a camera has no azimuth."""
 FEW_POINTS = 50
 """Number of triangulated points below which a capture shows hardly any distances."""
 FEW = 4
-"""Number of photos below which nothing is said of gaps."""
+"""Number of photos below which gaps are not assessed."""
 
 
 def coverage(
@@ -63,7 +63,10 @@ def coverage(
 def _around(
     views: Sequence[View], directions: Float[Tensor, "v 3"], up: Float[Tensor, "3"], converge: bool
 ) -> tuple[Arrangement, Gap | None, tuple[Gap, ...], tuple[float, float]]:
-    """Return how ``directions`` (of the cameras from the centre, or of their axes) lie about the vertical."""
+    """Return the arrangement of ``directions`` (of the cameras from the centre, or of their axes) about the vertical.
+
+    It comes with the open side, the gaps and the range of heights (degrees) of a ``CoverageRecord``.
+    """
     unit = torch.nn.functional.normalize(directions, dim=-1)
     heights = (unit @ up).clamp(-1, 1).asin().rad2deg()
     low, high = heights.quantile(torch.tensor([0.05, 0.95], dtype=heights.dtype)).tolist()
@@ -85,7 +88,7 @@ def _around(
 
 
 def _steps(azimuths: Float[Tensor, "v"], names: Sequence[str]) -> tuple[Float[Tensor, "v"], list[Gap]]:
-    """Return the angles from each direction to the next, once around, and the same with names."""
+    """Return the angles (degrees) from each direction to the next, once around, and the same as named gaps."""
     order = azimuths.argsort()
     steps = torch.diff(azimuths[order], append=azimuths[order[:1]] + 360)
     ends = [names[i] for i in order.tolist()]

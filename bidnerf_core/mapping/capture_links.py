@@ -1,4 +1,4 @@
-"""Which photos of a capture show the same, by the landmarks that they share."""
+"""Links between photos of a capture that show the same things, by the landmarks that they share."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from bidnerf_core.mapping.view_pairs import likely_pairs
 from bidnerf_core.robust import MAD_TO_SIGMA
 
 LARGEST = 800
-"""Pixels along the longer side to which photos are reduced: detail that is finer serves no map."""
+"""Pixels along the longer side to which photos are reduced: finer detail is of no use to a map."""
 FINE, COARSE = 1.0, 4.0
 """Standard deviations (pixels) of the Gaussians of the two scales whose energies are compared. The finer one suppresses
 noise, which would pass for detail.
@@ -27,7 +27,7 @@ SHARPNESS_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
 DARKEST = 2 / 255
 """Brightness below which pixels are equally dark: quantisation leaves nothing to compare."""
 OVEREXPOSED, UNDEREXPOSED = 254 / 255, 4 / 255
-"""Brightness of the largest channel from which on, and up to which, a pixel holds no measurement."""
+"""Brightness of the brightest channel at or above which, and at or below which, a pixel holds no measurement."""
 GAMMA = 2.2
 """Exponent from the values of an image to linear light, approximately that of sRGB."""
 ENOUGH_SHARED = 10
@@ -37,14 +37,14 @@ BRIGHTNESS_ROUNDS = 20
 NEIGHBOURS = 8
 """Number of photos from nearby places with which a photo is compared."""
 LEAST_BLUR = 0.5
-"""Octaves of the energy of fine detail that a photo must at least lack to be blurred."""
+"""Least lack of fine detail, in octaves of its energy, of a photo that counts as blurred."""
 OUTLYING = 4.0
-"""Deviations (robust) from the other photos of the capture from which on a photo stands out."""
+"""Robust standard deviations from the other photos of the capture beyond which a photo stands out."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoMeasures:
-    """Numbers measured in photos, one a photo."""
+    """Numbers measured in photos, one of each kind per photo."""
 
     sharpness: Float[Tensor, "v"]  # log2 of fine over coarse energy, in the direction where it is least
     brightness: Float[Tensor, "v"]  # log2 of the median linear brightness
@@ -59,7 +59,7 @@ def photo_measures(views: Sequence[View]) -> PhotoMeasures:
 
 
 def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
-    """Return the share of the energy of fine detail that each photo has of what photos from nearby have.
+    """Return the energy of each photo's fine detail as a share of that in photos from nearby.
 
     It is 1 for all photos but those that stand out as blurred.
     """

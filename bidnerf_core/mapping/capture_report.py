@@ -1,6 +1,6 @@
 """A record of a capture: what its photos are fit for, and how well they cover the scene.
 
-The records are plain data, which JSON holds; ``capture_advice`` puts them in words.
+The records are plain data that JSON can hold; ``capture_advice`` puts them into words.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Arrangement = Literal["around", "inside", "one side", "one place", "unknown"]
 
 @dataclass(frozen=True)
 class PhotoRecord:
-    """What is known of one photo of a capture."""
+    """What is known about one photo of a capture."""
 
     name: str
     position: tuple[float, float, float]  # of the camera, metres, world
@@ -34,7 +34,7 @@ class PhotoRecord:
     keypoints: int
     landmarks: int  # triangulated ones that it shows
     linked: int  # number of photos with which it shares enough landmarks
-    group: int  # linked photos have one number; 0 is the largest group, -1 is no group
+    group: int  # the same number for linked photos; 0 is the largest group, -1 is no group
     # How far its pose is from the one that the landmarks of the other photos give; None where they give none.
     pose_translation: float | None = None  # metres
     pose_rotation_deg: float | None = None
@@ -67,18 +67,18 @@ class CoverageRecord:
     seen_by: float = 0.0  # median number of photos that show a landmark
     seen_by_two: float = 0.0  # share of the landmarks that only two photos show
     seen_within_deg: float = 0.0  # median angle between the directions from which a landmark is seen
-    # Range of directions without a camera that all cameras leave open, where they do not go around; then gaps between them.
+    # Widest range of directions without a camera, where the cameras do not go all around; ``gaps`` are the other ones.
     open_side: Gap | None = None
     gaps: tuple[Gap, ...] = ()  # much wider than the capture's other steps, the widest first
     heights_deg: tuple[float, float] = (
         0.0,
         0.0,
-    )  # of the cameras above the horizon of the centre: lowest, highest twentieth
+    )  # of the cameras above the centre's horizon: limits of the lowest and the highest twentieth
 
 
 @dataclass(frozen=True)
 class CaptureReport:
-    """What is known of the photos of a map."""
+    """What is known about the photos of a map."""
 
     photos: tuple[PhotoRecord, ...]
     coverage: CoverageRecord

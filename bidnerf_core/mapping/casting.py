@@ -18,7 +18,7 @@ ROUND = 6
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """Where each ray met the surface or, of those that met nothing, came closest to it as an angle."""
+    """Where each ray met the surface or, if it met nothing, came closest to it in terms of angle."""
 
     met: Bool[Tensor, "r"]
     along: Float[Tensor, "r"]  # metres along the ray to that place
@@ -35,8 +35,8 @@ def cast(
     """Trace rays (metres, world; unit directions) until they are within ``reach`` of a surfel (metres; by default the
     surface's own). A step is as long as the clearance, and a cell at least.
 
-    A ray that does not cross the grid counts as closest where it is nearest to the grid's centre. Rays lie where the surface
-    does. Where the host must not wait, dropped rays are traced to the end, without effect.
+    A ray that does not cross the grid counts as closest where it is nearest to the grid's centre. Rays must be on the surface's
+    device. Where the host must not wait, rays that are done are not dropped but traced to the end, without effect.
     """
     reach = surface.reach if reach is None else reach
     rays, cell = surface.grid.rays(origins, directions), surface.grid.cell

@@ -1,4 +1,4 @@
-"""The size of a surface's cells: as fine as the images resolve, no finer than they are accurate, within a limit of memory."""
+"""The size of a surface's cells: as fine as the images resolve, but no finer than their accuracy and a memory limit allow."""
 
 from __future__ import annotations
 
@@ -31,19 +31,17 @@ fewer points, surfels are farther from each other on average than the radius of 
 COMPARED_IMAGES, CELL_POINTS = 40, 400
 """Images, and points of each, from which the noise is estimated."""
 GROSS = 5.0
-"""Differences of more than so many medians are occlusions and gross errors, not noise."""
+"""Differences of more than this multiple of the median are occlusions and gross errors, not noise."""
 MOST_NOISE = 2.0
-"""Images that differ by more than so many standard deviations of an unknown sensor contradict each other; it is not taken for
-noise.
-"""
+"""Upper limit of the noise, in standard deviations of an unknown sensor: images that differ by more contradict each other."""
 COARSER = 2**0.25
 """Factor by which cells grow until there are enough points in them, or until they take little enough memory."""
 
 
 def finest_cell(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return the least cell (metres) that the images are worth, by their resolution and by the noise of measured depth.
+    """Return the least cell (metres) that the images justify, by their resolution and by the noise of measured depth.
 
-    Rendered images are thinned out too much to tell noise from the structure of the scene.
+    Rendered images are thinned out too much to distinguish noise from the structure of the scene.
     """
     measured = [posed for posed in images if posed.measured]
     return max(PIXEL * footprint(images, opacity), LAYER * depth_noise(measured, opacity))
@@ -68,7 +66,7 @@ def depth_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
 
 
 def comparison_noise(images: Sequence[PosedDepthImage], opacity: float) -> float:
-    """Return ``depth_noise`` as ``agreed`` sees it: against the nearest pixels of images that were thinned out."""
+    """Return ``depth_noise`` as ``agreed`` meets it: against the nearest pixels of images that were thinned out."""
     return _spread(images, opacity, PosedDepthImage.beyond)
 
 
@@ -98,7 +96,7 @@ def chosen_grid(
 ) -> VoxelGrid:
     """Return the grid whose cells (metres) are ``finest``, or coarser where points (metres, world) are few or memory is short.
 
-    For want of points, cells grow no larger than ``coarsest``, at which each holds a pixel. An ``InputWarning`` says by how
+    For want of points, cells grow no larger than ``coarsest``, at which each holds a pixel. An ``InputWarning`` states by how
     much the limit of ``megabytes`` made them larger. Raises ``InputError`` where no cell is large enough for that limit.
     """
     grid = VoxelGrid.covering(bounds, finest)

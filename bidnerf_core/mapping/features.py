@@ -80,7 +80,7 @@ SIFT = Sift()
 
 
 def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Return the square roots of L1-normalised, non-negative descriptors; their Euclidean distance is the Hellinger one."""
+    """Return square roots of L1-normalised, non-negative descriptors; their Euclidean distance is the Hellinger distance."""
     total = descriptors.sum(-1, keepdim=True).clamp(min=torch.finfo(descriptors.dtype).tiny)
     return (descriptors / total).sqrt()
 

@@ -91,7 +91,7 @@ class TrackedViews:
         return _bounded(found, config.most, report)
 
     def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
-        """Return the triangulated landmarks that each image shows, whose depth training takes where none was measured."""
+        """Return the triangulated landmarks that each image shows; training uses their depth where none was measured."""
         kept, positions, covariance = _triangulated(self.observations, radians(config.parallax))
         return seen_landmarks(kept, positions, noise(kept.sightings, positions) ** 2 * covariance)
 

@@ -108,7 +108,7 @@ def seen_landmarks(
 def _across_and_along(
     covariance: Float[Tensor, "n 3 3"], directions: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 2"]:
-    """Return the standard deviation across a direction, averaged over both axes, and that along the direction."""
+    """Return the standard deviations across a direction (the variances of both axes averaged) and along it."""
     along = (directions[:, None] @ covariance @ directions[..., None])[:, 0, 0]
     across = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) - along) / 2
     return torch.stack([across, along], dim=-1).clamp(min=0).sqrt()

@@ -44,7 +44,7 @@ def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
 
 
 def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
-    """Return the landmarks that ``landmark_tensors`` gave as ``tensors``.
+    """Return the landmarks from the tensors that ``landmark_tensors`` returned.
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """

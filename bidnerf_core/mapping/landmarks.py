@@ -58,7 +58,7 @@ class LandmarkMap:
         return replace(self, **{name: getattr(self, name)[index] for name in PER_LANDMARK})
 
     def to(self, device: torch.device | str) -> LandmarkMap:
-        """Return the landmarks on another device; the same ones where they lie there already.
+        """Return the landmarks on another device; ``self`` if they are already there.
 
         Only descriptors are compared there. Keypoints, RANSAC and the resection of a pose are computed on the CPU, by OpenCV,
         poselib and scipy, for which ``LandmarkMatcher`` keeps a copy of the other tensors.
@@ -66,10 +66,10 @@ class LandmarkMap:
         return moved(self, working_device(device))
 
     def correlation_of(self, matches: int) -> float:
-        """Return the number of keypoints that count as one in an image with so many ``matches``.
+        """Return the number of keypoints that count as one in an image with this number of ``matches``.
 
-        Keypoints share errors with their neighbours, the more of them the denser they are: errors of images with few matches
-        are smaller than a constant number says. On several captures it grew with the square root of the matches.
+        Keypoints share errors with their neighbours, with more of them the denser they are: errors of images with few matches
+        are smaller than a constant number implies. On several captures it grew with the square root of the matches.
         """
         if self.usual_matches <= 0:
             return self.correlation

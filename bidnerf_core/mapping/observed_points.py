@@ -26,7 +26,7 @@ class ObservedPoints:
     rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
     translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
     moments: Float[Tensor, "m"]  # of exposure, see ``exposure_moments``
-    turned_moments: Float[Tensor, "m"]  # the same if the rows run the other way
+    turned_moments: Float[Tensor, "m"]  # the same if the rows run along the other axis
 
     def __len__(self) -> int:
         return len(self.points)

@@ -22,11 +22,11 @@ from bidnerf_core.se3 import SE3
 ROUNDS = 3
 """Largest number of adjustments. After each, the keypoints are matched anew, which finds those that wrong poses hid."""
 SETTLED_PIXELS = 0.25
-"""Largest motion of an image by an adjustment after which no other one is needed."""
+"""Largest motion of an image in an adjustment (pixels) after which no further one is needed."""
 CORRELATED_KEYPOINTS = 10.0
-"""Number of keypoints that count as one: lenses and rolling shutters give the keypoints of an image errors in common."""
+"""Number of keypoints that count as one: lenses and rolling shutters cause errors that the keypoints of an image share."""
 LEAST_DEVIATION = 1e-9
-"""Standard deviation of the poses (metres, radians) that is assumed at least."""
+"""Least standard deviation of the poses (metres, radians) that is assumed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class AdjustedPoses:
     """The poses that fit the keypoints best, and how well the given ones do."""
 
     tracked: TrackedViews  # with these poses, and matched by them
-    pixels: Float[Tensor, "v"]  # how far the points that an image shows move in it, median; 0 without points
+    pixels: Float[Tensor, "v"]  # median motion in each image of the points that it shows; 0 without points
     consistency: PoseConsistency  # of the given poses
 
 
@@ -47,8 +47,8 @@ def adjusted_poses(
     """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
 
     The errors of the given poses are taken as independent of each other, and as large as resection of the images
-    suggests. This prior alone holds the whole arrangement in its place, so that the mean motion of the images is about zero. If the
-    first adjustment finds an inconsistency of less than ``least`` pixels, its poses are returned at once.
+    suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean motion of the images
+    is about zero. If the first adjustment finds an inconsistency of less than ``least`` pixels, its poses are returned at once.
     """
     given = tracked.T_world_camera
     seen, points = tracked.triangulated(config)
@@ -104,7 +104,7 @@ def _spread(values: Float[Tensor, "v 3"]) -> float:
 def _motion(
     seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3
 ) -> Float[Tensor, "v"]:
-    """Return how far (pixels) the points move in each image between two poses, median."""
+    """Return the median motion (pixels) in each image of the points that it shows, between two poses of the image."""
     shown, image = points[seen.point], seen.image
     focal = seen.sightings.focal[:, None]
     places = [_projected(T, image, shown) * focal for T in (given, found)]

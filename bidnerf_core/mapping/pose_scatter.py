@@ -35,7 +35,7 @@ def pose_scatter(
 
 
 def update_scatter(updates: Sequence[Float[Tensor, "6"] | None]) -> Float[Tensor, "6 6"]:
-    """Return the covariance of updates of poses, robustly; zero if there are too few, or less than half of the images have one."""
+    """Return a robust covariance of pose updates; zero if there are too few, or fewer than half of the images have one."""
     known = [update for update in updates if update is not None]
     if len(known) < max(ENOUGH_IMAGES, len(updates) / 2):
         return torch.zeros((6, 6), dtype=torch.float64)
@@ -47,7 +47,7 @@ def pose_updates(
 ) -> dict[int, Float[Tensor, "6"]]:
     """Return the right updates from given to resected poses of the images with enough points, by number of the image.
 
-    They are corrected for the part that each image has in its points, see ``pose_scatter``.
+    They are corrected for each image's influence on its points, see ``pose_scatter``.
     """
     sightings, image = tracked.sightings, tracked.image
     seen = torch.bincount(sightings.point)[sightings.point].double()

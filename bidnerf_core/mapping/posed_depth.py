@@ -110,8 +110,8 @@ def agreed(
     tolerance: float,
     needed: int,
 ) -> Bool[Tensor, "p"]:
-    """Return which points of image ``number`` at least ``needed`` others show, to within ``tolerance`` (metres), and no
-    fewer than look through it.
+    """Return which points of image ``number`` are shown, to within ``tolerance`` (metres), by at least ``needed`` other images
+    and by no fewer than look through them.
     """
     agree, against = (torch.zeros(len(points), dtype=torch.int32) for _ in range(2))
     others = witnesses(number, images)

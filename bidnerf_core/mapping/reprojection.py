@@ -68,7 +68,7 @@ class Linearization:
     """Reprojection errors in pixels about a state; they do not depend on the noise, which may change without them."""
 
     state: State
-    front: Array  # (m,) whether the point is before the camera
+    front: Array  # (m,) whether the point is in front of the camera
     off: Array  # (m, 2) projection minus observation
     jacobian: Array  # (m, 2, p)
 
@@ -86,7 +86,7 @@ class ReprojectionErrors:
         self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
 
     def linearized(self, state: State, free: Array) -> Linearization:
-        """Return the errors at a state, and their derivatives by the pose and the ``free`` parameters of the camera."""
+        """Return the errors at a state, and their Jacobian with respect to the pose and the camera's ``free`` parameters."""
         rig = (self._points - state.position) @ state.rotation
         motion = state.camera[4:]
         if motion.any():
@@ -122,7 +122,7 @@ class ReprojectionErrors:
     def _jacobian(
         self, rig: Array, flat: Array, z: Array, scale: Array, radial: float, bend: Array, free: Array
     ) -> Array:
-        """Return the derivative (m, 2, p) of the projection in pixels by a right update and by the free parameters of the camera."""
+        """Return the Jacobian (m, 2, p) of the projection in pixels: a right update, then the camera's ``free`` parameters."""
         x, y = flat[:, 0], flat[:, 1]
         zero, one = np.zeros_like(x), np.ones_like(x)
         by_rig = np.stack([one, zero, -x, zero, one, -y], axis=1).reshape(-1, 2, 3) * (scale / z)[..., None]
@@ -149,6 +149,6 @@ class ReprojectionErrors:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return ``np.cross`` of vectors along the last axis, in a fifth of its time for small arrays."""
+    """Return ``np.cross`` along the last axis; NumPy's takes five times as long for small arrays."""
     (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)

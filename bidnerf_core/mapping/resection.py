@@ -39,26 +39,26 @@ class ReprojectionFit:
     T_world_rig: SE3
     calibration: Calibration
     motion: Float[Tensor, "6"]  # from the first row of the image to the last, see ``rolling_shutter``
-    noise: float  # pixels: standard deviation of a residual along each axis, robustly
+    noise: float  # pixels: robust standard deviation of a residual along each axis
     # Of the right update (translation, rotation), with the uncertainty of the calibration and of the motion.
     covariance: Float[Tensor, "6 6"]
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
-    covariance_by_motion: Float[Tensor, "6 6"]  # the part of the pose's that is of the motion
-    # Of the motion, by the curvature of the cost; 0x0 for a camera at rest.
+    covariance_by_motion: Float[Tensor, "6 6"]  # the part of the pose's covariance due to the motion
+    # Covariance of the motion, from the curvature of the cost; 0x0 for a camera at rest.
     motion_posterior: Float[Tensor, "k k"]
-    slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each parameter of the calibration
+    slope: Float[Tensor, "6 4"]  # derivative of the pose (right update) with respect to the calibration
 
     def log_occam_factor(self, prior: MotionPrior) -> float:
-        """Return the logarithm of the Occam factor of a motion that was estimated: how much the observations narrow its prior.
+        """Return the logarithm of the Occam factor of an estimated motion: how much the observations narrow its prior.
 
-        The likelihood of the fit times this factor is the evidence for a motion (MacKay 2003, ch. 28), in Laplace's approximation,
-        if that of the fit without motion is that for none.
+        The likelihood of the fit times this factor is the evidence for a motion (MacKay 2003, ch. 28), in Laplace's
+        approximation; the evidence for no motion is the likelihood of the fit without one.
         """
         narrowed = self.motion_posterior / torch.outer(prior.deviations, prior.deviations)
         return 0.5 * (float(torch.logdet(narrowed)) - self.motion_in_deviations(prior))
 
     def motion_in_deviations(self, prior: MotionPrior) -> float:
-        """Return the squared size of the motion in the standard deviations of its prior."""
+        """Return the squared size of the motion, in standard deviations of its prior."""
         return float((self.motion / prior.deviations).square().sum())
 
 
@@ -71,7 +71,7 @@ def resect(
     correlation: float = 1.0,
     motion: MotionPrior = STILL,
 ) -> ReprojectionFit:
-    """Minimize the Cauchy loss of the reprojection errors in standard deviations of keypoint and landmark together.
+    """Minimize the Cauchy loss of the reprojection errors, in standard deviations of keypoint and landmark together.
 
     ``noise`` is a first guess at the keypoints' noise (pixels), which is re-estimated after every accepted step until it
     settles. ``calibration`` is where its estimation starts; parameters that ``prior`` leaves out stay there.
@@ -119,7 +119,7 @@ def resect(
 
 
 def _by_last(hessian: Array, covariance: Float[Tensor, "p p"], first: int) -> Float[Tensor, "6 6"]:
-    """Return the part of the pose's covariance that is of the unknowns from the ``first`` one on, which the others follow."""
+    """Return the part of the pose's covariance due to the unknowns from number ``first`` on, to which the others adapt."""
     follows = torch.from_numpy(-damped_solution(hessian[:first, :first], 1e-9, hessian[:first, first:])[:6])
     by_last = follows @ covariance[first:, first:] @ follows.mT
     return (by_last + by_last.mT) / 2
@@ -128,7 +128,7 @@ def _by_last(hessian: Array, covariance: Float[Tensor, "p p"], first: int) -> Fl
 def _slope(
     errors: ReprojectionErrors, state: State, noise: float, correlation: float, motion: MotionPrior
 ) -> Float[Tensor, "6 4"]:
-    """Return how the pose that fits best follows a change of the calibration, with the best motion if that is unknown."""
+    """Return the derivative of the best pose with respect to the calibration, with the best motion if that is unknown."""
     deviations = motion.deviations.numpy()
     free = np.concatenate([np.arange(4), 4 + deviations.nonzero()[0]])
     system = errors.system(errors.linearized(state, free), noise).weighted(1 / correlation)
@@ -142,10 +142,10 @@ def _slope(
 def log_likelihood_ratio(
     data: ObservedPoints, fit: ReprojectionFit, other: ReprojectionFit, correlation: float = 1.0
 ) -> float:
-    """Return the logarithm of how many times as likely the observations are with one fit to them as with another.
+    """Return the logarithm of the likelihood ratio of the observations, with one fit to them over another.
 
-    Both are compared by the loss of ``resect``, with the deviations that the one with less noise, the better explanation, has:
-    those of the points depend on the pose, and larger ones would make residuals less unlikely at no price.
+    Both are compared by the loss of ``resect``, with the deviations of the fit with less noise, which is the better
+    explanation: those of points depend on the pose, and larger ones would make large residuals more likely at no cost.
     """
     better = min(fit, other, key=lambda fit: fit.noise)
     errors = ReprojectionErrors(data, better.T_world_rig)

@@ -20,7 +20,7 @@ class RobustEquations:
     hessian: Array  # (p, p)
     curvature: Array  # (p, p) of the robust cost itself; the Hessian is that of the reweighted squares
     scatter: Array  # (p, p) of the gradients of single observations and priors
-    spread: float  # residuals in standard deviations, robustly: 1 where the noise is right
+    spread: float  # robust standard deviation of the normalized residuals: 1 where the noise is right
 
     def weighted(self, share: float) -> RobustEquations:
         return RobustEquations(
@@ -29,7 +29,7 @@ class RobustEquations:
         )  # fmt: skip
 
     def with_prior(self, value: Array, deviations: Array) -> RobustEquations:
-        """Add a Gaussian prior about zero of the last unknowns, which have this value."""
+        """Add a Gaussian prior about zero on the last unknowns, whose present values are ``value``."""
         first = len(self.gradient) - len(value)
         precision = deviations**-2
         information, gradient = np.zeros_like(self.hessian), self.gradient.copy()
@@ -55,7 +55,7 @@ class RobustEquations:
         values, vectors = np.linalg.eigh(unit[:, None] * self.curvature * unit)
         least = 0.2 * np.linalg.eigvalsh(unit[:, None] * self.hessian * unit)
         inverse = vectors @ np.diag(1 / np.maximum(values, least).clip(min=1e-12)) @ vectors.T
-        # What the residuals do not determine at all overflows; a covariance that is not finite says so.
+        # What the residuals do not determine at all overflows, so the covariance is not finite.
         with np.errstate(over="ignore", invalid="ignore"):
             found: Array = unit[:, None] * inverse * unit
             return found
@@ -68,7 +68,7 @@ def robust_spread(residual: Array, unknowns: int) -> float:
 
 
 def _median(values: Array) -> float:
-    """Return ``np.median`` of finite values, without the time that its checks take."""
+    """Return ``np.median`` of finite values, without the checks that make it slow."""
     half, odd = divmod(len(values), 2)
     ordered = np.partition(values, (half - 1 + odd, half))
     return float(ordered[half]) if odd else float(0.5 * (ordered[half - 1] + ordered[half]))

@@ -30,11 +30,11 @@ class SurfaceMap:
 
     @property
     def device(self) -> torch.device:
-        """Where the surfels, their index and the keyframes lie, and where rays and points meet them."""
+        """Device of the surfels, their index and the keyframes, and of the rays and points that meet them."""
         return self.surfels.positions.device
 
     def to(self, device: torch.device | str) -> SurfaceMap:
-        """Return the surface on another device; the same one where it lies there already."""
+        """Return the surface on another device; ``self`` if it is already there."""
         return moved(self, working_device(device))
 
     @property
@@ -95,7 +95,7 @@ class SurfaceMap:
         self.index.warm_up()
 
     def nearest(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
-        """Return the index of the surfel nearest to each point (metres, world), as exactly as ``SurfelIndex`` says.
+        """Return the index of the surfel nearest to each point (metres, world), as exactly as ``SurfelIndex`` finds it.
 
         A point outside the grid is first clamped to the grid's border.
         """

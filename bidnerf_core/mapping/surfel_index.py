@@ -1,6 +1,6 @@
 """The index of surfels: which one is nearest to a point, in constant time and memory in proportion to the surface.
 
-The cells of a voxel grid are grouped into blocks of 8 x 8 x 8. A dense table of blocks says where the entries of each block
+The cells of a voxel grid are grouped into blocks of 8 x 8 x 8. A dense table of blocks holds where the entries of each block
 begin and how many cells share one entry: one cell where surface is near, 2, 4 or 8 along each side farther away, so that a
 block far from all surface has a single entry. Within a block, cells are in Morton order (x, y and z interleaved bit by bit),
 in which cells that share an entry are consecutive; a look-up is thus three gathers, whatever the point.
@@ -61,7 +61,7 @@ class SurfelIndex:
 
     @staticmethod
     def of_cells(grid: VoxelGrid, nearest: Int[Tensor, "x y z"]) -> SurfelIndex:
-        """Return the index that gives each cell of ``grid`` its own entry: the surfel ``nearest`` names for it."""
+        """Return the index in which each cell of ``grid`` has an entry of its own: its surfel in ``nearest``."""
         shape = block_shape(grid)
         padded = torch.zeros([BLOCK_SIDE * count for count in shape], dtype=torch.int32)
         padded[tuple(slice(count) for count in grid.shape)] = nearest
@@ -84,9 +84,9 @@ class SurfelIndex:
     def __call__(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
         """Return the index (int64) of the surfel nearest to each point (metres, world).
 
-        The distance of that surfel exceeds the least one by at most the root of three times a cell, or 87 % of the least
-        one where that is more; beside a plane, by 10 % of it. A point outside the grid is first clamped to the grid's
-        border; one that is not finite has some surfel.
+        The distance of that surfel exceeds the least one by at most sqrt(3) cells, or by 87 % of the least one where that is
+        more; beside a plane, by 10 % of it. A point outside the grid is first clamped to the grid's border; one that is not
+        finite gets an arbitrary surfel.
         """
         offset, rate, cells, base = self._numbering
         flat = points.detach().reshape(-1, 3).T
@@ -107,9 +107,9 @@ class SurfelIndex:
     def _numbering(
         self,
     ) -> tuple[Float[Tensor, "3 1"], Float[Tensor, "3 3"], Int[Tensor, "c"], Int[Tensor, "3 1"]]:
-        """What turns points into numbers of cells: ``offset + rate point`` is a place in each axis' part of a table (which
-        begins at ``base``) of terms whose sum is the number. Each part has one more cell at either end, which is the
-        border's.
+        """The tables that turn points into numbers of cells: ``offset + rate point`` is a place in each axis' part of a table
+        (which begins at ``base``) of terms whose sum is the number. Each part has one more cell at either end, which repeats
+        the border.
         """
         longest = max(self.grid.shape) + 2
         parts, strides = [], _strides(block_shape(self.grid))

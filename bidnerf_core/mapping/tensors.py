@@ -29,7 +29,7 @@ INDEX_KINDS: Kinds = {
     "entries": ((-1,), torch.int32),
 }
 DENSE_KINDS: Kinds = {"nearest": ((-1, -1, -1), torch.int32)}
-"""The index of surfaces that older versions baked: a surfel for every cell of the grid."""
+"""The index of surfaces that older versions baked: one surfel for each cell of the grid."""
 
 
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
@@ -48,7 +48,7 @@ def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
-    """Return the surface that ``surface_tensors`` gave as ``tensors``, in this version or in an older one.
+    """Return the surface from the tensors that ``surface_tensors`` of this or an older version returned.
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """

@@ -40,7 +40,7 @@ class Matches:
     """Pairs of keypoints of two images that look alike and lie on each other's epipolar lines."""
 
     pairs: Int[Tensor, "p 2"]
-    ambiguity: Float[Tensor, "p"]  # distance of the descriptors as a share of that to the next best
+    ambiguity: Float[Tensor, "p"]  # ratio of the descriptor distance to that of the next best
 
 
 def epipolar_matches(a: PosedKeypoints, b: PosedKeypoints) -> Matches:

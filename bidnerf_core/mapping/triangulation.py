@@ -113,7 +113,7 @@ def fitting(sightings: Sightings, points: Float[Tensor, "n 3"], tolerance: float
 
 
 def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
-    """Return a robust standard deviation of observations along each axis (pixels), corrected for the fitted points."""
+    """Return a robust standard deviation of observations along each axis (pixels), corrected for the points being fitted."""
     if not len(sightings):
         return 1.0
     seen = observations_per_point(sightings, len(points))

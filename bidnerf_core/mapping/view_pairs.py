@@ -13,7 +13,7 @@ from bidnerf_core.se3 import SE3
 
 
 def likely_pairs(views: Sequence[View], neighbours: int) -> Int[Tensor, "p 2"]:
-    """Return pairs (i < j) of each view with ``neighbours`` views that are likely to show the same, without duplicates."""
+    """Return pairs (i < j) of each view with ``neighbours`` views likely to show the same things, without duplicates."""
     return likely_pairs_of_poses([view.T_ref_camera for view in views], neighbours)
 
 

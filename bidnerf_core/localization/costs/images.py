@@ -30,7 +30,7 @@ UNKNOWN_COST = 0.7
 class ColourScales:
     """Scales of the comparison of colours, and how an image's exposure relative to the map is fitted."""
 
-    colour: float = 0.2  # norm of the difference over the three channels at which a pixel is half an inlier
+    colour: float = 0.2  # norm of a pixel's difference (three channels) at which its inlier weight is 1/2
     gain: float = 0.2  # standard deviation of the prior about 1
     bias: float = 0.1  # standard deviation of the prior about 0
     exposure_rounds: int = 2  # number of rounds of robust reweighting, which begin at a gain of 1; at least 1
@@ -41,18 +41,18 @@ class RenderedView:
     """A thumbnail's n pixels as the map renders them from each of h poses."""
 
     camera: Intrinsics
-    rgb: Float[Tensor, "h 3 n"]  # smooth
+    rgb: Float[Tensor, "h 3 n"]  # smoothed
     known: Float[Tensor, "h n"]  # share of the pixel that the map renders, 0 to 1
     points: Float[Tensor, "h n 3"]  # points seen by the pixels: metres, last camera's frame
     depth: Float[Tensor, "h n"]  # metres, in the thumbnail's camera
 
     @cached_property
     def slopes(self) -> Float[Tensor, "h 3 n 2"]:
-        """The change of the colours per unit on the plane z = 1."""
+        """Derivative of the colours with respect to position on the plane z = 1."""
         return slopes(self._image(self.rgb), self.camera)
 
     def blurred(self, pixels: float) -> RenderedView:
-        """Return the colours convolved with a Gaussian of that standard deviation."""
+        """Return the view with its colours convolved with a Gaussian of standard deviation ``pixels``."""
         if pixels == 0:
             return self
         known = self.known[:, None]
@@ -86,9 +86,9 @@ def render_view(renderer: ViewRenderer, small: Thumbnail, T: SE3) -> RenderedVie
 class ImageCost:
     """Mean over pixels of ``1 - 1 / (1 + c^2 / s^2)``, with the difference c between rendered and measured colour.
 
-    Its normal equations are those of iteratively reweighted least squares. With the mean of both images' slopes, colours
-    change with the pose to second order (Benhimane and Malis 2004, "Real-time image-based tracking of planes using efficient
-    second-order minimization"). Updates turn about ``pivot``. The cost is infinite where a pose is not finite.
+    Its normal equations are those of iteratively reweighted least squares. With the mean of both images' slopes, colours are
+    linearized with second-order accuracy (Benhimane and Malis 2004, "Real-time image-based tracking of planes using efficient
+    second-order minimization"). Updates rotate about ``pivot``. The cost is infinite where a pose is not finite.
     """
 
     renderer: ViewRenderer
@@ -107,7 +107,7 @@ class ImageCost:
         return NormalEquations(torch.where(sound, cost, torch.inf), gradient, hessian)
 
     def with_blur_of(self, T: SE3, candidates: Sequence[float]) -> ImageCost:
-        """Return the cost with that blur among the candidates which makes renderings from one pose most like the photos."""
+        """Return the cost with the candidate blur that makes renderings from one pose most similar to the photos."""
         return replace(self, blur=candidates[int(self.costs_of_blurs(T, candidates).argmin())])
 
     def costs_of_blurs(self, T: SE3, candidates: Sequence[float]) -> Float[Tensor, "b"]:
@@ -145,11 +145,11 @@ class ImageCost:
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """A rendered image beside a measured one."""
+    """A rendered image compared with a measured one."""
 
     cost: Float[Tensor, "h"]
     error: Float[Tensor, "h 3 n"]
-    weight: Float[Tensor, "h 3 n"]  # of each square in a step
+    weight: Float[Tensor, "h 3 n"]  # of each squared error in a step
 
 
 def uniform_cost(thumbnails: Sequence[Thumbnail], scale: float) -> float:
@@ -165,9 +165,9 @@ def uniform_cost(thumbnails: Sequence[Thumbnail], scale: float) -> float:
 def exposed(
     seen: RenderedView, measured: Float[Tensor, "3 n"], scales: ColourScales
 ) -> Float[Tensor, "h 3 n"]:
-    """Return the rendered colours at the exposure, within the priors, that brings them nearest to the measured ones.
+    """Return the rendered colours at the exposure that, given its priors, brings them nearest to the measured ones.
 
-    They are not clipped. Measured colours that are, at black or white, do not bend the exposure.
+    The result is not clipped. Measured colours that are clipped, at black or white, do not influence the exposure.
     """
     if not (scales.gain and scales.bias):
         return seen.rgb
@@ -184,7 +184,7 @@ def exposed(
 def _by_point(
     small: Thumbnail, slope: Float[Tensor, "h 3 n 2"], depth: Float[Tensor, "h n"]
 ) -> Float[Tensor, "h 3 n 3"]:
-    """Return the change of each pixel's colour by a displacement of the camera, in the last camera's axes, per metre.
+    """Return the change of each pixel's colour with a displacement of the camera, in the last camera's axes, per metre.
 
     A point (X, Y, Z) is seen at x = X / Z, y = Y / Z, and moves there by (dX - x dZ, dY - y dZ) / Z.
     """

@@ -1,7 +1,8 @@
-"""Residuals of rendered rays and their Jacobian by the pose: one backward pass a channel, for any differentiable field.
+"""Residuals of rendered rays and their Jacobian: one backward pass per channel, for any differentiable field.
 
-Rays are independent of each other, so the derivative of a channel's sum over all rays by their origins and directions holds
-every ray's own. Four passes give the whole Jacobian of an RGB-D objective; on a GPU, one pass over four copies of the rays.
+Rays are independent of each other, so the gradient of a channel's sum over all rays, with respect to their origins and
+directions, contains the gradient of every single ray. Four passes give the whole Jacobian of an RGB-D objective; on a GPU, one
+pass over four copies of the rays does.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ BackgroundColour = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """The residuals of n rays from each of h poses, and how they change with the pose."""
+    """The residuals of n rays from each of h poses, and their Jacobian with respect to the pose."""
 
     residuals: Float[Tensor, "h n c"]
     rgb: Float[Tensor, "h n 3"]  # rendered
-    steepness: Float[Tensor, "h n c"]  # length of the derivative by the ray's origin, per metre
-    jacobian: Float[Tensor, "h n c 6"]  # by a right update at the pivot: translation, rotation
+    steepness: Float[Tensor, "h n c"]  # norm of the gradient with respect to the ray's origin, per metre
+    jacobian: Float[Tensor, "h n c 6"]  # with respect to a right update at the pivot: translation, rotation
 
 
 def linearize(
@@ -48,15 +49,15 @@ def linearize(
 ) -> Linearization:
     """Render ``rays`` (h n), which move with the pivots (h), and differentiate their residuals against ``observed`` (n).
 
-    ``least_weight``: samples of less rendering weight contribute to what is rendered, but not to its derivative; most of
-    them are air, and nearly all of the time goes into derivatives. ``channels``: those that are differentiated, by default
+    ``least_weight``: samples with a smaller rendering weight contribute to what is rendered, but not to its derivative; most of
+    them lie in empty space, and nearly all of the time goes into derivatives. ``channels``: those to differentiate, by default
     all; the Jacobian of the others is 0.
     """
     flat, shape = flattened(rays), rays.near.shape
     repeated = observed.repeated(shape[0])
     with torch.no_grad():
         rendering = render_samples(field, flat, field.sampler(flat), background)
-        # Colours nearly cancel at the answer: their difference is taken in float64.
+        # Rendered and measured colours nearly cancel at the answer, so their difference is taken in float64.
         precise = replace(rendering, rgb=rendering.rgb.double())
         residuals = residual(precise, replace(repeated, rgb=repeated.rgb.double()))
     kept = rendering.samples.valid
@@ -86,7 +87,7 @@ def _ray_gradients(
     field: RadianceField, rays: Rays, observed: Observations, residual: Residual, samples: RaySamples,
     kept: Bool[Tensor, "r s"], background: BackgroundColour, channels: tuple[int, ...], count: int,
 ) -> tuple[Float[Tensor, "r c 3"], Float[Tensor, "r c 3"]]:  # fmt: skip
-    """Return the derivatives of each ray's residuals by its origin and by its direction, from the ``kept`` samples."""
+    """Return the gradients of each ray's residuals with respect to its origin and direction, from the ``kept`` samples."""
     results = [rays.origins.new_zeros((len(rays.near), count, 3)) for _ in range(2)]
     if may_wait(kept.device):
         busy = kept.any(-1).nonzero()[:, 0]
@@ -122,7 +123,7 @@ def _ray_gradients(
 def _all_at_once(samples: RaySamples, channels: int) -> bool:
     """Return whether to differentiate all channels in one pass, over as many copies of the rays.
 
-    A CPU would have more to compute. On a GPU, a pass takes the time to launch it, unless its samples are many.
+    A CPU would only have more to compute. On a GPU, the launch dominates the time of a pass unless its samples are many.
     """
     return samples.valid.device.type != "cpu" and channels * samples.valid.numel() <= MOST_AT_ONCE
 

@@ -28,9 +28,9 @@ from bidnerf_core.sampling import AroundDepth, Resampled
 from bidnerf_core.se3 import SE3
 
 MISS_SCALES = 3.0
-"""Depth residual of a ray that meets nothing, in depth scales: that of an outlier, but less than the whole distance."""
+"""Depth residual, in depth scales, of a ray that meets nothing: an outlier's, but less than the whole distance."""
 LEAST_WITH_DEPTH = 0.05
-"""Least share of the rays that must have depth for these to stand for all."""
+"""Least share of the rays that must have depth for these to represent all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +42,11 @@ class Residuals:
     weights: Float[Tensor, "n c"]  # of each in the objective; 0 where nothing was measured
     confidence: Float[Tensor, "h n c"]  # 1, or less where a residual is too steep for the map's accuracy
     objective: Objective
-    home: torch.device = torch.device("cpu")  # where the poses came from, and what is asked of residuals goes
+    home: torch.device = torch.device("cpu")  # device of the poses, on which all results are returned
 
     @property
     def _pull(self) -> Float[Tensor, "h n c"]:
-        """The weight of each square in a step."""
+        """Weight of each squared residual in a step."""
         return self.weights * self.confidence**2 * self.objective.robust_weights(self.confidence * self.value)
 
     def cost(self) -> Float[Tensor, "h"]:
@@ -79,9 +79,9 @@ class Residuals:
         return self._agreeing.double().mean(-1).to(self.home)
 
     def inliers_by_depth(self) -> Float[Tensor, "h"]:
-        """Return the same share of the rays that have depth; of all rays, if fewer than ``LEAST_WITH_DEPTH`` of them have.
+        """Return the share of ``inliers`` among the rays with depth; among all rays if fewer than ``LEAST_WITH_DEPTH`` have it.
 
-        Something nearer than a sensor measures, or too dark or too clear for it, hides the scene and has no depth.
+        What hides the scene without having depth is left out: it may be too near for the sensor, too dark or too transparent.
         """
         measured = (self.weights[:, 3:] > 0).any(-1).double()
         agreeing = self._agreeing.double()
@@ -110,7 +110,7 @@ class RenderedCost:
         return self.residuals(T).normal_equations()
 
     def cost(self, T: SE3) -> Float[Tensor, "h"]:
-        """Return the cost without the time that derivatives take."""
+        """Return the cost alone, without spending time on derivatives."""
         return self.residuals(T, derivatives=False).cost()
 
     def residuals(self, T: SE3, derivatives: bool = True) -> Residuals:
@@ -164,7 +164,7 @@ class RenderedCostSettings:
 def _residuals(
     found: Linearization, rays: WeightedRays, objective: Objective, exposure: bool, surface_sigma: float
 ) -> Residuals:
-    """Turn a linearization into weighted residuals; with ``exposure``, the rendering is first corrected to the image's.
+    """Turn a linearization into weighted residuals; with ``exposure``, the rendering first takes on the image's exposure.
 
     The correction clips colours at black and at white, as cameras do; where it does, a residual does not depend on the pose.
     ``surface_sigma`` (metres) is the uncertainty of the map's surfaces. It adds the variance (slope x sigma)^2 to that of

@@ -26,14 +26,14 @@ from bidnerf_core.se3 import SE3
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""
 LITTLE_BACKGROUND = 0.02
-"""Share of an image's pixels that show no matter up to which it is not worth while to draw pixels that do."""
+"""Share of an image's pixels that show no matter, up to which preferring the other pixels is not worth its cost."""
 BOX_SCALE = 0.1
 """Distance (metres) between a measured point and the box of the scene at which outliers begin."""
 
 
 @dataclass(eq=False)
 class SampledLoss:
-    """The loss at a pose, on pixels that are drawn anew at each call or once for all."""
+    """The loss at a pose, on pixels that are drawn anew at each call or only once."""
 
     problem: Problem
     objective: Objective
@@ -62,7 +62,7 @@ class SampledLoss:
 
     @property
     def is_capturable(self) -> bool:
-        """Whether each call computes the same, but for the random numbers; a blur fades from call to call."""
+        """Whether each call does the same computation apart from random numbers; with a blur, which fades, it does not."""
         return self.reach.blur == 0
 
     def _field(self) -> RadianceField:
@@ -96,7 +96,7 @@ class SampledLoss:
         return masked_mean(robust(torch.linalg.vector_norm(off, dim=-1)), observed.measured).mean()
 
     def _drawn(self, T_world_last: SE3) -> list[Observations]:
-        """Draw pixels (views, pixels a view) and, where there are any, rays of depth (1, rays)."""
+        """Draw pixels (views, pixels per view) and, where there are any, depth rays (1, rays)."""
         problem, device = self.problem, self.problem.device
         many = self.counts.pixels * self._candidates
         pixels = draw(problem.views, many, self._drawer, self.generator, device=device)
@@ -120,7 +120,7 @@ class SampledLoss:
 
 
 def _shows_background(problem: Problem) -> bool:
-    """Return whether pixels of an image have the background's colour and no measured depth, more than a few."""
+    """Return whether more than a few pixels of any image have the background's colour and no measured depth."""
     return any(_share_of_background(view.frame, problem.bounds) > LITTLE_BACKGROUND for view in problem.views)
 
 

@@ -22,7 +22,7 @@ from bidnerf_core.se3 import SE3, skew
 SURFEL_RADIUS = 1.5
 """Radius of a surfel's disc, in cells of the surface's grid."""
 MOST_DRAWN_FROM = 1_000_000
-"""Number of measured pixels of a view, above which points are drawn from every so many of them."""
+"""Number of a view's measured pixels above which they are thinned evenly before points are drawn."""
 MOST_COLOUR_CHANGE = 0.2
 """Largest change of a surfel's colour along its plane to which its gradient is extrapolated."""
 
@@ -44,7 +44,7 @@ class PointCloud:
     rgb: Float[Tensor, "p 3"]
     origins: Float[Tensor, "p 3"]  # metres: where each was measured from
     coloured: Bool[Tensor, "p"]  # whether a colour was measured
-    # Metres: how a unit of a factor that all depths share moves the points. With it, equations have that factor as seventh unknown.
+    # Metres: derivative of the points with respect to a factor on all depths. If given, that factor is the seventh unknown.
     growth: Float[Tensor, "p 3"] | None = None
 
     @staticmethod
@@ -67,7 +67,7 @@ class PointCloud:
         return len(self.points)
 
     def to(self, device: torch.device | str) -> PointCloud:
-        """Return the points on another device; the same ones where they lie there already."""
+        """Return the points on another device; ``self`` if they are already there."""
         return moved(self, device)
 
     def first(self, count: int) -> PointCloud:
@@ -78,7 +78,7 @@ class PointCloud:
         )
 
     def scaled(self, factor: float) -> PointCloud:
-        """Return the points with depths multiplied by a factor, which becomes an unknown; the points have none so far."""
+        """Return the points, not scaled so far, with depths multiplied by a factor, which becomes an unknown."""
         growth = self.points - self.origins
         return replace(self, points=self.origins + factor * growth, growth=growth)
 
@@ -88,12 +88,12 @@ class PointCloud:
 
     @cached_property
     def middle(self) -> Float[Tensor, "3"]:
-        """The median of the points by axis."""
+        """Median of the points along each axis."""
         return self.points.median(0).values
 
     @cached_property
     def basis(self) -> Float[Tensor, "p 3 k"]:
-        """Derivative of the points, in the camera's axes, by an update about their middle, and by the factor if there is one."""
+        """Jacobian of the points, in the camera's axes, with respect to an update about their middle and the factor, if any."""
         turned = -skew(self.points - self.middle)
         eye = torch.eye(3, dtype=turned.dtype, device=turned.device)
         by_pose = torch.cat([eye.expand_as(turned), turned], dim=-1)
@@ -106,7 +106,7 @@ class PointCloud:
 
     @cached_property
     def pivot(self) -> Pivot:
-        """The middle of the points, about which updates turn; on the CPU."""
+        """The middle of the points, about which updates rotate; on the CPU."""
         return Pivot.at_point(self.middle)
 
 
@@ -149,7 +149,7 @@ class SurfaceCost:
         return moved(self._equations(self.correspondences(T)), T.device)
 
     def with_variance(self, T: SE3) -> tuple[NormalEquations, Float[Tensor, "h"]]:
-        """Return the normal equations and ``residual_variance``; neighbours are sought once for both."""
+        """Return the normal equations and ``residual_variance``, with one search for neighbours."""
         found = self.correspondences(T)
         return moved((self._equations(found), self._variance(found)), T.device)
 
@@ -167,13 +167,13 @@ class SurfaceCost:
         return NormalEquations(self._cost(near, alike), gradient + by_colour[0], hessian + by_colour[1])
 
     def cost(self, T: SE3) -> Float[Tensor, "h"]:
-        """Return the cost without the time that derivatives take."""
+        """Return the cost alone, without spending time on derivatives."""
         near, alike = self.inliers(self.correspondences(T))
         colour = self.scales.colour_weight
         return moved(self._cost(near, alike) if colour else (1 - near).mean(-1).double(), T.device)
 
     def inliers(self, found: Correspondences) -> tuple[Float[Tensor, "h p"], Float[Tensor, "h p"]]:
-        """Return how much of an inlier each point is, by its distance and by its colour."""
+        """Return each point's inlier weights: that of its distance and that of its colour."""
         near = geman_mcclure_inlier(found.squared, self.scales.distance)
         difference, _ = self.colour_differences(found)
         return near, geman_mcclure_inlier((difference**2).sum(-1), self.scales.colour)
@@ -195,7 +195,7 @@ class SurfaceCost:
         return (total / weights.sum((0, -1)).clamp(min=1e-12)).double()
 
     def correspondences(self, T: SE3) -> Correspondences:
-        """Match each point with its nearest surfel, where the surface lies.
+        """Match each point with its nearest surfel, on the surface's device.
 
         A point beside an edge lies in the plane of the surfel there, but not on the surfel; ``beyond`` accounts for it.
         """
@@ -214,8 +214,8 @@ class SurfaceCost:
     def colour_differences(
         self, found: Correspondences
     ) -> tuple[Float[Tensor, "h p 3"], Float[Tensor, "h p 3 3"]]:
-        """Return the surface's colour at each point minus the measured one, and its derivative by place (channel by axis,
-        world).
+        """Return the surface's colour at each point minus the measured one, and its derivative with respect to the point's
+        position (channel by world axis).
         """
         gradient = self.surface.surfels.rgb_gradient[found.index]
         change = (gradient @ found.along[..., None])[..., 0]
@@ -243,7 +243,7 @@ def _cloud_of(view: View, count: int, generator: Generator) -> PointCloud:
 def _cloud_of_rays(
     depth_rays: Observations, views: tuple[View, ...], count: int, generator: Generator
 ) -> PointCloud:
-    """Return points of rays in the last camera's frame, with the colours of the pixels at which views see them."""
+    """Return the points that rays measured, in the last camera's frame, with the colours of the pixels where views see them."""
     some = depth_rays.drawn(count, generator, device="cpu")
     rgb, coloured = torch.zeros_like(some.points), torch.zeros(len(some), dtype=torch.bool)
     for view in views:
@@ -263,8 +263,8 @@ def _distance_terms(
 ) -> tuple[Tensor, Tensor]:
     """Return the gradient and the Hessian of half the weighted squared distances.
 
-    A distance is split into one across the plane and one in all directions, ``n n^T + s (1 - n n^T) = (1 - s) n n^T + s``;
-    the derivative of s itself is left out.
+    A squared distance is split into a part across the plane and an isotropic one,
+    ``n n^T + s (1 - n n^T) = (1 - s) n n^T + s``; the derivative of s itself is left out.
     """
     count = len(cloud)
     spread = weight * found.beyond
@@ -282,7 +282,7 @@ def _colour_terms(
     error: Float[Tensor, "h p 3"], derivative: Float[Tensor, "h p 3 3"], weight: Tensor,
     found: Correspondences, cloud: PointCloud,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return the gradient and the Hessian of half the weighted squares of three residuals a point."""
+    """Return the gradient and the Hessian of half the weighted squares of each point's three residuals."""
     count = len(cloud)
     rows = ((derivative @ found.rotation[:, None]) @ cloud.basis).flatten(1, 2)
     hessian = (rows * weight.repeat_interleave(3, dim=-1)[..., None]).mT @ rows

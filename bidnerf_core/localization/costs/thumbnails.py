@@ -23,11 +23,11 @@ KERNEL_REACH = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A view resampled to a small camera without distortion. All that follows from it lies where ``rgb`` does."""
+    """A view resampled to a small camera without distortion. All that is derived from it lies on the device of ``rgb``."""
 
     camera: Intrinsics
     T_last_camera: SE3
-    rgb: Float[Tensor, "3 h w"]  # smooth
+    rgb: Float[Tensor, "3 h w"]  # smoothed
 
     @cached_property
     def flat(self) -> Float[Tensor, "n 3"]:
@@ -41,7 +41,7 @@ class Thumbnail:
 
     @cached_property
     def directness(self) -> Float[Tensor, "n"]:
-        """Depth per distance along each ray."""
+        """Ratio of depth (planar z) to distance along each ray."""
         return 1 / torch.linalg.vector_norm(self.flat, dim=-1)
 
     @cached_property
@@ -83,7 +83,7 @@ def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
 
 
 def gaussian_blurred(image: Float[Tensor, "b c h w"], pixels: float) -> Float[Tensor, "b c h w"]:
-    """Convolve with a Gaussian of that standard deviation; the border is repeated."""
+    """Convolve with a Gaussian of standard deviation ``pixels``; the border is repeated."""
     size = 2 * math.ceil(KERNEL_REACH * pixels) + 1
     return gaussian_blur2d(image, (size, size), (pixels, pixels), "replicate")
 

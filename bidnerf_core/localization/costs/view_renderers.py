@@ -16,7 +16,7 @@ from bidnerf_core.mapping.casting import cast
 from bidnerf_core.rendering import render
 
 CHUNK = 16384
-"""Rays that are rendered at a time."""
+"""Number of rays that are rendered at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class RayColours:
     """The rendered colour and distance of rays."""
 
     rgb: Float[Tensor, "r 3"]  # times ``known``, where that is less than 1
-    known: Float[Tensor, "r"]  # 0 where a ray leads to where the map has nothing
+    known: Float[Tensor, "r"]  # 0 where the map has nothing along the ray
     # Metres to what is seen or, where that is the background, to where the ray passes closest to the scene.
     along: Float[Tensor, "r"]
 
@@ -35,7 +35,7 @@ class ViewRenderer(Protocol):
 
     @property
     def device(self) -> torch.device:
-        """Where the rays have to lie, and where their colours will."""
+        """Device on which the rays must lie and their colours are returned."""
         ...
 
     def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours: ...
@@ -43,12 +43,12 @@ class ViewRenderer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceRenderer:
-    """Renders the colours of surfels and, where the scene has a background, that behind them."""
+    """Renders the colours of surfels and, where the scene has a background, its colour behind them."""
 
     surface: SurfaceMap
     background: (
         tuple[float, float, float] | None
-    )  # None: a ray that meets nothing looks through a hole of the map
+    )  # None: a ray that meets nothing looks through a hole in the map
 
     @property
     def device(self) -> torch.device:

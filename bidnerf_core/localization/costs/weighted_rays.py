@@ -1,4 +1,4 @@
-"""Drawn rays with the weight of each of their residuals: the same for every pose that is tried."""
+"""Drawn rays with the weights of their residuals, which are the same for every pose that is tried."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class RayCounts:
     """The numbers of rays to draw."""
 
     pixels: int  # in all, shared out equally among the views
-    depth_rays: int = 0  # besides, of a sensor with rays of its own
+    depth_rays: int = 0  # in addition, from a sensor with rays of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def draw_weighted_rays(
     blur: int,
     generator: Generator,
 ) -> WeightedRays:
-    """Draw pixels of all views and, where there are any, rays of depth, with their weights of eqs. 5 and 6.
+    """Draw pixels of all views and, where there are any, depth rays, weighted as in eqs. 5 and 6.
 
     Colours are averaged over squares of ``blur`` x ``blur`` pixels; 1 leaves them as they are.
     """
@@ -62,7 +62,7 @@ def draw_weighted_rays(
 
 
 def blurred(view: View, size: int) -> View:
-    """Return the view with colours averaged over squares of ``size`` pixels and interpolated between; depth stays."""
+    """Return the view with colours averaged over squares of ``size`` pixels and interpolated in between; depth is unchanged."""
     frame = view.frame
     height, width = frame.rgb.shape[:2]
     size = min(size, height, width)

@@ -51,16 +51,16 @@ DETAILED_STAGES: tuple[ImageStage, ...] = (
     ImageStage(96, 6, 2),
     ImageStage(192, 4, 2),
 )
-"""Stages for images that something hides part of: nearly every pixel of a smaller thumbnail would show some of it."""
+"""Stages for partly hidden images: in smaller thumbnails, nearly every pixel would show some of what hides the scene."""
 WIDE_SCALES = ColourScales(gain=1.0, exposure_rounds=5)
-"""Scales with which images that are exposed twice or half as long are found."""
+"""Scales with which images exposed twice or half as long are found."""
 DETAILED_SCALES = ColourScales(colour=0.07)
-"""Scales for images that something hides part of: with wider ones, poses that explain its colours a little look better.
+"""Scales for partly hidden images: wider ones favour poses that explain a little of the colours of what hides the scene.
 
-They suppose about the map's exposure. With wider priors, more of what hides the scene is explained.
+They assume about the map's exposure: wider priors would explain more of what hides the scene.
 """
 COMPARED_SCALES = replace(WIDE_SCALES, colour=0.07, exposure_rounds=10)
-"""Scales with which few poses are compared, whatever the exposure and whatever hides part of the scene."""
+"""Scales for comparing a few poses, whatever the exposure and whatever hides part of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class ImageSearch:
 
     @torch.no_grad()
     def cost(self, T: SE3, width: int) -> float:
-        """Return the cost of one pose, with thumbnails of that width."""
+        """Return the cost of one pose, on thumbnails whose longer side is ``width`` pixels."""
         return float(self._cost(width)(T[None].to(self.renderer.device)).cost[0])
 
     def thumbnails(self, width: int) -> list[Thumbnail]:

@@ -50,7 +50,7 @@ POINT_STAGES = (
 class PointSearch:
     """Aligns measured points with a surface, starting from hypotheses all over the scene.
 
-    Steps are taken where the surface lies. Poses come from the CPU and return to it.
+    Steps are taken on the surface's device. Poses come from the CPU and return to it.
     """
 
     surface: SurfaceMap
@@ -71,7 +71,7 @@ class PointSearch:
 
     @property
     def surroundings(self) -> Surroundings:
-        """What hypotheses are drawn from; on the CPU, where the same seed draws the same ones for every device."""
+        """What hypotheses are drawn from; on the CPU, so that a seed draws the same ones whatever the device."""
         surface = self.surface
         keyframes, middle = SE3.from_matrix(surface.keyframes), surface.surfels.positions.median(0).values
         return moved(Surroundings(keyframes, surface.extent, middle, self.cloud.middle), "cpu")

@@ -1,7 +1,7 @@
-"""Another camera that far more of the matches agree with: a part of an image, say, or one that was resized to another shape.
+"""Another camera with which far more matches agree: that of a cropped image, say, or of one resized to another shape.
 
-Matches in a part of the scene, on one wall say, agree with a wrong pose and wrong intrinsics as well as with the right ones. The
-other matches tell: far more agree if the camera is an unknown of the fit.
+Matches in one part of the scene, on a single wall say, agree with a wrong pose and wrong intrinsics as well as with the right
+ones. The other matches decide: far more of them agree if the camera is an unknown of the fit.
 """
 
 from __future__ import annotations
@@ -24,30 +24,32 @@ from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 UNSUSPECTED = 0.8
-"""Share of the matches from which on a pose is not suspected."""
+"""Least share of agreeing matches at which a pose is not suspected."""
 SUSPECTED, FAR = 0.5, 0.1
-"""Share of the matches below which a pose may be far from right, and principal points tried then, as shares of the focal length."""
+"""Share of agreeing matches below which a pose may be far off, and shift of the principal points tried then, as a share of the
+focal length.
+"""
 LEAST_STRETCH = math.log(1.03)
-"""Smallest stretch that is told from the errors of lenses and landmarks."""
+"""Smallest stretch, as a logarithm, that is distinguished from the errors of lenses and landmarks."""
 MORE, FURTHER = 1.1, 5
 """Factor by which, and number of exact matches by which, the support of another camera has to exceed that of the one found."""
 DEVIATIONS = np.array([ANY.log_focal, ANY.shift, ANY.shift, ANY.log_focal])
 """Standard deviations of the logarithm of the focal length, of the principal point and of the logarithm of the stretch."""
 FIT_SCALES = (4.0, 1.0)
-"""Residuals at which outliers begin in the fits one after the other, in limits of an inlier."""
+"""Residuals at which outliers begin in the successive fits, in units of the inlier threshold."""
 MOST_EVALUATIONS, ROUGH_EVALUATIONS = 30, 8
-"""Largest number of steps of a fit, and of those that choose among starts."""
+"""Largest number of steps of a fit, and of the fits that choose among starts."""
 FEW_DRAWS = 500
 """Largest number of minimal samples: enough for two inliers in five matches."""
 LARGEST_RESIDUAL = 1e4
-"""Residual, pixels, of points behind the camera and of those that are farther off: fits need finite numbers."""
+"""Residual (pixels) of points behind the camera, and upper limit of all others: fits need finite numbers."""
 LARGEST_CHANGE = 5.0
 """Largest logarithm of a focal length's change that is tried."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """The pose and the camera that most matches agree with."""
+    """The pose and the camera with which most matches agree."""
 
     T_world_rig: SE3
     stretch: Stretch  # of the given intrinsics
@@ -72,10 +74,11 @@ def better_camera(
     limit: float,
     unsuspected: float = UNSUSPECTED,
 ) -> CameraFit | None:
-    """Return the camera that matches agree with far better than with one that was found; None if there is none.
+    """Return a camera with which far more matches agree than with the one that was found; None if there is none.
 
-    ``data`` are matches by descriptors alone. A match agrees with a residual within ``limit`` (pixels). The camera that was found is
-    the given one, corrected by ``calibration``, and not suspected from that share of agreeing matches on.
+    ``data`` are matches by descriptors alone; a match agrees if its residual is within ``limit`` (pixels). The camera that was
+    found is the given one corrected by ``calibration``; if at least a share ``unsuspected`` of the matches agree with it, no
+    other is sought.
     """
     here = _Projection(data, T_world_rig, calibration.radial)
     start = _unknowns(calibration)
@@ -113,7 +116,7 @@ def _fitted(
 def _from_sample(data: ObservedPoints, limit: float) -> tuple[CameraFit, float] | None:
     """Return the fit from the best minimal sample of the matches, whose focal length is free.
 
-    None if there is no sample, and for several views, whose matches are not of one pinhole.
+    Returns None if there is no sample, and for several views, whose matches are not those of one pinhole camera.
     """
     parts = (data.translation, data.rotation, data.focal)
     if not all(bool((part == part[0]).all()) for part in parts):
@@ -128,7 +131,7 @@ def _from_sample(data: ObservedPoints, limit: float) -> tuple[CameraFit, float] 
 def _from_far(
     data: ObservedPoints, T_world_rig: SE3, calibration: Calibration, limit: float
 ) -> tuple[CameraFit, float]:
-    """Return the best fit from principal points far off."""
+    """Return the best of the fits that start from principal points far from the middle."""
     rough = []
     for u, v in itertools.product((-FAR, FAR), repeat=2):
         # The principal point and this turn move the image by opposite amounts.
@@ -149,9 +152,9 @@ def told_apart(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
 
 
 def least_change(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
-    """Return the stretch, and what remains of the change of the focal length.
+    """Return the stretch, and the change of the focal length that remains (logarithm).
 
-    An image that was resized in one direction keeps its focal length in the other, so that the least change is the most probable.
+    An image that was resized in one direction keeps its focal length in the other, so the least change is the most probable.
     """
     across = min((0.5, 0.0, 1.0), key=lambda share: abs(log_focal + (0.5 - share) * log_stretch))
     stretch = Stretch(math.exp(across * log_stretch), math.exp((across - 1) * log_stretch))
@@ -159,7 +162,7 @@ def least_change(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
 
 
 class _Projection:
-    """Residuals of matches from ten unknowns.
+    """Residuals of matches as functions of ten unknowns.
 
     These are a right update of the pose, the logarithm of the focal length, the shift of the principal point as a share of the
     focal length, and the logarithm of the stretch.
@@ -188,11 +191,11 @@ class _Projection:
         return int((self.distances(unknowns) <= limit).sum())
 
     def support(self, unknowns: Float[np.ndarray, "10"], limit: float) -> float:
-        """Return how many matches agree, each the less the farther off it is (MSAC: Torr and Zisserman 2000)."""
+        """Return how many matches agree, where each counts the less the farther off it is (MSAC: Torr and Zisserman 2000)."""
         return float((1 - (self.distances(unknowns) / limit) ** 2).clip(min=0).sum())
 
     def descended(self, start: Float[np.ndarray, "10"], scale: float, steps: int) -> Float[np.ndarray, "10"]:
-        """Return the unknowns that the loss with a ``scale`` leads to from a start."""
+        """Return the unknowns to which minimizing the robust loss of this ``scale`` leads from a start."""
         found: Float[np.ndarray, "10"] = least_squares(
             self._whitened, start, args=(scale,), loss="cauchy", max_nfev=steps
         ).x

@@ -28,7 +28,7 @@ class QueryImage:
     depth: Float[Tensor, "n"]  # metres, 0 where none was measured
     intrinsics: Intrinsics
     T_rig_camera: SE3  # float64
-    hidden: Bool[Tensor, "h w"] | None = None  # pixels of what the map does not have, as ``Frame`` has them
+    hidden: Bool[Tensor, "h w"] | None = None  # pixels that show what the map does not have, see ``Frame``
 
     @property
     def focal(self) -> float:
@@ -71,7 +71,7 @@ class LandmarkMatches:
 
     @property
     def keys(self) -> Int[Tensor, "m"]:
-        """A number for each match, the same for the same view (of up to 512), keypoint (of up to a million) and landmark."""
+        """A number that identifies each match by its view (up to 512), keypoint (up to a million) and landmark."""
         return (self.view << 54) + (self.keypoint << 34) + self.landmark
 
     def __getitem__(self, index: Tensor) -> LandmarkMatches:

@@ -1,4 +1,4 @@
-"""Whether a camera moved while its rows were exposed, judged by the keypoints of one image."""
+"""Evidence that a camera moved while its rows were exposed, from the keypoints of one image."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
 ENOUGH_POINTS = 20
-"""Least number of points that tell a motion: with fewer, the noise is as uncertain as the motion itself."""
+"""Least number of points that determine a motion: with fewer, the noise is as uncertain as the motion itself."""
 MOVING = 1 / 30
-"""Share of images that are taken to show a motion before their points are looked at: lens stabilisers and lenses that the intrinsics do not
-describe bend images in similar ways.
+"""Prior probability that an image shows a motion.
+
+It is low because lens stabilisers, and lenses that the intrinsics do not describe, distort images in similar ways.
 """
 
 LARGEST = 22.5
-"""Largest squared motion in its prior's standard deviations (99.9 % of six degrees of freedom). More would be needed to make up for an
-image that was resized to another shape, which is another camera.
+"""Largest squared motion, in standard deviations of its prior (chi-squared at 99.9 %, six degrees of freedom).
+
+A larger motion would stand in for the camera of an image that was resized to another shape.
 """
 NEGLIGIBLE = 1e-3
 """Probability of a motion below which it adds nothing to the doubt about a pose."""
 TURNED = 0.1
-"""Share of these whose rows run the other way than the shape of the image says: parts of images, turned square ones, other sensors."""
+"""Share of these whose rows run across those that the image's shape suggests: crops, turned square images, other sensors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +44,10 @@ class EvidentMotion:
 def evident_motion(
     data: ObservedPoints, fit: ReprojectionFit, correlation: float, camera: CalibrationPrior = NOMINAL
 ) -> EvidentMotion:
-    """Return the more probable of a camera at rest and one that moved, and the doubt that is left about the pose.
+    """Return the more probable of a camera at rest and one that moved, and the doubt about the pose that is left.
 
-    ``fit`` is one to these points. The intrinsics are free in both fits that are compared, as far as the prior ``camera`` leaves them
-    open: what they explain is no motion.
+    ``fit`` is a fit to these points. The intrinsics are free in all fits that are compared, as far as the prior ``camera``
+    leaves them open: what they explain is not a motion.
     """
     if len(data) < ENOUGH_POINTS:
         return EvidentMotion()
@@ -69,7 +71,7 @@ def evident_motion(
         return EvidentMotion()
     if max(of_moving, of_turned) < NEGLIGIBLE:
         return EvidentMotion()
-    # The pose is found with known intrinsics, so that the doubt about it is that of fits with the same ones.
+    # The pose is found with known intrinsics, so the doubt about it follows from fits with the same ones.
     still, moving, turned = (
         resect(points, fit.T_world_rig, found.noise, FIXED, fit.calibration, correlation, prior)
         for points, found, prior in (
@@ -88,11 +90,11 @@ def evident_motion(
 def _log_evidence(
     data: ObservedPoints, moving: ReprojectionFit, still: ReprojectionFit, motion: MotionPrior, correlation: float
 ) -> float:  # fmt: skip
-    """Return the logarithm of how many times as much evidence there is for a motion as for none."""
+    """Return the logarithm of the Bayes factor of a motion against none."""
     return log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
 
 
 def _square(fit: ReprojectionFit, other: ReprojectionFit) -> Float[Tensor, "6 6"]:
-    """Return the square of the right update from one fit to another."""
+    """Return the outer product of the right update from one fit to another with itself."""
     shift = (fit.T_world_rig.inverse() @ other.T_world_rig).log()
     return torch.outer(shift, shift)

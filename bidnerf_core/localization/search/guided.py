@@ -95,7 +95,7 @@ class ProjectedLandmarks:
     def matches(
         self, radius: float, most_distance: float, shift: tuple[float, float] = (0.0, 0.0)
     ) -> LandmarkMatches:
-        """Return matches as ``guided_matches`` does; with keypoints that are shifted (pixels), all matches are due to chance."""
+        """Return matches as ``guided_matches`` does; if keypoints are shifted (pixels), all matches are due to chance."""
         observed = (self._image.rays[:, :2] * self._image.focal + torch.tensor(shift)).float()
         keypoint, found = self._near(observed, radius)
         keypoints = self._image.keypoints
@@ -111,7 +111,7 @@ class ProjectedLandmarks:
     def _near(
         self, observed: Float[Tensor, "k 2"], radius: float
     ) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
-        """Return the indices of keypoints and projections that are within ``radius`` (pixels) of one another, pairwise."""
+        """Return the pairs of keypoints and projections within ``radius`` (pixels) of each other, as two lists of indices."""
         if self._tree is None or not len(observed):
             return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
         _, found = self._tree.query(observed.numpy(), k=CANDIDATES, distance_upper_bound=radius)
@@ -121,7 +121,7 @@ class ProjectedLandmarks:
 
 
 def _image_pixels(pixels: Float[Tensor, "m 2"], image: QueryImage) -> Float[Tensor, "m 2"]:
-    """Return where pixels from the principal point, by the mean focal length, are in the image, but for its distortion."""
+    """Convert pixels from the principal point, at the mean focal length, to pixels of the image; distortion is neglected."""
     camera = image.intrinsics
     across = torch.tensor([camera.fx, camera.fy]) / image.focal
     return pixels * across + torch.tensor([camera.cx, camera.cy])
@@ -130,7 +130,7 @@ def _image_pixels(pixels: Float[Tensor, "m 2"], image: QueryImage) -> Float[Tens
 def _visible(
     image: QueryImage, landmarks: LandmarkMap, T_world_camera: SE3, local: Tensor, focal: float, margin: float
 ) -> Bool[Tensor, "n"]:
-    """Return which landmarks are in front of the camera, inside its image, and seen from about a mapped direction."""
+    """Return which landmarks are in front of the camera, inside its image, and seen roughly from a mapped direction."""
     camera = image.intrinsics
     half = torch.tensor([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
     # Distortion moves the edges of the image. A generous margin does no harm: landmarks outside match no keypoint.
@@ -146,7 +146,7 @@ def _visible(
 def _hidden(
     hidden: Bool[Tensor, "h w"], local: Float[Tensor, "m 3"], camera: Intrinsics
 ) -> Bool[Tensor, "m"]:
-    """Return which points before a camera appear in its hidden pixels, but for its distortion."""
+    """Return which points in front of a camera project to its hidden pixels; distortion is neglected."""
     column = (local[:, 0] / local[:, 2] * camera.fx + camera.cx).floor().clamp(-1, camera.width).long()
     row = (local[:, 1] / local[:, 2] * camera.fy + camera.cy).floor().clamp(-1, camera.height).long()
     within = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

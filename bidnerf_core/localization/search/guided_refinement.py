@@ -52,13 +52,14 @@ LOOSE = 1.3
 DEPTH_OFF = 0.1
 """Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
 CERTAIN, CERTAIN_BY_OTHERS = 0.999, 0.98
-"""Probability that the given intrinsics are wrong above which the estimated ones are taken, by keypoints alone and where other
-measurements support it.
+"""Probability that the given intrinsics are wrong above which the estimated ones are taken: by keypoints alone, and where other
+measurements provide evidence too.
 """
 POSSIBLE, PROBABLE = 0.1, 0.5
-"""Probabilities that an image is a part of one from which on its principal point is free in the fit that judges the intrinsics,
-which then are doubtful, and from which on the principal point may be estimated. Where the focal length is approximate, so that it is
-estimated anyway, the principal point is from the first one on.
+"""Probabilities that an image is a crop: thresholds for its principal point.
+
+Above the first, the principal point is free in the fit that judges the intrinsics, which are then doubtful; above the second,
+it may be estimated. Where the focal length is approximate, and therefore estimated anyway, the first is enough for that.
 """
 MOST_DISTANCE = (0.5 * NORM) ** 2
 """Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
@@ -90,7 +91,7 @@ def refined_pose(
 ) -> GuidedPose:
     """Refine the pose on the inliers, then on guided matches within shrinking radii until they no longer change.
 
-    ``prior``: how uncertain the given intrinsics are before they are judged, if more than those of the query.
+    ``prior``: how uncertain the given intrinsics are before they are judged, if more than ``query`` states.
     """
     prior = query.prior if prior is None else prior
     most = usual_distance(query, inliers)
@@ -124,9 +125,9 @@ def _settled(
     most: float,
     prior: CalibrationPrior,
 ) -> GuidedPose:
-    """Refine a pose on guided matches, with the given intrinsics unless the matches contradict them for certain.
+    """Refine a pose on guided matches, with the given intrinsics unless the matches clearly contradict them.
 
-    ``prior`` says how uncertain they are before that is known.
+    ``prior`` is the uncertainty of the intrinsics before they are judged.
     """
     fit, found = _guided(query, prior, fit, found, most, RADII)
     open_camera = prior.log_focal > 0
@@ -171,7 +172,7 @@ def _settled(
 def _evident_motion(
     query: LandmarkQuery, free: ReprojectionFit, found: LandmarkMatches, camera: CalibrationPrior
 ) -> EvidentMotion:
-    """Return the motion of a single image's camera; the views of a rig may be of different moments and are taken as still."""
+    """Return the motion of a single image's camera; a rig, whose views may be from different moments, counts as still."""
     if not query.moving or len(query.images) > 1:
         return EvidentMotion()
     return evident_motion(query.observed(found), free, query.landmarks.correlation_of(len(found)), camera)
@@ -184,9 +185,9 @@ def _with_free_camera(
     open_camera: bool,
     motion: MotionPrior = STILL,
 ) -> tuple[ReprojectionFit, float]:
-    """Return a fit of the intrinsics along with the pose, and the probability that the image is a part of one.
+    """Return a fit of the intrinsics along with the pose, and the probability that the image is a crop.
 
-    If it may well be, its principal point is free. ``open_camera`` says that nothing is known of the focal length.
+    If it may well be one, its principal point is free. ``open_camera``: whether nothing is known about the focal length.
     """
     data, correlation = query.observed(found), query.landmarks.correlation_of(len(found))
     part, whole = (
@@ -232,7 +233,7 @@ def _changed(a: LandmarkMatches, b: LandmarkMatches) -> float:
 
 
 def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
-    """Return which correspondences have a landmark that fits the depth measured at the keypoint, or no measured depth."""
+    """Return which correspondences agree with the depth at the keypoint, up to a common factor, or have no measured depth."""
     z = data.in_camera(T_world_rig)[:, 2]
     known = data.depth > 0
     ratio = torch.where(known, z / torch.where(known, data.depth, 1), 1)

@@ -26,7 +26,7 @@ class SearchStage:
     pivot: Pivot
     steps: int
     keep: int
-    damping: float  # at first
+    damping: float  # of the first step
     # The score by which poses are compared after the steps; None: the cost.
     score: Callable[[SE3], Float[Tensor, "h"]] | None = None
 
@@ -53,9 +53,9 @@ class SearchResult:
 
     T: SE3  # (h), best first
     scores: Float[Tensor, "h"]
-    margin: float  # score of the best different pose less that of the best; infinite where there was none
+    margin: float  # score of the best different pose minus that of the best; infinite where there was none
     path: SE3  # (s + 1): from the winning hypothesis to the best pose
-    losses: Float[Tensor, "s"]  # of the path before each step; costs of different stages do not compare
+    losses: Float[Tensor, "s"]  # of the path before each step; costs of different stages are not comparable
 
 
 def search(

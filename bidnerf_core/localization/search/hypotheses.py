@@ -32,9 +32,9 @@ class Surroundings:
 def hypotheses_for_points(known: Surroundings, start: SE3 | None, count: int, generator: Generator) -> SE3:
     """Return ``count`` poses from which measured points may fit the surface.
 
-    Half are keyframes, moved a little. The other half put the middle of the measured points on the middle of the scene, as
-    is right where cameras look at an object; three quarters of their orientations are near those of keyframes, and a quarter
-    are uniformly random. If there is a start, a quarter of all poses are the start and poses near it.
+    Half are keyframes, moved a little. The other half put the middle of the measured points on the middle of the scene, which
+    suits cameras that look at an object; three quarters of their orientations are near those of keyframes, and a quarter are
+    uniformly random. If there is a start, a quarter of all poses are the start and poses near it.
     """
     spread = _deviation(0.1 * known.extent, 0.25)
     near = [] if start is None else [_about(start, known.pivot, max(1, count // 4), spread, generator)]

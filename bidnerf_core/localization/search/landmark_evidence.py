@@ -18,7 +18,7 @@ from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 LEAST_DEPTHS = 6
-"""Least number of measured depths that give a depth scale."""
+"""Least number of measured depths that determine a depth scale."""
 CELLS = 8
 """Rows and columns into which an image is divided to see how far the correspondences spread."""
 

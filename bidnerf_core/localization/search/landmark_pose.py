@@ -20,8 +20,10 @@ from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.se3 import SE3
 
 ESTIMATED_INFLATION = 3.0
-"""Factor on the covariance of poses whose intrinsics were estimated along: errors of landmarks and of lenses, which the right intrinsics
-hide, shift the estimate. With it, 148 of 155 such poses lie inside their 95 % bound in the record ``faults_camera``.
+"""Factor on the covariance of poses whose intrinsics were estimated too.
+
+Errors of landmarks and of lenses, which matter less where the intrinsics are known, shift the estimate. With this factor, 148
+of 155 such poses lie inside their 95 % bound in the record ``faults_camera``.
 """
 
 
@@ -29,16 +31,16 @@ hide, shift the estimate. With it, 148 of 155 such poses lie inside their 95 % b
 class Unguided:
     """Matches by descriptors alone, before there was a pose."""
 
-    matches: ObservedPoints  # as the given intrinsics have them
+    matches: ObservedPoints  # with the given intrinsics
     limit: float  # pixels: largest residual of one that agrees with a pose
 
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """Another pose that about as many landmarks agree with."""
+    """Another pose with which about as many landmarks agree."""
 
     T_world_rig: SE3
-    share: float  # of the number of correspondences at the pose itself, those by chance left out of both
+    share: float  # ratio of its correspondences to those of the pose itself, those by chance left out of both
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,15 +48,15 @@ class LandmarkPose:
     """A pose found by landmarks, its covariance, and the evidence for it."""
 
     T_world_camera: SE3  # of the last view, float64
-    # Of the right update, translation (metres) first: the errors of keypoints, landmarks, calibration, and of the poses
-    # of the map's own images.
+    # Of the right update, translation (metres) first: due to the errors of keypoints, landmarks and calibration, and of the
+    # poses of the map's own images.
     covariance: Float[Tensor, "6 6"]
-    map_covariance: Float[Tensor, "6 6"]  # the part of it that is of the poses of the map's own images
-    noise: float  # pixels: standard deviation of the reprojection errors along each axis, robustly
+    map_covariance: Float[Tensor, "6 6"]  # the part of it due to the poses of the map's own images
+    noise: float  # pixels: robust standard deviation of the reprojection errors along each axis
     correspondences: LandmarkMatches  # those that the pose was refined on
     residuals: Float[Tensor, "m 2"]  # pixels, of the correspondences
     normalized_residuals: Float[Tensor, "m 2"]  # the same in standard deviations, those of landmarks included
-    pixels: Float[Tensor, "m 2"]  # where the correspondences were observed, as the image has them
+    pixels: Float[Tensor, "m 2"]  # where the correspondences were observed, in pixels of their images
     matches: int  # by descriptors alone, before there was a pose
     agreeing: int  # of those, how many agree with the pose
     # Logarithm of the number of as good agreements expected by chance (Moisan and Stival 2004).
@@ -69,17 +71,17 @@ class LandmarkPose:
         Calibration  # of the camera: estimated, or that of the map's images if their intrinsics were taken
     )
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
-    slope: Float[Tensor, "6 4"]  # right update of the pose by a unit of each of them
+    slope: Float[Tensor, "6 4"]  # derivative of the pose (right update) with respect to each of them
     # Of the camera while its rows were exposed, see ``rolling_shutter``; 0 if none is evident.
     motion: Float[Tensor, "6"]
-    motion_covariance: Float[Tensor, "6 6"]  # the part of the pose's covariance that is of the motion
+    motion_covariance: Float[Tensor, "6 6"]  # the part of the pose's covariance due to the motion
     miscalibration: Miscalibration
     calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
-    unguided: Unguided | None = None  # what tells another camera; None for landmarks that were followed
-    has_other_camera: bool = False  # one that far more matches agree with than with the given one
-    twin: Twin | None = None  # where it was sought: another pose that about as many landmarks agree with
+    unguided: Unguided | None = None  # what reveals another camera; None for landmarks that were followed
+    has_other_camera: bool = False  # whether far more matches agree with this camera than with the given one
+    twin: Twin | None = None  # if sought and found: another pose with which about as many landmarks agree
     stretch: Stretch = UNSTRETCHED  # of the given intrinsics; ``calibration`` corrects the stretched ones
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
@@ -94,7 +96,7 @@ class LandmarkPose:
 
     @property
     def focal_factor(self) -> float:
-        """True over given focal length; the geometric mean of those across and down where the image was stretched."""
+        """Ratio of the estimated to the given focal length; of a stretched image, the geometric mean across and down."""
         return self.calibration.focal_factor * math.sqrt(self.stretch.across * self.stretch.down)
 
     def intrinsics_of(self, given: Intrinsics) -> Intrinsics | None:
@@ -132,7 +134,7 @@ class LandmarkPose:
 
     @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:
-        """The covariance with that of the intrinsics, as they were given or as this image and this map show them."""
+        """The covariance, including that due to errors of the intrinsics, whether these were taken or estimated."""
         deviations = (
             self.calibration_scatter if self.estimates_calibration else self.miscalibration.deviations
         )
@@ -141,21 +143,21 @@ class LandmarkPose:
 
     @property
     def stated_covariance(self) -> Float[Tensor, "6 6"]:
-        """``full_covariance``, enlarged where the intrinsics were estimated along."""
+        """``full_covariance``, enlarged where the intrinsics were estimated too."""
         return (ESTIMATED_INFLATION if self.estimates_calibration else 1.0) * self.full_covariance
 
     def with_correction(self, correction: Float[Tensor, "4"]) -> SE3:
-        """Return the pose to which a correction of the intrinsics, in the order of ``Calibration``, would move it."""
+        """Return the pose after a correction of the intrinsics, in the order of ``Calibration``, which moves it."""
         return self.T_world_camera.retract(self.slope @ correction)
 
     @property
     def alternative_shift(self) -> Float[Tensor, "6"]:
-        """The right update of the pose with those intrinsics, given or the map's, that were not taken."""
+        """The right update by which the intrinsics that were not taken, given or the map's, would move the pose."""
         return self.slope @ self.miscalibration.alternative
 
     @property
     def unresolved_calibration(self) -> Float[Tensor, "6 6"]:
-        """What errors of the intrinsics that are usual, and that this image does not rule out, add to ``full_covariance``."""
+        """What usual errors of the intrinsics, as far as this image does not rule them out, add to ``full_covariance``."""
         if self.estimates_calibration:
             return torch.zeros_like(self.covariance)
         judged = self.miscalibration
@@ -168,7 +170,8 @@ class LandmarkPose:
     def shared_covariance(self) -> Float[Tensor, "6 6"]:
         """The part of the covariance that rendered rays and measured points have in common with the landmarks.
 
-        It is that of the poses of the map's own images and of the motion, at most nine tenths of the whole in any direction.
+        It is due to the poses of the map's own images and to the motion. The part of the motion is at most nine tenths of all
+        that is not due to the map, in any direction.
         """
         rest = self.covariance - self.map_covariance
         root = torch.linalg.inv(torch.linalg.cholesky(rest))

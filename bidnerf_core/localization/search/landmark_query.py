@@ -1,4 +1,4 @@
-"""The images of a query, the landmarks to find in them, and what is known of the camera."""
+"""The images of a query, the landmarks to find in them, and what is known about the camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ THRESHOLD = 0.005
 
 @dataclass(frozen=True, eq=False)
 class LandmarkQuery:
-    """The images of a query, the landmarks to find in them, and what is known of the camera."""
+    """The images of a query, the landmarks to find in them, and what is known about the camera."""
 
     images: list[QueryImage]
     landmarks: LandmarkMap
@@ -44,7 +44,7 @@ class LandmarkQuery:
         return self.map_camera_near(GIVEN)
 
     def map_camera_near(self, estimated: Calibration) -> MapCamera | None:
-        """Return ``map_camera``, turned to the side to which an estimated correction points where it was turned."""
+        """Return ``map_camera``; if it is turned, an estimated correction decides to which side."""
         given = {image.intrinsics for image in self.images}
         if len(given) > 1:
             return None

@@ -35,8 +35,8 @@ APPROXIMATE = 0.05
 LEAST_INLIERS = 6
 """Least number of inliers for a pose to be refined at all."""
 MANY_VISIBLE, CONTRADICTED = 200, 1.5
-"""The number of visible landmarks from which on they can contradict a pose, and how many times as many as by chance have to
-match for them not to.
+"""Least number of visible landmarks that can contradict a pose, and multiple of the matches by chance that must match for them
+not to contradict it.
 """
 
 
@@ -52,10 +52,10 @@ def propose(
 ) -> LandmarkPose | None:
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
-    ``prior`` says how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal
-    length is approximate. One correction is estimated for all views; those of different cameras are taken as given.
-    ``evidence``: what else is known of the camera. ``seek_twin`` says to look for another place that the images may show, and
-    ``moving`` to estimate how the camera moved while the rows of its image were exposed, where that is evident.
+    ``prior``: how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal length
+    is approximate. One correction is estimated for all views; those of different cameras are taken as given. ``evidence``: what
+    else is known about the camera. ``seek_twin``: whether to look for another place that the images may show. ``moving``:
+    whether to estimate how the camera moved while the rows of its image were exposed, where that is evident.
     Raises ``InputError`` if there is no view.
     """
     if not views:
@@ -78,7 +78,7 @@ def propose(
 
 @dataclass(frozen=True, eq=False)
 class Confirmation:
-    """What landmarks say about a pose that was found by other means."""
+    """The landmarks' evidence about a pose that was found by other means."""
 
     pose: LandmarkPose | None  # refined on the landmarks that match near it; None if too few do
     visible: int  # landmarks that should be visible there
@@ -110,7 +110,7 @@ def confirm(
     clock.lap("refinement")
     if answer is None:
         return Confirmation(None, visible, matches, chance)
-    # Matches that were not sought near the pose are the evidence for it, and tell another camera.
+    # Matches that were not sought near the pose are the evidence for it, and reveal another camera.
     pose = described(query, unguided_matches(query.images, matcher, STRONGEST), answer, clock.seconds)
     agreeing = int((torch.linalg.vector_norm(pose.residuals, dim=-1) <= query.threshold).sum())
     pose = replace(pose, matches=len(pose.correspondences), agreeing=agreeing)

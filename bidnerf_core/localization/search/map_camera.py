@@ -1,7 +1,7 @@
 """The cameras of a map's own images, as an alternative to the intrinsics that a query states.
 
-Who localizes with the camera that made the map may state it a little differently, after another calibration or as the
-manufacturer does. The map was fitted to the intrinsics of its own images, so that these are right for such a query.
+A query from the camera that made the map may state slightly different intrinsics, from another calibration or from the
+manufacturer. The map was fitted to the intrinsics of its own images, so these are right for such a query.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from bidnerf_core.mapping.calibration import (
 )
 
 MOST_CAMERAS = 9
-"""Number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
+"""Largest number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
 MOST_RESIDUAL = 0.002
 """Root mean square difference, as a share of the image's width, above which a correction does not describe another camera."""
 UNUSUAL = 0.03
-"""Share of the map's images up to which a camera among theirs is at the edge of one that focuses, rather than another one."""
+"""Share of the map's images up to which an agreeing camera is taken for an extreme of one that focuses, not for another one."""
 GRID = 7
 """Rows and columns of pixels at which cameras are compared."""
 TOLD_APART = 2.0
@@ -41,12 +41,12 @@ SAME_CAMERA = 0.9
 """Share of queries with nearly the map's intrinsics that are from the map's camera."""
 SAME_LOG_ODDS = math.log(SAME_CAMERA / (1 - SAME_CAMERA))
 OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1)
-"""Standard deviations between the intrinsics of different cameras of one shape of image."""
+"""Standard deviations of the differences between the intrinsics of different cameras with images of the same shape."""
 ALIKE, ALIKE_SHAPES = CalibrationPrior(log_focal=0.04, shift=0.04), 0.02
 """Largest differences between intrinsics that were estimated from an image and those of the map's camera, if it took the image."""
 MOST_DEVIATIONS = 1.5
-"""Differences of so many times ``OTHER_CAMERA``, or of ``NOMINAL`` where the focal length is approximate, are those of another
-camera for certain.
+"""Intrinsics that differ by more than this multiple of ``OTHER_CAMERA``, or of ``NOMINAL`` where the focal length is
+approximate, are certainly those of another camera.
 """
 
 
@@ -60,7 +60,7 @@ class MapCamera:
 
     @property
     def differs(self) -> Bool[Tensor, "4"]:
-        """In which parameters the intrinsics differ."""
+        """Which parameters of the intrinsics differ."""
         return self.correction.abs() > TOLD_APART * self.deviations
 
     @property
@@ -70,7 +70,7 @@ class MapCamera:
 
     @property
     def log_odds(self) -> float:
-        """Logarithm of the odds, before an image is looked at, that the map's intrinsics are right and not the stated ones.
+        """Prior log odds that the map's intrinsics are right rather than the stated ones.
 
         Either the query is from the map's camera and misstates it, or it is from another camera with similar intrinsics.
         """
@@ -82,11 +82,11 @@ class MapCamera:
         return float(misstated - self._log_density(OTHER_CAMERA)) + SAME_LOG_ODDS
 
     def is_near(self, prior: CalibrationPrior) -> bool:
-        """Return whether the intrinsics differ by no more than those of different cameras may, where they are stated so well."""
+        """Return whether the intrinsics differ by no more than ``MOST_DEVIATIONS`` standard deviations of ``prior``."""
         return bool((self.correction.abs() <= MOST_DEVIATIONS * prior.deviations).all())
 
     def _log_density(self, prior: CalibrationPrior) -> Float[Tensor, ""]:
-        """Return the logarithm of the density of the parameters that differ, but for a constant."""
+        """Return the logarithm of the density of the parameters that differ, up to a constant."""
         deviations = prior.deviations
         return (-0.5 * (self.correction / deviations).square() - deviations.log())[self.differs].sum()
 
@@ -99,8 +99,9 @@ def map_camera(
     It is the one that the given intrinsics agree with or, if that took hardly any of the images, that with the median focal
     length. None as well if its lens is so different that ``Calibration`` cannot describe the difference.
 
-    A camera that took landscape images alone is turned for a portrait one, to the side that puts its principal point nearest to that of the
-    correction ``near``. With ``crops``, an image of a shape that the map does not have is compared with centre crops of the map's images.
+    A camera that took landscape images alone is turned for a portrait one, to the side that puts its principal point nearest to
+    that of the correction ``near``. With ``crops``, an image of a shape that the map does not have is compared with centre
+    crops of the map's images.
     """
     groups = cameras_at_size(cameras, given.width, given.height)
     if crops and not groups:
@@ -133,7 +134,7 @@ def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCame
 def camera_like(
     fitted: Intrinsics, cameras: tuple[Intrinsics, ...], log_focal_deviation: float = 0.0
 ) -> Intrinsics | None:
-    """Return the camera of a map's images that is like ``fitted`` intrinsics, resized to their image whatever its shape, or None.
+    """Return the camera of a map's images that resembles ``fitted`` intrinsics once resized to their image; None if none does.
 
     ``log_focal_deviation``: standard deviation of the logarithm of their focal length, which was estimated from a single image.
     """
@@ -150,7 +151,7 @@ def camera_like(
 
 
 def _agree(a: Intrinsics, b: Intrinsics) -> bool:
-    """Return whether two intrinsics differ by no more than two good calibrations of one camera."""
+    """Return whether two intrinsics differ by no more than two good calibrations of the same camera may."""
     known, size = CALIBRATED, max(len(a.distortion), len(b.distortion))
     parts = [
         (math.log(a.fx / b.fx), known.log_focal), (math.log(a.fy / b.fy), known.log_focal),
@@ -164,14 +165,15 @@ def _agree(a: Intrinsics, b: Intrinsics) -> bool:
 def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "4"] | None:
     """Return the correction of ``given`` intrinsics, in the order of ``Calibration``, that comes closest to ``true`` ones.
 
-    The squares of the differences in pixels are least. None if these stay considerable.
+    It minimizes the squared differences in pixels. None if these remain considerable.
     """
     true = true.resized(given.width, given.height)
     u, v = (torch.linspace(0, size, GRID, dtype=torch.float64) for size in (given.width, given.height))
     pixels = torch.stack(torch.meshgrid(u, v, indexing="ij"), dim=-1).reshape(-1, 2)
     stated, real = (camera.unproject(pixels)[:, :2] for camera in (given, true))
     steps = torch.eye(2, dtype=torch.float64)
-    # The derivative of the plane by the pixels of the given camera, whose inverse turns differences into pixels.
+    # Derivative of points on the plane z = 1 with respect to the given camera's pixels; its inverse converts differences
+    # between such points to pixels.
     slope = torch.stack([given.unproject(pixels + step)[:, :2] - stated for step in steps], dim=-1)
     bend = real * real.square().sum(-1, keepdim=True)
     # stated = factor real + shift + factor radial bend, as in ``Calibration.pixels``

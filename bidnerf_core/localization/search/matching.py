@@ -35,7 +35,7 @@ class LandmarkMatcher:
     Above ``EXHAUSTIVE`` landmarks it uses an inverted file: k-means divides the landmarks into about sqrt(n) cells, and only the
     cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a matcher.
 
-    Descriptors are compared where those of ``landmarks`` lie; everything else that is done with landmarks is done on the CPU.
+    Descriptors are compared on the device of those of ``landmarks``; all else that is done with landmarks is done on the CPU.
     """
 
     def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""Whether an image shows the scene as in a mirror, which front cameras and wrong readers produce."""
+"""Evidence that an image shows the scene as in a mirror: front cameras and faulty readers produce such images."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ KEYPOINTS = 700
 SUSPICIOUS = -150.0
 """Logarithm of the number of false alarms below which an image is not compared with its mirror image."""
 SIGNIFICANT, DECISIVE, CLEAR = -30.0, 2.0, 1.5
-"""Logarithm of the number of false alarms below which a mirror image is recognised; how many times that of the image it has to
-be for the image to be mirrored; and how many times that of the mirror image that of the image has to be for it not to be.
-Symmetric things resemble their mirror images.
+"""Logarithm of the number of false alarms below which a mirror image is recognised; the image is mirrored if that logarithm is
+below ``DECISIVE`` times its own, and ambiguous if its own is above ``CLEAR`` times that of the mirror image. Symmetric things
+resemble their mirror images.
 """
 
 
@@ -37,10 +37,10 @@ class MirrorEvidence:
     log10_nfa: float  # logarithm of the number of such agreements expected by chance
 
     def rejection(self, log10_nfa: float) -> Verdict | None:
-        """Return why a pose of the image with this ``log10_nfa`` is rejected, or None.
+        """Return a rejection of a pose of the image with this ``log10_nfa``, or None.
 
         The image is mirrored if its mirror image is recognised and matches much better. If neither matches much better than
-        the other, the image does not tell.
+        the other, the pose is ambiguous.
         """
         if self.log10_nfa >= SIGNIFICANT:
             return None

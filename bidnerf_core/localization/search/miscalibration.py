@@ -1,4 +1,4 @@
-"""Whether the given intrinsics of a camera are wrong, judged by those that fit an image best."""
+"""The probability that a camera's given intrinsics are wrong, judged by those that fit an image best."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from bidnerf_core.mapping.resection import ReprojectionFit
 Mixture = tuple[tuple[CalibrationPrior, float], ...]
 """Priors and their shares."""
 MISTAKES_AND_CROPS: Mixture = ((MISTAKEN, MISTAKES), (CROPPED, CROPS))
-"""Priors of the correction of intrinsics that are wrong, and the shares of cameras that they are of."""
+"""Priors of the correction of intrinsics that are wrong, and the shares of cameras to which they apply."""
 WRONG_SHARE = sum(share for _, share in MISTAKES_AND_CROPS)
 """Share of cameras whose intrinsics are wrong."""
 MIXTURE: Mixture = ((CALIBRATED, 1 - USUALLY - WRONG_SHARE), (USUAL, USUALLY), *MISTAKES_AND_CROPS)
-"""Prior of the correction of given intrinsics: they are calibrated, off as usual, or wrong."""
+"""Prior of the correction of given intrinsics, which are calibrated, as inexact as usual, or wrong."""
 LIKELY = 0.8
-"""Probability from which on an image whose focal length is approximate is taken to be from the map's camera."""
+"""Probability above which an image whose focal length is approximate is taken to be from the map's camera."""
 
 
 @dataclass(frozen=True)
 class CameraEvidence:
-    """Logarithms of odds about the camera of an image, by other measurements than the positions of its keypoints."""
+    """Log odds about the camera of an image, by measurements other than the positions of its keypoints."""
 
-    map_camera: float = 0.0  # that the map's intrinsics are right and not the given ones
-    mistaken: float = 0.0  # that those that fit the keypoints best are right and not the ones taken
+    map_camera: float = 0.0  # that the map's intrinsics are right rather than the given ones
+    mistaken: float = 0.0  # that those that fit the keypoints best are right rather than the ones taken
 
 
 NO_EVIDENCE = CameraEvidence()
-"""Nothing but the positions of keypoints is known."""
+"""No evidence other than the positions of keypoints."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ class TakenIntrinsics:
 
     @property
     def log_odds_of_mistake(self) -> float:
-        """Logarithm of the odds, before an image is looked at, that the intrinsics taken are wrong.
+        """Prior log odds that the intrinsics taken are wrong.
 
-        Intrinsics that are also those of the map's images are mistaken only for another camera's image.
+        If they are also those of the map's images, they are wrong only where the image is from another camera.
         """
         share = WRONG_SHARE * (1 - SAME_CAMERA) if self.as_map else WRONG_SHARE
         return math.log(share / (1 - share))
@@ -82,7 +82,7 @@ class Miscalibration:
     """
 
     apparent: Float[Tensor, "4"]  # the correction that fits best, in the order of ``Calibration``
-    noise: Float[Tensor, "4"]  # standard deviations of that estimate by the noise of the keypoints
+    noise: Float[Tensor, "4"]  # standard deviations of that estimate due to the noise of the keypoints
     probability: Float[Tensor, "4"]  # that the parameter taken is wrong
     unresolved: Float[
         Tensor, "4"
@@ -92,7 +92,7 @@ class Miscalibration:
 
     @staticmethod
     def unknown() -> Miscalibration:
-        """Return that of intrinsics that no image has been compared with."""
+        """Return the miscalibration of intrinsics that have not been compared with an image."""
         zero = torch.zeros(4, dtype=torch.float64)
         return Miscalibration(zero, zero, zero, USUAL.deviations, zero, zero[0])
 
@@ -106,8 +106,8 @@ class Miscalibration:
     ) -> Miscalibration:
         """Judge the intrinsics ``taken`` by a fit in which they were free.
 
-        ``other_log_odds``: logarithm of the odds that they are wrong, by other measurements; it counts for each parameter.
-        ``right``: how uncertain those are that are not wrong.
+        ``other_log_odds``: log odds that they are wrong, by other measurements; they count for each parameter.
+        ``right``: how uncertain intrinsics are that are not wrong.
         """
         value, noise = _estimate(free, landmarks)
         value = value - _as_tensor(taken.calibration)
@@ -125,9 +125,9 @@ class Miscalibration:
         return (CALIBRATED.deviations.square() + self.probability * self.apparent.square()).sqrt()
 
     def prior(self, right: CalibrationPrior, cropped: bool) -> CalibrationPrior:
-        """Return how uncertain the intrinsics are where those that are probably wrong are unknown, and the others ``right``.
+        """Return a prior that leaves open the parameters that are probably wrong, and takes the others from ``right``.
 
-        ``cropped`` says that the image is probably a part of one.
+        ``cropped``: whether the image is probably a crop.
         """
         focal, u, v, radial = (self.probability > 0.5).tolist()
         unknown = ANY if cropped else NOMINAL
@@ -153,8 +153,8 @@ def taken_intrinsics(
 ) -> TakenIntrinsics:
     """Return the more probable of the given intrinsics and those of the map's ``camera``, by a fit in which they were free.
 
-    ``approximate`` says that the given focal length is; the given intrinsics then leave the calibration to be estimated.
-    ``other_log_odds``: logarithm of the odds that the map's camera is right, by other measurements.
+    ``approximate``: whether the given focal length is; taking the given intrinsics then means estimating the calibration.
+    ``other_log_odds``: log odds that the map's camera is right, by other measurements.
     """
     if camera is None:
         return TakenIntrinsics()
@@ -177,10 +177,9 @@ def taken_intrinsics(
 def probability_of_map_camera(
     free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera, other_log_odds: float = 0.0
 ) -> float:
-    """Return the probability that an image was taken by the map's ``camera`` and not by one with the given intrinsics.
+    """Return the probability that an image was taken by the map's ``camera`` rather than by one with the given intrinsics.
 
-    The image is represented by a fit in which the intrinsics were free. ``other_log_odds``: logarithm of the odds by other
-    measurements.
+    The image is represented by a fit in which the intrinsics were free. ``other_log_odds``: log odds by other measurements.
     """
     value, noise = _estimate(free, landmarks)
     by_given = torch.stack([
@@ -193,7 +192,7 @@ def probability_of_map_camera(
 def probability_beside_approximate(
     free: ReprojectionFit, landmarks: LandmarkMap, camera: MapCamera, other_log_odds: float = 0.0
 ) -> float:
-    """Return the same probability where the given focal length is approximate, so that only the image tells it."""
+    """Return ``probability_of_map_camera`` where the given focal length is approximate, so only the image determines it."""
     if not camera.is_near(NOMINAL):
         return 0.0
     value, noise = _estimate(free, landmarks)
@@ -207,7 +206,7 @@ def probability_beside_approximate(
 def _log_density_by(
     camera: MapCamera, value: Float[Tensor, "4"], noise: Float[Tensor, "4"]
 ) -> Float[Tensor, "4"]:
-    """Return the logarithm of the density of an estimate if the image is from the map's camera; constants left out."""
+    """Return the logarithm of the density of an estimate if the image is from the map's camera, up to a constant."""
     total = camera.deviations.square() + noise
     return -0.5 * ((value - camera.correction).square() / total + total.log())
 
@@ -219,12 +218,12 @@ def probability_of_crop(
     log_ratio: float,
     open_camera: bool,
 ) -> float:
-    """Return the probability that an image is a part of one.
+    """Return the probability that an image is a crop of a larger one.
 
-    ``part`` is a fit whose principal point was free, and ``whole`` one whose focal length was, with the prior ``NOMINAL``. The prior of
-    the first is ``CROPPED``, or ``ANY`` with an ``open_camera``. ``log_ratio``: logarithm of how many times as likely the keypoints are
-    with the first. The prior odds are those among images whose intrinsics are wrong, also with an ``open_camera``: a principal point
-    that is estimated in vain costs little there.
+    ``part`` is a fit whose principal point was free, with the prior ``CROPPED``, or ``ANY`` with an ``open_camera``; ``whole``
+    is one whose focal length was free, with the prior ``NOMINAL``. ``log_ratio``: logarithm of their likelihood ratio, the
+    first over the second. The prior odds are those among images whose intrinsics are wrong, even with an ``open_camera``: a
+    principal point that is estimated needlessly costs little there.
     """
     value, noise = _estimate(part, landmarks)
     factor = part.calibration.focal_factor  # shares of the given focal length become those of the true one
@@ -238,7 +237,7 @@ def probability_of_crop(
 
 
 def _log_occam_factor(fit: ReprojectionFit, prior: CalibrationPrior) -> float:
-    """Return the logarithm of a fit's Occam factor (MacKay 2003, ch. 28), but for a constant: prior density times posterior width.
+    """Return the log of a fit's Occam factor (MacKay 2003, ch. 28), up to a constant: prior density times posterior width.
 
     The likelihood of the fit times this factor is the evidence for its ``prior``, in Laplace's approximation. The width is that of
     independent parameters, and the pose, which is free in all fits, is left out.
@@ -249,7 +248,7 @@ def _log_occam_factor(fit: ReprojectionFit, prior: CalibrationPrior) -> float:
 
 
 def unresolved_deviations(apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
-    """Return the standard deviations about zero of the true corrections, seen as ``apparent`` with the variances ``noise``."""
+    """Return the standard deviations about zero of true corrections estimated as ``apparent`` with the variances ``noise``."""
     prior = torch.stack([part.deviations.square() for part, _ in MIXTURE])
     total = prior + noise
     weights = torch.softmax(_log_joint(MIXTURE, apparent, noise), dim=0)
@@ -267,7 +266,7 @@ def _log_joint(
 def _log_density(
     prior: CalibrationPrior, apparent: Float[Tensor, "4"], noise: Float[Tensor, "4"]
 ) -> Float[Tensor, "4"]:
-    """Return the logarithm of the density of each estimate with the variances ``noise``, but for a constant."""
+    """Return the logarithm of the density of each estimate with the variances ``noise``, up to a constant."""
     total = prior.deviations.square() + noise
     return -0.5 * (apparent.square() / total + total.log())
 

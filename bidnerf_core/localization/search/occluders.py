@@ -17,7 +17,7 @@ from bidnerf_core.mapping.casting import cast
 from bidnerf_core.se3 import SE3
 
 JUMP = 0.05
-"""Relative difference of the depths of neighbouring pixels from which on they belong to different things."""
+"""Relative difference of the depths of neighbouring pixels above which they belong to different things."""
 CONSIDERABLE, REST = 0.15, 0.05
 """Least share of the measured pixels in an occluder, and in the rest."""
 LEAST_PIXELS = 50
@@ -25,7 +25,7 @@ LEAST_PIXELS = 50
 PROBED_POINTS = 300
 """Largest number of points of an occluder that are compared with the surface."""
 CLEARLY_BEFORE = 0.02
-"""Distance before the surface (share of the scene's extent) up to which a point still lies on it."""
+"""Distance in front of the surface (share of the scene's extent) up to which a point still lies on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Occluder:
 
     @torch.no_grad()
     def share_in_front(self, surface: SurfaceMap, T_world_camera: SE3) -> float:
-        """Return the share of its points that lie clearly before the surface, or before nothing, as seen from a pose."""
+        """Return the share of its points that lie clearly in front of the surface, or of nothing, as seen from a pose."""
         T = T_world_camera.to(surface.device)
         ends = T.apply(self.points.to(T.translation))
         lines = (ends - T.translation).float()
@@ -90,7 +90,7 @@ def _nearest(depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"] | None:
 
 
 def _pieces(depth: np.ndarray) -> np.ndarray:
-    """Return the number of the connected piece of each pixel, -1 where nothing was measured."""
+    """Return the number of the connected piece to which each pixel belongs, -1 where nothing was measured."""
     number, measured = np.arange(depth.size).reshape(depth.shape), (depth > 0) & np.isfinite(depth)
     depth = np.where(measured, depth, 0)
     pairs = []

@@ -1,4 +1,4 @@
-"""Poses with another camera than the given one: that of the map's images if it is like it, and else one estimated with the pose."""
+"""Poses with a camera other than the given one: the map's if it is similar, else one that is estimated with the pose."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.mapping.calibration import ANY, FIXED, Calibration, Stretch
 
 AS_MANY = 0.9
-"""Share of the matches that agree with another camera that still have to once its errors are weighed, or it is exactly the map's."""
+"""Share of the matches agreeing with another camera that must still agree after its refinement, or with the map's instead."""
 REFUTED = 0.5
-"""Probability that the map's intrinsics are wrong from which on they are not taken."""
+"""Probability that the map's intrinsics are wrong above which they are not taken."""
 
 
 def with_other_camera(
     query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose, clock: Stopwatch
 ) -> LandmarkPose:
-    """Return a pose again with the camera that far more of the ``matches`` by descriptors agree with, if there is one.
+    """Return a pose, found again with another camera if far more of the ``matches`` by descriptors agree with that.
 
-    Images of different cameras are taken as they are given.
+    Images from different cameras keep their given intrinsics.
     """
     if len({image.intrinsics for image in query.images}) > 1:
         return found
@@ -59,7 +59,7 @@ def with_other_camera(
 
 
 def _is_compared(query: LandmarkQuery) -> bool:
-    """Whether the map's camera is so near the given one that the two were compared already."""
+    """Return whether the map's camera is so near the given one that the two were compared already."""
     camera, prior = query.map_camera, OTHER_CAMERA if query.prior == FIXED else query.prior
     return camera is not None and camera.is_near(prior)
 
@@ -67,7 +67,7 @@ def _is_compared(query: LandmarkQuery) -> bool:
 def _estimated(
     query: LandmarkQuery, matches: LandmarkMatches, better: CameraFit, clock: Stopwatch
 ) -> LandmarkPose | None:
-    """Return the pose with a camera that is estimated along; None if matches do not agree with it once their errors are weighed."""
+    """Return the pose with a camera estimated along with it; None if too few matches agree with it once errors are weighed."""
     seen = query.seen_by([better.stretch.applied(image.intrinsics) for image in query.images])
     first = Hypothesis(better.T_world_rig, better.inliers, 0, better.calibration)
     answer = refined_pose(seen, matches[better.inliers], first, ANY)
@@ -81,7 +81,7 @@ def _estimated(
 def _like_map_camera(
     query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose, clock: Stopwatch
 ) -> LandmarkPose | None:
-    """Return the pose with the map's intrinsics if those found are like them and nothing refutes them."""
+    """Return the pose with the map's intrinsics if the ones found resemble them and nothing refutes them."""
     given, count = query.images[-1].intrinsics, len(query.images)
     own, deviation = found.intrinsics_of(given), float(found.calibration_deviations[0])
     camera = None if own is None else camera_like(own, query.landmarks.cameras, deviation)

@@ -136,7 +136,7 @@ def _projected(pose: poselib.CameraPose, points: Float[np.ndarray, "m 3"]) -> Fl
 
 
 def _draws_needed(inliers: float) -> int:
-    """Return how many samples of four to draw so that most likely one has no outlier (Fischler and Bolles 1981)."""
+    """Return how many samples of four to draw so that one most likely has no outlier (Fischler and Bolles 1981)."""
     clean = min(max(inliers, 1e-3) ** 4, 1 - 1e-9)
     return max(LEAST_DRAWS, int(3 * np.log(1 - SUCCESS) / np.log1p(-clean)))
 

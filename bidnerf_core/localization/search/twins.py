@@ -19,9 +19,9 @@ COMPARED = 100
 ALIKE = 0.9
 """Least ratio of a correspondence's descriptor distance to that of a landmark elsewhere that looks as much like the keypoint."""
 LEAST_ALIKE = 0.3
-"""Share of the correspondences that need such a landmark, and that have to agree with one other pose."""
+"""Least share of the correspondences that must have such a landmark, and that must agree with one other pose."""
 RIVAL = 0.5
-"""Share of the correspondences, those by chance left out, that have to match about another pose for it to be a twin."""
+"""Least ratio of the correspondences at a twin to those at the pose itself, those by chance left out of both."""
 
 
 def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> Twin | None:
@@ -49,7 +49,7 @@ def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose)
 def _elsewhere(
     query: LandmarkQuery, matcher: LandmarkMatcher, chosen: LandmarkMatches, found: LandmarkPose
 ) -> LandmarkMatches:
-    """Return matches of the keypoints of ``chosen`` with landmarks that do not project near them from the pose, the most alike first."""
+    """Return matches of the keypoints of ``chosen`` with landmarks that do not project near them, the most similar first."""
     distances, index = matcher.nearest(query.descriptors(chosen), LOOKED_UP)
     ratio = distances / query.squared_distances(chosen).clamp(min=1)[:, None]
     row, column = (ratio <= ALIKE**-2).nonzero().unbind(-1)

@@ -24,11 +24,11 @@ BETAS, EPSILON = (0.9, 0.999), 1e-8
 
 
 class AdamSteps:
-    """Steps of one pose, on its own device: no step reads a number from it, or copies anything from or to it.
+    """Steps of one pose, on its own device: no step reads a number from the device, or copies anything from or to it.
 
-    Each step writes the pose as an update delta of the current one about ``pivot``, takes the gradient by delta at 0, and
-    moves by what Adam makes of it. A step that is not finite leaves the pose where it is. What a step changes lies in
-    tensors that it writes in place, so that a step captured as a CUDA graph is the next one whenever it is replayed.
+    Each step writes the pose as an update delta of the current one about ``pivot``, takes the gradient with respect to delta
+    at 0, and moves by Adam's update. A step that is not finite leaves the pose where it is. All that a step changes lies in
+    tensors that it writes in place, so each replay of a step captured as a CUDA graph takes the next step.
     """
 
     def __init__(self, loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3) -> None:
@@ -68,7 +68,7 @@ class AdamSteps:
     def block(self) -> tuple[SE3, Float[Tensor, "s"], Bool[Tensor, "s"]]:
         """Return the poses after the last ``WINDOW`` steps, on the CPU, the loss before each, and whether each was finite.
 
-        It is for the end of each ``WINDOW`` steps; rows of steps that were not taken are those of earlier ones.
+        Call it after every ``WINDOW`` steps; rows of steps that were not taken hold earlier ones.
         """
         log = self._log.to("cpu", copy=True)  # later steps overwrite it
         return SE3(log[:, :9].unflatten(1, (3, 3)), log[:, 9:12]), log[:, 12], log[:, 13] > 0
@@ -94,8 +94,8 @@ def follow_gradient(
     """Take steps from ``history.T``, record them, and return whether they stayed finite and why they ended.
 
     Steps are taken on ``device``, ``WINDOW`` at a time; the host reads them after each block. If a reason to stop arose
-    within a block, the steps after it are forgotten. Give the ``generator`` from which the loss draws if each call computes
-    the same but for these numbers: on a GPU, a step is then captured once and replayed.
+    within a block, the steps after it are discarded. Give the ``generator`` from which the loss draws if all calls do the same
+    computation apart from these numbers: on a GPU, a step is then captured once and replayed.
     """
     steps = AdamSteps(loss, pivot, config, history.T.to(device))
     take: Callable[[], None] = steps

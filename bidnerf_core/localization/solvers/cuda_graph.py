@@ -20,22 +20,23 @@ from bidnerf_core.constants import noted
 WARM_UP = 3
 """Steps to take before one is captured: caches are filled and kernels loaded in these, which a capture does not allow."""
 _capturing = Lock()
-"""One capture at a time: it begins with waiting for all that the device does, which another capture forbids."""
+"""Allows one capture at a time: a capture begins by waiting for the device, which another capture forbids."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Replay:
     graph: torch.cuda.CUDAGraph
-    constants: list[Tensor]  # which the graph reads, wherever else they are forgotten
+    constants: list[Tensor]  # kept alive here, since the graph reads them
 
     def __call__(self) -> None:
         self.graph.replay()
 
 
 def captured(step: Callable[[], None], device: torch.device, generator: Generator) -> Callable[[], None]:
-    """Return a function that does what ``step`` would: on a GPU, the replay of a graph of it, if it can be captured.
+    """Return a function that does what ``step`` does: on a GPU, by replaying a graph of it, if it can be captured.
 
-    ``generator`` is that from which the step draws. Capturing takes no step. A step that cannot be captured is returned with a warning.
+    ``generator`` is the one from which the step draws. Capturing takes no step. A step that cannot be captured is returned as
+    it is, with a warning.
     """
     if device.type != "cuda":
         return step

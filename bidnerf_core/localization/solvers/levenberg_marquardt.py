@@ -18,7 +18,7 @@ LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """The poses at the end of a descent, the cost there, and the way."""
+    """The poses at the end of a descent, the cost there, and the path."""
 
     T: SE3  # (h)
     equations: NormalEquations  # at T
@@ -36,11 +36,11 @@ def descend(
     damping: float = 1e-3,
     stop: float = 0.0,
 ) -> Descent:
-    """Take ``steps`` steps from the poses ``start`` (h); a step that does not lower its pose's cost is taken back.
+    """Take ``steps`` steps from the poses ``start`` (h); a step that does not lower its pose's cost is undone.
 
     Damping scales with the diagonal (Marquardt 1963), so that units do not matter. ``stop``: a pose has settled once a
     lightly damped step is shorter than this (norm of the tangent), whether or not it still lowers the cost; the descent
-    ends when all poses have, unless the host must not wait for the device to say so. 0: never.
+    ends when all poses have, unless the host must not wait for the device to find out. 0: never.
     """
     T, here = start, cost(start)
     factor = torch.full_like(here.cost, damping)
@@ -66,7 +66,7 @@ def descend(
 def _short(
     delta: Float[Tensor, "h 6"], damping: Float[Tensor, "h"], here: NormalEquations, stop: float
 ) -> Bool[Tensor, "h"]:
-    """Return which steps are shorter than ``stop`` for lack of slope, not because the solve failed or damping is heavy."""
+    """Return which steps are shorter than ``stop`` due to a small gradient, not to a failed solve or heavy damping."""
     whole = here.hessian.isfinite().all(-1).all(-1) & here.gradient.isfinite().all(-1)
     return whole & (damping <= 1) & (torch.linalg.vector_norm(delta, dim=-1) < stop)
 

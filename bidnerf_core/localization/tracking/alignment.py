@@ -1,4 +1,4 @@
-"""Measured depth against the baked surface, from a pose that is nearly right."""
+"""Alignment of measured depth with the baked surface, from a pose that is nearly right."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from bidnerf_core.se3 import SE3
 SURFACE_BIAS = 0.5
 """Share of the variance of a pose by depth that consecutive frames share."""
 DEPTH_MEASUREMENTS = 3.0
-"""Number of independent measurements that a frame's points count as beside landmarks: fewer than ``INDEPENDENT``, which is
-optimistic for hand-held sensors.
+"""Number of independent measurements that a frame's points count as when fused with landmarks: fewer than ``INDEPENDENT``,
+which is optimistic for hand-held sensors.
 """
 DRAWN = 4
 """Number of pixels that are drawn for each measured point that is wanted."""
 ALIGNMENT_STEPS = 8
 """Largest number of steps of an alignment without landmarks, at each of its scales."""
 ALIGNED_STEP = 1e-4
-"""Length of a step (metres and radians) at which the alignment has ended."""
+"""Length of a step (metres and radians) below which an alignment ends."""
 
 
 @dataclass(frozen=True, eq=False)
 class CloudInCamera:
-    """A frame's measured points, and the pose that this frame had by itself."""
+    """A frame's measured points, and the pose that was found for this frame by itself."""
 
     cloud: PointCloud
     T_world_camera: SE3
@@ -57,8 +57,8 @@ def measured_cloud(
     """Return up to ``count`` of a frame's measured points in the camera's frame; depth is multiplied by ``scale``.
 
     ``motion`` is that of the camera while its rows were exposed, where it is known.
-    Pixels are drawn without a look at all of them, which would take longer than what is done with the few; a pixel may be
-    drawn twice. Where the depth is sparse, every measured pixel is a candidate.
+    Pixels are drawn without scanning the whole image, which would take longer than processing the few that are drawn; a pixel
+    may be drawn twice. Where the depth is sparse, every measured pixel is a candidate.
     """
     view, depth = View(frame, SE3.identity(), motion=motion), frame.depth
     assert depth is not None
@@ -89,7 +89,7 @@ def joined_clouds(now: CloudInCamera, before: Sequence[CloudInCamera]) -> PointC
 def fused_with_surface(
     pose: PoseEstimate, surface: SurfaceMap, cloud: PointCloud, steps: int, views: int = 1
 ) -> PoseEstimate:
-    """Fuse a pose with measured points on the surface, which count as ``DEPTH_MEASUREMENTS`` a view.
+    """Fuse a pose with measured points on the surface, which count as ``DEPTH_MEASUREMENTS`` per view.
 
     A share ``SURFACE_BIAS`` of the variance that the points contribute is bias, as in ``aligned``.
     """
@@ -103,7 +103,7 @@ def fused_with_surface(
     for number in range(steps):
         here = cost(T[None]) if number else here
         hessian, gradient = weight * here.hessian[0], weight * here.gradient[0]
-        # The steps are so short that they add up; the prior pulls back by all of them.
+        # The steps are short enough to be added as vectors; the prior pulls back by their sum.
         step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)
         T, moved = retracted(T, at_camera @ step), moved + step
         if float(torch.linalg.vector_norm(step)) < ALIGNED_STEP:
@@ -114,7 +114,7 @@ def fused_with_surface(
 
 
 def fused_with_points(T: SE3, pose: PoseEstimate, information: Float[Tensor, "6 6"]) -> PoseEstimate:
-    """Return the pose ``T`` with the covariances of ``pose`` after it was fused with points of this information."""
+    """Return the pose ``T`` with the covariances that ``pose`` has once it is fused with points of this ``information``."""
     fused = torch.linalg.inv(torch.linalg.inv(pose.covariance) + information)
     kept, by_points = torch.eye(6).double() - fused @ information, fused @ information @ fused
     return PoseEstimate(

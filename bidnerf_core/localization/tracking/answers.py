@@ -11,7 +11,7 @@ from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.se3 import SE3
 
 METHOD = "track"
-"""The method that poses of a tracker name."""
+"""Method name of the poses that a tracker finds."""
 
 
 def tracked_localization(motion: Motion, verdict: Verdict, predicted: Motion, loss: float) -> Localization:
@@ -32,7 +32,7 @@ def tracked_localization(motion: Motion, verdict: Verdict, predicted: Motion, lo
 
 
 def unknown(start: SE3 | None, extent: float) -> Localization:
-    """Return the answer for a frame when neither its pose is known nor that of any frame before it.
+    """Return the answer for a frame when neither its pose nor that of any frame before it is known.
 
     ``extent`` (metres) is the size of the scene, in which the camera may be anywhere.
     """

@@ -17,32 +17,31 @@ class CorrectedCamera:
 
     given: Intrinsics
     found: Intrinsics
-    approximate: (
-        bool  # whether the frame's focal length was; frames of the other kind are from another source
-    )
+    # Whether the frame's focal length was approximate; frames of the other kind are from another source.
+    approximate: bool
 
     def applies_to(self, frame: Frame) -> bool:
         """Return whether the intrinsics of a frame come from the same source."""
         return frame.focal_is_approximate == self.approximate
 
     def focal_factor(self, frame: Frame) -> float:
-        """Return the true over the given focal length of a frame; the geometric mean of those across and down."""
+        """Return the ratio of a frame's corrected to its given focal length: the geometric mean across and down."""
         if not self.applies_to(frame):
             return 1.0
         return math.sqrt(self.found.fx * self.found.fy / (self.given.fx * self.given.fy))
 
     def corrected(self, frame: Frame) -> Frame:
-        """Return the frame with better intrinsics."""
+        """Return the frame with corrected intrinsics."""
         return replace(frame, intrinsics=self.changed(frame.intrinsics)) if self.applies_to(frame) else frame
 
     def stated_in(self, answer: Localization, frame: Frame) -> Localization:
-        """Return the answer for a frame with the intrinsics that replace its own, if they do."""
+        """Return the answer for a frame, completed by the intrinsics that replace the frame's own, if any do."""
         taken = self.corrected(frame).intrinsics
         corrected = None if taken == frame.intrinsics else taken
         return replace(answer, focal_factor=self.focal_factor(frame), intrinsics=corrected)
 
     def changed(self, camera: Intrinsics) -> Intrinsics:
-        """Return better intrinsics; those of another focus or size are changed in the same proportion."""
+        """Return corrected intrinsics; those of another focus or size are changed in the same proportion."""
         given, found = self.given, self.found
         if camera == given:
             return found
@@ -54,7 +53,7 @@ class CorrectedCamera:
         )  # fmt: skip
 
     def then(self, later: CorrectedCamera) -> CorrectedCamera:
-        """Return the correction by which ``later`` follows this one."""
+        """Return this correction followed by the correction ``later``."""
         return replace(self, found=later.changed(self.found))
 
     def plain(self) -> list[Any]:
@@ -63,7 +62,7 @@ class CorrectedCamera:
 
     @staticmethod
     def from_plain(values: list[Any]) -> CorrectedCamera:
-        """Return the camera of which ``values`` are the JSON values."""
+        """Return the camera from JSON values as ``plain`` returns them."""
         given, found = (_camera(*camera) for camera in values[:2])
         return CorrectedCamera(given, found, values[2])
 
@@ -77,7 +76,10 @@ def _camera(
 def after_search(
     frame: Frame, found: Intrinsics, before: CorrectedCamera | None
 ) -> tuple[Frame, CorrectedCamera]:
-    """Return a frame, which ``before`` has corrected, with the intrinsics that a search found for it, and the correction of later frames."""
+    """Return a frame with the intrinsics that a search found for it, and the correction for later frames.
+
+    ``before`` is the correction that was already applied to the frame, if any.
+    """
     later = CorrectedCamera(frame.intrinsics, found, frame.focal_is_approximate)
     if before is not None and before.applies_to(frame):
         return later.corrected(frame), before.then(later)

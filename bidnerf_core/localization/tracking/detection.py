@@ -1,4 +1,4 @@
-"""Landmarks of the map that are recognised around a predicted pose, and the evidence that a pose by landmarks is right."""
+"""Recognition of the map's landmarks around a predicted pose, and the evidence that a pose by landmarks is right."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from bidnerf_core.mapping.resection import resect
 from bidnerf_core.se3 import SE3
 
 NEARBY = EXHAUSTIVE
-"""Largest number of landmarks that are compared with an image: those that most images of the map saw."""
+"""Largest number of landmarks that are compared with an image: those seen in the most images of the map."""
 WIDE = 2.0
-"""Multiple of the radius of guided matching from which on keypoints are compared with all landmarks in view. Guided matching
+"""Multiple of the radius of guided matching above which keypoints are compared with all landmarks in view. Guided matching
 compares a keypoint with the few landmarks that project nearest to it, which suits predictions that are off by little.
 """
 LEAST_CHANCE = 0.5
@@ -46,7 +46,7 @@ LEAST_CHANCE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """How much a pose by landmarks is supported; see ``LandmarkPose``."""
+    """How well a pose by landmarks is supported; see ``LandmarkPose``."""
 
     matches: int
     agreeing: int
@@ -86,7 +86,8 @@ class LandmarkDetector:
         """Match keypoints with landmarks that project within ``radius`` pixels of them, and fit the pose to the matches.
 
         ``most_distance`` is the largest squared distance between the descriptors of a match, ``noise`` a first guess at that
-        of keypoints (pixels), ``known`` what is known of wrong intrinsics; without it, they are checked. Returns None if too few match.
+        of keypoints (pixels), ``known`` the result of an earlier check of the intrinsics; without it, they are checked now.
+        Returns None if too few keypoints match.
         """
         number = self._near(frame.intrinsics, T_world_camera)
         image = query_image(frame, SE3.identity(), self.features)
@@ -114,7 +115,7 @@ class LandmarkDetector:
     def _seen(
         self, frame: Frame, query: LandmarkQuery, T: SE3, radius: float, most_distance: float, noise: float
     ) -> tuple[FollowedPoints, PointFit, float] | None:
-        """Return the matches within a radius, the pose that they determine, and the usual distance of its inliers."""
+        """Return the matches within a radius, the pose that they determine, and ``usual_distance`` of its inliers."""
         if radius > WIDE * RADII[-1] * query.threshold:
             matches = _matches_within(query, T, radius)
         else:
@@ -127,7 +128,7 @@ class LandmarkDetector:
         return points, found, usual_distance(query, matches[found.inliers])
 
     def _near(self, camera: Intrinsics, T_world_camera: SE3) -> Int[Tensor, "n"]:
-        """Return the numbers of landmarks in view that most images of the map saw, from about this direction."""
+        """Return up to ``NEARBY`` numbers of landmarks in view, mapped from roughly this direction, those in most images."""
         landmarks = self.landmarks
         local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
         half = torch.tensor([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
@@ -214,7 +215,7 @@ def landmark_pose(
 
 
 def well_spread(pixels: Float[Tensor, "m 2"], camera: Intrinsics, most: int) -> Int[Tensor, "k"]:
-    """Return up to ``most`` indices, from all cells of a grid over the image in turn; the pixels come best first."""
+    """Return up to ``most`` indices, from all cells of a grid over the image in turn; ``pixels`` must be sorted best first."""
     if len(pixels) <= most:
         return torch.arange(len(pixels))
     cell = cell_numbers(pixels, camera)

@@ -17,14 +17,14 @@ LEVELS = 3
 FLOW_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 """Largest number of iterations on each level, and the step (pixels) below which they end."""
 RETURN = 0.7
-"""Largest distance (pixels) between a point and where the flow back from its new place leads to."""
+"""Largest distance (pixels) between a point and where the flow back from its new place ends."""
 LEAST_TEXTURE = 1e-3
 """Least eigenvalue of a patch's gradient matrix, as OpenCV normalises it; a blank wall with noise stays below it."""
 BRIGHTNESS = 0.02
-"""Relative change of an image's mean from which on its brightness is matched first: the flow assumes constant brightness."""
+"""Relative change of an image's mean above which its brightness is matched first: the flow assumes constant brightness."""
 
 PATCH, LEAST_CORRELATION = 4, 0.6
-"""Pixels from the middle to the border of the patches that are compared, and their least correlation."""
+"""Pixels from the middle to the border of the patches that ``alike`` compares, and their least correlation."""
 
 Grey = UInt8[np.ndarray, "h w"]
 
@@ -60,7 +60,7 @@ def alike(
 ) -> Bool[Tensor, "m"]:
     """Return which patches about ``pixels`` of one image resemble those about ``there`` in the next.
 
-    The flow follows patches of mere noise to wherever it began to search; these do not correlate.
+    The flow leaves patches of mere noise wherever its search began; these do not correlate.
     """
     one, two = (_patches(image, place) for image, place in ((before, pixels), (now, there)))
     spread = np.sqrt((one**2).sum(-1) * (two**2).sum(-1)).clip(min=1e-6)
@@ -68,7 +68,7 @@ def alike(
 
 
 def _patches(image: Grey, pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m p"]:
-    """Return the grey values about pixels, less their mean."""
+    """Return the grey values about pixels, minus their mean."""
     steps = np.arange(-PATCH, PATCH + 1)
     column, row = np.moveaxis(pixels.floor().long().numpy(), -1, 0)
     rows = (row[:, None] + steps).clip(0, image.shape[0] - 1)
@@ -90,7 +90,7 @@ def _corner_based(pixels: Float[Tensor, "m 2"]) -> Float[np.ndarray, "m 2"]:
 
 
 def _as_bright_as(model: Grey, image: Grey) -> Grey:
-    """Return ``image`` with the mean and the standard deviation of ``model``."""
+    """Return ``image`` with about the mean and standard deviation of ``model``; unchanged where the means hardly differ."""
     (mean, spread), (wanted, wanted_spread) = _moments(image), _moments(model)
     if abs(wanted - mean) <= BRIGHTNESS * mean or spread < 1:
         return image

@@ -13,14 +13,14 @@ from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.result import Outcome, Verdict
 
 DETERMINED = 0.02, math.radians(3)
-"""Largest standard deviation of an accepted pose by depth or colour: shares of the scene's extent, and radians."""
+"""Largest standard deviations of an accepted pose by depth or colour: share of the scene's extent, and radians."""
 
 
 def not_by_chance(verdict: Verdict, noise: float, threshold: float) -> Verdict:
-    """Return the verdict on followed landmarks, or that they agree within a ``noise`` (pixels) that chance would give.
+    """Return the verdict on followed landmarks, or a rejection if their ``noise`` (pixels) is what chance would give.
 
-    Places that are spread evenly over a disc of the radius ``threshold`` (pixels) have half of it as their standard deviation
-    along each axis. Where the flow has gone astray over a long interval, the landmarks agree no better than that.
+    Points spread evenly over a disc of radius ``threshold`` (pixels) have a standard deviation of half that radius along each
+    axis. Where the flow has gone astray over a long interval, the landmarks agree no better than that.
     """
     if not verdict.accepted or noise <= threshold / 2:
         return verdict
@@ -28,7 +28,7 @@ def not_by_chance(verdict: Verdict, noise: float, threshold: float) -> Verdict:
 
 
 def unconfirmed(verdict: Verdict) -> Verdict:
-    """Return the verdict on few followed landmarks where none are recognised about the pose, which may have drifted away."""
+    """Reject a pose by few followed landmarks where none are recognised around it: it may have drifted away."""
     if not verdict.accepted:
         return verdict
     return Verdict(
@@ -38,7 +38,7 @@ def unconfirmed(verdict: Verdict) -> Verdict:
 
 
 def precise_enough(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
-    """Return the verdict, or that the position is too uncertain for the ``distance`` (metres) of what is in view."""
+    """Return the verdict, or a rejection if the position is too uncertain for the ``distance`` (metres) of what is in view."""
     deviation = position_deviation(covariance)
     if not verdict.accepted or deviation <= LandmarkThresholds().precision * distance:
         return verdict
@@ -47,7 +47,7 @@ def precise_enough(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance:
 
 
 def determined(verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float) -> Verdict:
-    """Return the verdict, or that the pose is not determined where its covariance is large."""
+    """Return the verdict, or a rejection if the pose's covariance is large for a scene of this ``extent`` (metres)."""
     translation, rotation = (float(part.max().sqrt()) for part in covariance.diagonal().split(3))
     if not verdict.accepted or (translation <= DETERMINED[0] * extent and rotation <= DETERMINED[1]):
         return verdict
@@ -56,7 +56,7 @@ def determined(verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float
 
 
 def as_certain_as_usual(verdict: Verdict, covariance: Float[Tensor, "6 6"], typical: float) -> Verdict:
-    """Return the verdict, or that the position is far less certain than what the map's own images give.
+    """Return the verdict, or a rejection if the position is far less certain than those of the map's own images.
 
     ``typical`` is their median error, metres; 0 where it is not known. Frames without colours are judged by it: along a
     corridor, nothing in them shows the position, which is then predicted rather than measured.
@@ -71,9 +71,9 @@ def as_certain_as_usual(verdict: Verdict, covariance: Float[Tensor, "6 6"], typi
 def shape_verdict(
     verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float, typical: float, stamped: bool
 ) -> Verdict:
-    """Judge a pose by depth without colours, of which the motion before it is a part.
+    """Judge a pose by depth without colours, which relies on the motion before it as well.
 
-    Without a time stamp, nothing says how far the camera has moved along what the shape leaves open.
+    Without a time stamp, nothing determines how far the camera has moved in the directions that the shape leaves open.
     """
     if verdict.accepted and not stamped:
         return Verdict(

@@ -49,15 +49,15 @@ from bidnerf_core.se3 import SE3
 WIDEST = 0.4
 """Largest radius, as a share of the image's diagonal, within which landmarks are sought around their prediction."""
 SIGMAS = 3.0
-"""The radius in standard deviations of the prediction."""
+"""Radius of that search, in standard deviations of the prediction."""
 ENOUGH_LANDMARKS = 40
-"""The number of followed landmarks that agree from which on no new ones are sought, and the pose needs no confirmation."""
+"""Least number of agreeing followed landmarks at which no new ones are sought, and the pose needs no confirmation."""
 INTRINSICS_CHECKED_EVERY = 30
 """The number of frames after which recognised landmarks check the given intrinsics again."""
 SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
 VAGUE = 0.35
-"""Largest uncertainty of a prediction that shape alone corrects, as a share of the distance to what is seen."""
+"""Largest uncertainty of a prediction that shape alone may correct, as a share of the distance to what is seen."""
 TOO_VAGUE = Verdict(
     Outcome.UNDETERMINED, "no colours were recorded, and the prediction is too uncertain for the shape"
 )
@@ -85,7 +85,7 @@ def followed(state: TrackerState, image: Grey | None, frame: Frame, predicted: S
         if int(found_again.sum()) > int(found.sum()):
             pixels, found = again, found_again
     fresh = (state.points.landmark == FRESH) & found
-    if bool(fresh.any()):  # landmarks have proved that they can be recognised, corners have not
+    if bool(fresh.any()):  # landmarks, unlike corners, are known to be recognisable
         found[fresh.clone()] = alike(state.image, image, state.points.pixels[fresh], pixels[fresh])
     return replace(state.points, pixels=pixels)[found]
 
@@ -218,7 +218,7 @@ class ByLandmarks:
         return Measurement(pose, verdict, found.noise, replace(state, window=kept_clouds))
 
     def _estimate(self, found: LandmarkPose) -> PoseEstimate:
-        """Split a pose's covariance: errors that the landmarks of an image have in common are those of the next image, too."""
+        """Split a pose's covariance into noise and bias: errors that an image's landmarks share recur in the next image."""
         landmarks = self.detector.landmarks
         correlation = landmarks.correlation_of(len(found.correspondences))
         noise = (found.covariance - found.map_covariance) / correlation
@@ -231,7 +231,7 @@ def search_radius(predicted: Motion, camera: Intrinsics) -> float:
 
 
 def is_vague(predicted: Motion, camera: Intrinsics) -> bool:
-    """Return whether a prediction, such as that after a gap, says too little about where landmarks appear."""
+    """Return whether a prediction, such as one after a gap, is too uncertain to seek landmarks around it."""
     return search_radius(predicted, camera) > WIDEST * math.hypot(camera.width, camera.height)
 
 
@@ -273,7 +273,7 @@ def by_shape(
 def by_colour(
     scene: SceneMap, frame: Frame, state: TrackerState, predicted: Motion, config: ByColourConfig
 ) -> Measurement:
-    """Return the pose by colours of rendered rays alone, which takes far longer than the other ways."""
+    """Return the pose by the colours of rendered rays alone, which takes far longer than the other measurements."""
     problem = rig(scene, [View(replace(frame, depth=None), SE3.identity())], predicted.T_world_camera)
     T, none = predicted.T_world_camera, torch.zeros(0, dtype=torch.float64)
     start = SearchResult(T[None], torch.zeros(1, dtype=torch.float64), math.inf, T[None], none)

@@ -2,8 +2,7 @@
 
 An error-state Kalman filter on SE(3) with right errors (Sola et al. 2018) and a white-noise acceleration. Two kinds of error
 are kept apart, as a Schmidt-Kalman filter does: noise, which is independent from frame to frame and averages out, and the
-bias of the map and the camera, which consecutive frames share and which therefore does not become smaller however many are
-fused.
+bias of the map and the camera, which consecutive frames share and which therefore does not shrink however many are fused.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from bidnerf_core.localization.tracking.single_pose import retracted, update_bet
 from bidnerf_core.se3 import SE3
 
 SPEED, TURN_RATE = 1.0, 1.0
-"""Standard deviations of an unknown velocity: reaches (the distance to what the camera sees) a second, and radians a second."""
+"""Standard deviations of an unknown velocity, per second: reaches (distances to what the camera sees), and radians."""
 ACCELERATION, TURN_ACCELERATION = 2.0, 4.0
-"""Standard deviations of the acceleration: reaches a second squared, and radians a second squared. Those of a hand-held camera
-that is moved briskly.
+"""Standard deviations of the acceleration, per second squared: reaches, and radians. They are those of a hand-held camera that
+is moved briskly.
 """
 LONGEST_GAP = 0.6
 """Seconds without a frame after which the velocity is no longer used."""
@@ -35,7 +34,7 @@ to the expected one that counts.
 KNOWN = 0.5
 """Variance of a velocity, as a share of that of an unknown one, up to which predictions show how briskly a camera moves."""
 UNSTAMPED = 0.5
-"""Standard deviation of an interval between frames that is not recorded, as a share of it: frames may be left out."""
+"""Standard deviation, as a share, of an interval between frames that is not recorded: frames may be left out."""
 LEAST_SECONDS = 1e-3
 """Least time between two frames for which noise of the motion is added; frames may be repeated or lack distinct times."""
 
@@ -58,7 +57,7 @@ class Motion:
     """A camera's pose and velocity at one time; float64."""
 
     T_world_camera: SE3
-    velocity: Float[Tensor, "6"]  # right updates of the pose (metres, radians) a second
+    velocity: Float[Tensor, "6"]  # right update of the pose (metres, radians) per second
     noise: Float[Tensor, "12 12"]  # covariance of pose and velocity
     bias: Float[Tensor, "6 6"]  # covariance of the pose's error that frames share
     reach: float  # metres: distance to what the camera sees, which scales translations
@@ -83,7 +82,7 @@ class Motion:
         """Return the state ``seconds`` later, or earlier where they are negative.
 
         After a gap, the pose stays where it was and its uncertainty grows with the speed that a camera may have. Without a
-        time stamp the interval is an assumption, and the way covered in it is uncertain by as much.
+        time stamp the interval is an assumption, and the distance covered in it is uncertain in the same proportion.
         """
         motion = self.at_rest() if abs(seconds) > LONGEST_GAP else self
         step = motion.velocity * seconds
@@ -125,7 +124,7 @@ class Motion:
         )
 
     def refined(self, fused: PoseEstimate) -> Motion:
-        """Return the state whose pose, fused with a measurement already, is ``fused``; the velocity follows it."""
+        """Return the state with the pose ``fused``, in which a measurement is already included; the velocity follows it."""
         gain = torch.linalg.solve(self.noise[:6, :6], self.noise[:6]).T
         delta = gain @ update_between(self.T_world_camera, fused.T_world_camera)
         noise = self.noise + gain @ (fused.noise - self.noise[:6, :6]) @ gain.T
@@ -149,8 +148,8 @@ class Motion:
     def _observed_agility(self, off: Float[Tensor, "3"], spread: Float[Tensor, "3 3"]) -> float:
         """Return the agility after a position that was ``off`` the prediction, of covariance ``spread`` (Mehra 1970).
 
-        A velocity that is not known yet says nothing about it. Turns are left out: they change more abruptly than the way
-        that somebody walks, and what is measured determines them well.
+        While the velocity is not known yet, the agility is unchanged. Turns are left out: they change more abruptly than the
+        motion of somebody walking, and what is measured determines them well.
         """
         velocity = float(self.noise.diagonal()[6:9].mean()) / (self.reach * SPEED) ** 2
         if velocity > KNOWN:
@@ -159,7 +158,7 @@ class Motion:
         return min(1.0, max(LEAST_AGILITY, self.agility * math.sqrt(1 - ADAPTED + ADAPTED * ratio)))
 
     def moved(self, T_world_camera: SE3, relative: Float[Tensor, "6 6"], seconds: float) -> Motion:
-        """Return the state after a motion that the images themselves gave, ``seconds`` later.
+        """Return the state ``seconds`` later, after a motion measured between the images themselves.
 
         ``relative`` is the covariance of that motion, a right update of the new pose.
         """

@@ -17,20 +17,20 @@ from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.se3 import SE3
 
 LEAST_CORNERS = 20
-"""The number of corners that have to agree with a motion."""
+"""Least number of corners that must agree with a motion."""
 LEAST_SHARE = 0.5
-"""Share of the corners that have to agree with it."""
+"""Least share of the corners that must agree with it."""
 SIGNIFICANT_NFA = -6.0
 """Largest logarithm of the number of such agreements expected by chance."""
 REPLENISHED = 0.5
-"""Share of the corners left at which new ones are taken."""
+"""Share of ``count`` below which new corners are detected."""
 CORRELATION = 4.0
 """Number of corners that count as one, since the errors of neighbouring depths are correlated."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Follows up to ``count`` corners whose depth was measured, with this noise."""
+    """Follows up to ``count`` corners whose depth was measured, with errors of this ``noise``."""
 
     count: int
     noise: DepthNoise = UNKNOWN.noise

@@ -26,9 +26,9 @@ LEAST_FOLLOWED = 6
 INLIER = 3.0
 """Largest reprojection error of an inlier, in standard deviations along both axes together."""
 MAJORITY = 0.7
-"""Share of inliers below which the robust fit is not relied upon, and a sample consensus is sought."""
+"""Share of inliers below which the robust fit is not relied upon, and a sample consensus is tried."""
 FRESH = -1
-"""The number of a landmark that a point stands for, if it stands for none."""
+"""Landmark number of points that are not landmarks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ def fit_pose(
 
 
 def with_motion(found: PointFit, correlation: float) -> PointFit:
-    """Return a fit with the motion of the camera while its rows were exposed, if there evidently was one, and with the doubt about it."""
+    """Return a fit with the camera's motion while its rows were exposed, if one is evident, and with the doubt about it."""
     evident = evident_motion(found.data[found.inliers], found.fit, correlation)
     if evident.prior == STILL:
         return replace(found, evident=evident)

@@ -25,7 +25,7 @@ LONG_WAIT = 0.25
 
 
 def search_due(localizer: Localizer, frame: Frame, lost: int, patience: int, waited: float = 0.0) -> bool:
-    """Return whether the pose of a frame is searched, or the frame left out to save time.
+    """Return whether to search for the pose of a frame, or to skip the frame to save time.
 
     In maps with landmarks, the first ``patience`` frames after a loss are searched and then every second, or every frame
     where ``waited``, the time (seconds) without a search, is long. ``lost`` is as for ``relocalized``.
@@ -40,7 +40,7 @@ def search_due(localizer: Localizer, frame: Frame, lost: int, patience: int, wai
 def relocalized(
     localizer: Localizer, frame: Frame, predicted: SE3 | None, lost: int, seed: int
 ) -> Localization | None:
-    """Return what a search for the pose gives, None if nothing; for frames where ``search_due``.
+    """Return the result of a search for the pose, or None; meant for frames for which ``search_due`` holds.
 
     Where the map has landmarks, they are sought first. The search of the whole surface, which takes longer, comes at growing
     intervals; it is the only one in maps without landmarks. ``lost`` is the number of frames since the last accepted pose
@@ -73,7 +73,7 @@ def uses_landmarks(localizer: Localizer) -> bool:
 
 
 def typical_error(localizer: Localizer) -> float:
-    """Return the median error (metres) of positions of the map's own images, 0 where it is not known."""
+    """Return the median error (metres) of the positions of the map's own images, 0 where it is not known."""
     return 0.0 if localizer.matcher is None else localizer.matcher.landmarks.trial.translation
 
 

@@ -22,7 +22,7 @@ class TrackerConfig(Settings):
     refresh_share: Annotated[float, Range(0, 1), EXPERT] = 0.5
     # number of frames after which new landmarks are sought anyway
     refresh_frames: Annotated[int, Range(1, 10**6), EXPERT] = 20
-    # number of second-order steps on depth beside landmarks
+    # number of second-order steps on depth in addition to landmarks
     depth_steps: Annotated[int, Range(1, 100), EXPERT] = 1
     # number of lost frames that are all searched; afterwards every second one is
     patience: Annotated[int, Range(1, 10**6), EXPERT] = 3

@@ -1,4 +1,4 @@
-"""Measured depth without colours against the baked surface: a prediction is corrected where the shape determines it.
+"""Alignment of depth without colours with the baked surface: a prediction is corrected where the shape determines it.
 
 Points slide along flat walls at no cost, and in a corridor the few that do not, on door frames and edges, fit wrong places
 about as well as the right one. A weak direction is therefore left to the prediction altogether (solution remapping, Zhang et
@@ -47,7 +47,7 @@ class ShapeFit:
     determined: int  # number of directions that the shape determines, of six
 
     def verdict(self) -> Verdict:
-        """Judge the fit; whether the position is certain enough is judged apart."""
+        """Judge the fit; whether the position is certain enough is judged separately."""
         rejected = self.diagnostics.rejection()
         if rejected is not None:
             return rejected
@@ -86,12 +86,12 @@ def _descended(
     prior = torch.linalg.inv(predicted.covariance)
     for _ in range(SHAPE_STEPS):
         here, variance = cost.with_variance(T[None])
-        # The residuals at a prediction that is off say nothing of the noise, so it is estimated anew in each step.
+        # The residuals at a prediction that is off do not reflect the noise, so it is estimated anew in each step.
         weight = DEPTH_MEASUREMENTS / max(float(variance[0]), LEAST_VARIANCE)
         kept = _determined(here.hessian[0], cost.cloud)
         hessian = weight * at_pivot.T @ kept.T @ here.hessian[0] @ kept @ at_pivot
         gradient = weight * at_pivot.T @ kept.T @ here.gradient[0]
-        # The steps are so short that they add up; the prior pulls back by all of them.
+        # The steps are short enough to be added as vectors; the prior pulls back by their sum.
         step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)
         T, moved = retracted(T, step), moved + step
         if float(torch.linalg.vector_norm(step)) < ALIGNED_STEP:
@@ -104,7 +104,7 @@ def _determined(hessian: Float[Tensor, "6 6"], cloud: PointCloud) -> Float[Tenso
     size = float((cloud.points - cloud.middle).square().sum(-1).mean().sqrt())
     unit = torch.tensor(
         [1.0] * 3 + [1 / size] * 3, dtype=torch.float64
-    )  # a turn moves points by its angle times this
+    )  # a rotation moves points by about its angle times the size
     values, axes = torch.linalg.eigh(unit[:, None] * hessian * unit)
     good = values >= WEAK * values[3:].mean()
     # Back to updates: x = unit * y, where the axes are orthonormal in y.

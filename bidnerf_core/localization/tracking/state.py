@@ -34,7 +34,7 @@ class TrackerState:
 
     clock: Clock
     motion: Motion | None = None  # None before the first pose was found
-    frames: int = 0  # that the tracker has been called with
+    frames: int = 0  # number of frames that the tracker has been called with
     lost: int = 0  # consecutive frames without an accepted pose, up to the last one
     searchable: int = 0  # of these, the frames that could be searched
     waited: float = 0.0  # seconds since the loss, or since the last search of an image
@@ -45,7 +45,7 @@ class TrackerState:
     usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
     miscalibration: Miscalibration = field(default_factory=Miscalibration.unknown)
     calibrated: int | None = None  # the frame (of ``frames``) in which the intrinsics were last checked
-    camera: CorrectedCamera | None = None  # by the searches; None while the given intrinsics are taken
+    camera: CorrectedCamera | None = None  # found by searches; None while the given intrinsics are taken
     noise: float = 1.0  # pixels: of the points in the last image
     window: tuple[CloudInCamera, ...] = ()
 
