@@ -1,11 +1,11 @@
-r"""What each part of method ``auto`` contributes: landmarks, the surface, rendered rays, with and without depth.
+r"""Contribution of each part of method ``auto``: landmarks, the surface, rendered rays, with and without depth.
 
     python benchmarks/auto_terms.py MAP:DATA [MAP:DATA ...] --name auto_terms
 
 No start is given. Frames whose index in the test split is 1 modulo 5 are left out, since settings were tuned on them;
-``--tuning-frames`` takes those only. Maps need landmarks (``bidnerf train`` and ``bidnerf bake --data`` make them). One
-process of one thread; finished frames are kept, so that an interrupted run goes on where it stopped. The surface alone takes
-many seconds an image without depth; ``--slow`` tries that as well.
+``--tuning-frames`` takes only those. Maps need landmarks (``bidnerf train`` and ``bidnerf bake --data`` build them). Everything
+runs in one process of one thread; finished frames are kept, so that an interrupted run resumes where it stopped. Without depth,
+the surface alone takes many seconds per image; ``--slow`` tries that as well.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 SLOW = "surface alone"
 BOUND = float(chi2.ppf(0.95, 6))
-"""Normalised squared error below which nineteen of twenty errors lie, where the covariance is right."""
+"""Normalised squared error below which nineteen of twenty errors lie if the covariance is right."""
 
 
 def one_frame(localizer: Localizer, view: View, depth: bool) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def one_frame(localizer: Localizer, view: View, depth: bool) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return successes with Wilson intervals, median errors, and how honest the answers are."""
+    """Return successes with Wilson intervals, median errors, and how well the answers judge themselves."""
     right = [r["translation"] < 0.05 and r["rotation_deg"] < 5 for r in rows]
     strict = [r["translation"] < 0.02 and r["rotation_deg"] < 1 for r in rows]
     accepted = [r["outcome"] == "converged" for r in rows]
@@ -82,7 +82,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def scene(stored: Map, name: str, data: Path, tuning: bool, slow: bool, store: RowStore) -> dict[str, Any]:
-    """Try all variants on the frames of one scene, RGB and where there is depth RGB-D."""
+    """Try all variants on the frames of one scene, as RGB and, where there is depth, as RGB-D."""
     dataset = open_dataset(data, stored.bounds.background)
     names = [n for i, n in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == tuning]
     views = dataset.views("test", names)

@@ -1,11 +1,11 @@
-"""One step of ``bid`` on maps of any backends, in one run: time, samples a ray, size of the map.
+"""One step of ``bid`` on maps of any backends, in one run: time, samples per ray, size of the map.
 
     python benchmarks/backend_step.py DATA MAP... --name backend_step_lego
 
 All maps render the same 2048 rays of a test frame from the same pose, 0.1 m from the truth, at the level that ``bid`` uses,
-with the gradient to the pose (forward and backward). They take turns, so that a change of the machine's load affects all
-alike, and medians are reported. Where a level's sampler only leaves out samples of another one (the vanilla field does that by its grid of
-free space), the step without skipping is timed as well, as ``MAP dense``.
+with the gradient with respect to the pose (forward and backward). They take turns, so that a change in the machine's load
+affects all alike, and medians are reported. Where a level's sampler only skips samples of another one (as in the vanilla
+field, by its grid of free space), the step without skipping is timed as well, as ``MAP dense``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ OBJECTIVE = objective_of(SETTINGS.colour, SETTINGS.depth)
 
 @dataclass(frozen=True, eq=False)
 class Everywhere:
-    """A level whose samples another sampler places."""
+    """A level with samples from another sampler."""
 
     level: RadianceField
     sampler: RaySampler
@@ -51,7 +51,7 @@ class Everywhere:
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A map and a level to time, and facts about them for the record."""
+    """A map's level to time, and facts about both for the record."""
 
     view: View  # in the frame of its own camera
     start: SE3  # T_world_camera
@@ -82,7 +82,7 @@ def variants(folders: list[Path], data: Path) -> dict[str, Variant]:
 
 
 def step(variant: Variant, seed: int) -> tuple[float, float]:
-    """Return the seconds of one step, and its samples a ray."""
+    """Return the seconds of one step, and its samples per ray."""
     began = time.perf_counter()
     generator = torch.Generator().manual_seed(seed)
     pixels = draw([variant.view], SETTINGS.descent.rays, uniform, generator)
@@ -119,7 +119,7 @@ def measured(found: dict[str, Variant], repeats: int) -> dict[str, Any]:
 
 
 def faster(mine: list[float], others: list[float]) -> float:
-    """Return the median ratio over the rounds."""
+    """Return how many times faster ``mine`` is: the median ratio over the rounds."""
     return statistics.median(b / a for a, b in zip(mine, others, strict=True))
 
 

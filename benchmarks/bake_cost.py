@@ -1,4 +1,4 @@
-"""What it costs to bake the surface of a map: time, memory, and size on disk.
+"""The cost of baking the surface of a map: time, memory, and size on disk.
 
     python benchmarks/bake_cost.py --map MAP [MAP ...] [--data DATA] [--name bake_cost]
 
@@ -23,7 +23,7 @@ from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.storage import load_info, load_map
 
 RESULTS = Path(__file__).parent / "results"
-# The child measures itself: a parent's figure for the peak of a child includes the parent's own.
+# The child measures itself: the child's peak as reported to the parent includes the parent's own.
 MAIN = """
 import json, sys, time
 from bidnerf_core.cli import main

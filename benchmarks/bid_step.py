@@ -1,9 +1,10 @@
-"""One step of ``bid`` with and without the occupancy grid, and where its time goes.
+"""One step of ``bid`` with and without the occupancy grid, and a profile of its time.
 
     python benchmarks/bid_step.py MAP DATA --name bid_step_lego
 
-Both variants render the same 2048 rays of a test frame from the same pose, 0.1 m from the truth, with the gradient to the
-pose; without the grid, every step of the same length inside the scene's box is queried. Alternating, medians.
+Both variants render the same 2048 rays of a test frame from the same pose, 0.1 m from the truth, with the gradient with
+respect to the pose; without the grid, every step of the same length inside the scene's box is queried. The variants alternate,
+and medians are reported.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ KINDS = {
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """What one step localizes."""
+    """The input of one step."""
 
     view: View  # in the frame of its own camera
     start: SE3  # T_world_camera
@@ -51,7 +52,7 @@ class Query:
 
 
 def step(query: Query, field: RadianceField, seed: int) -> tuple[float, int]:
-    """Compute the loss and its gradient to the pose; return the loss and the number of queried samples."""
+    """Compute the loss and its gradient with respect to the pose; return the loss and the number of queried samples."""
     pixels = draw([query.view], RAYS, uniform, torch.Generator().manual_seed(seed))
     delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     rendering = render(field, pixels.rays(query.start.retract(delta), query.bounds), query.bounds.background)
@@ -104,7 +105,7 @@ def main() -> None:
 
 
 def compare(query: Query, sparse: RadianceField, dense: RadianceField, repeats: int) -> dict[str, Any]:
-    """Return alternating times of both, their losses on the same pixels, and the profile of the sparse one."""
+    """Return the times of both, measured alternately, their losses on the same pixels, and the sparse one's profile."""
     times: dict[str, list[float]] = {"sparse": [], "dense": []}
     losses: dict[str, list[float]] = {"sparse": [], "dense": []}
     samples = {}
@@ -112,7 +113,7 @@ def compare(query: Query, sparse: RadianceField, dense: RadianceField, repeats: 
         for name, field in (("sparse", sparse), ("dense", dense)):
             began = time.perf_counter()
             loss, samples[name] = step(query, field, seed)
-            if seed:  # the first warms up
+            if seed:  # the first round is a warm-up
                 times[name].append(time.perf_counter() - began)
                 losses[name].append(loss)
     seconds = {name: statistics.median(values) for name, values in times.items()}

@@ -1,14 +1,14 @@
-"""Variants of ``bid``, each tried alone from the same starts, on the frames that settings are tuned on.
+"""Variants of ``bid``, each tried on its own from the same starts, on the frames on which settings are tuned.
 
     python benchmarks/bid_variants.py DATA --map MAP --out FOLDER [--group schedule reach depth] [--variant NAME ...]
 
-- ``schedule``: what the paper leaves open: learning rate, its decay, the frame of updates, the scale of the Huber loss;
+- ``schedule``: what the paper leaves unspecified: learning rate, its decay, the frame of updates, the scale of the Huber loss;
 - ``reach``: what may widen the basin of convergence from 0.9, 1.7 and 3.4 units;
 - ``depth``: depth residuals in full detail, where a silhouette ray is off by the distance to what lies behind.
 
-The frames are those whose index in the test split is 1 modulo 5; nothing that is reported elsewhere is tried on them. Each
-group has a file of results in FOLDER, safe against any kill: the same command goes on where it stopped. ``--stop-after``
-ends the run after so many minutes; what is done is recorded.
+The frames are those whose index in the test split is 1 modulo 5; no result that is reported elsewhere uses them. Each group
+has a file of results in FOLDER, which survives a kill at any moment: the same command resumes where it stopped.
+``--stop-after`` ends the run after that many minutes; what is done by then is recorded.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PAPER = {
     "decay": 0.8,
     "decay_steps": 100,
 } | WITHOUT_REACH
-"""The paper's steps with a quarter of its rays; what is compared here has its own settings beside these."""
+"""The paper's steps with a quarter of its rays; the variants compared here add their own settings."""
 QUICK = {
     "rays": 512,
     "max_steps": 300,
@@ -41,7 +41,7 @@ QUICK = {
     "decay": 0.5,
     "decay_steps": 100,
 } | WITHOUT_REACH
-"""Poses may move as far in fewer steps: for what is compared with itself."""
+"""Settings with which poses can move as far in fewer steps, for variants that are compared only with each other."""
 
 SCHEDULE: dict[str, Settings] = {
     "scene, 0.02": {},
@@ -80,7 +80,7 @@ GROUPS: dict[str, tuple[Settings, dict[str, Settings], tuple[float, ...]]] = {
 
 
 def plans(group: str, base: Plan, names: list[str] | None, sizes: list[float] | None) -> list[Plan]:
-    """Return a plan for each variant of a group, or for those that are named."""
+    """Return a plan for each variant of a group, or only for the named ones."""
     common, variants, usual = GROUPS[group]
     starts = tuple((size,) for size in sizes or usual)
     return [
@@ -113,7 +113,7 @@ def main() -> None:
     )  # fmt: skip
     for group in given.group:
         chosen = plans(group, base, given.variant, given.size)
-        # One trial of every variant, then the next, so that whatever is done compares them all.
+        # One trial of every variant, then the next, so that the results at any moment compare all variants.
         rounds = zip(*(planned(plan) for plan in chosen), strict=True)
         trials = [trial for same in rounds for trial in same]
         name = f"bid_{group}_{trials[0].portable.map.replace(':', '_')}"

@@ -1,17 +1,17 @@
-r"""What the record of a capture names, when known damage is done to the photos and the poses of a dataset.
+r"""The problems that a capture's record reports when the photos and poses of a dataset are damaged in known ways.
 
     python benchmarks/capture_report.py DATA [DATA ...] [--name capture_report]
 
-Each case combines kinds of damage that do not interfere, at photos that are drawn with a fixed seed:
+Each case combines kinds of damage that do not interfere, on photos that are drawn with a fixed seed:
 
-- none, to see what is named of the photos as they are;
+- none, to see what is reported for the photos as they are;
 - ten photos removed on one side, five blurred by a moving camera, one wrong pose;
 - a tenth of the poses wrong, one photo upside down, one mirrored, five photos four stops too dark or too bright;
 - photos of two places in one folder (each dataset with the next one of the command);
 - photos from one place; two photos.
 
-Recorded are the photos that each problem was named of, rightly or not, and precision and recall. Photos of the case without
-damage are real: what is named of them already is listed apart, since it may be right.
+Recorded are the photos for which each problem was reported, rightly or not, and precision and recall. The photos of the case
+without damage are real: what is reported for them already is listed separately, since it may be right.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ STOPS = 4.0
 
 
 class RememberedKeypoints:
-    """SIFT that returns what it found before where it has seen an image already: most photos are the same in all cases."""
+    """SIFT that caches its keypoints by image, since most photos are the same in all cases."""
 
     def __init__(self) -> None:
         self._found: dict[int, Keypoints] = {}
@@ -64,10 +64,10 @@ class RememberedKeypoints:
 
 @dataclass
 class Case:
-    """A damaged capture, and what is wrong with it."""
+    """A damaged capture, and its true problems."""
 
     views: list[View]
-    truth: dict[str, set[str]] = field(default_factory=dict)  # problem: names of photos
+    truth: dict[str, set[str]] = field(default_factory=dict)  # names of photos by problem
     gap: Gap | None = None
     arrangement: str | None = None
 
@@ -93,7 +93,7 @@ def blurred(view: View, generator: Generator) -> View:
 
 
 def exposed(view: View, stops: float) -> View:
-    """Return the photo as taken with so many stops more light, and stored in 8 bits."""
+    """Return the photo as if taken with ``stops`` stops more light, and stored in 8 bits."""
     image = view.frame.rgb.numpy() * 2 ** (stops / 2.2)
     return with_image(view, (image.clip(0, 1) * 255).round() / 255)
 
@@ -165,7 +165,7 @@ def two_places(views: list[View], others: list[View]) -> Case:
 
 
 def one_place(views: list[View], generator: Generator) -> Case:
-    """Return twelve photos that a camera at one place would take, turned by up to ten degrees, cut from a real one."""
+    """Return twelve photos, cut from a real one, that a camera at one place would take, turned by up to ten degrees."""
     source = views[drawn(views, 1, generator)[0]]
     given = source.frame.intrinsics
     width, height = round(0.6 * given.width), round(0.6 * given.height)
@@ -212,7 +212,7 @@ def _around(report: CaptureReport) -> list[int]:
 
 
 def judged(case: Case, report: CaptureReport, usual: dict[str, set[str]]) -> dict[str, Any]:
-    """Compare what the record names with the truth; ``usual`` is what it names where nothing was damaged."""
+    """Compare what the record reports with the truth; ``usual`` is what it reports without damage."""
     problems = {}
     for problem in sorted(set(case.truth) | {p for photo in report.photos for p in photo.problems}):
         named = {photo.name for photo in report.with_problem(problem)}  # type: ignore[arg-type]
@@ -252,7 +252,7 @@ def survey(views: list[View], features: RememberedKeypoints) -> tuple[CaptureRep
 
 
 def scene(views: list[View], others: list[View] | None, seed: int, only: Sequence[str]) -> dict[str, Any]:
-    """Make each kind of damage to one dataset, and judge its record."""
+    """Apply each kind of damage to one dataset, and judge the record of each."""
     features = RememberedKeypoints()
     plain, cost = survey(views, features)
     usual = {
@@ -270,7 +270,7 @@ def scene(views: list[View], others: list[View] | None, seed: int, only: Sequenc
     if others is not None:
         cases["two places"] = lambda: two_places(views, others)
     for name, make in cases.items():
-        case = make()  # always, so that each case draws what it draws in a full run
+        case = make()  # always made, so that each case draws the same random numbers as in a full run
         if only and name not in only:
             continue
         report, cost = survey(case.views, features)

@@ -4,11 +4,11 @@ r"""Learn the confidence of method ``auto`` from answers to images with and with
     python benchmarks/confidence.py benchmarks/results/NAME.rows.jsonl [...] [--write]
 
 Each row of ``benchmarks/faults.py`` that holds diagnostics is an example, unless the query's mirror image ruled it out; it is
-right within 5 degrees and 0.05 units. A logistic regression with a small ridge is fitted, one for poses by landmarks and one
-for poses by the surface. Its quality is measured by leaving out one scene at a time: the model is fitted to the other scenes
-and tested on the one left out (expected calibration error in ten bins, wrong answers among the accepted, right ones among the
-rejected). A harder test leaves out one half of the faults as well, so that it meets kinds of failure that it never saw.
-``--write`` fits to all examples and stores the weights in the package.
+right within 5 degrees and 0.05 units. Logistic regressions with a small ridge penalty are fitted, one for poses by landmarks
+and one for poses by the surface. Their quality is measured by leaving out one scene at a time: the model is fitted to the
+other scenes and tested on the one left out (expected calibration error in ten bins, wrong answers among the accepted, right
+ones among the rejected). A harder test also leaves out one half of the faults, so that the model is tested on kinds of failure
+that it was not fitted to. ``--write`` fits to all examples and stores the weights in the package.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ GOOD = (
     "rendered_inliers",
 )  # fmt: skip
 BAD = ("noise_ratio", "precision", "miscalibration", "free_space_violations")
-"""Features of which more can only raise, or only lower, the confidence: examples are too few to show it for each."""
+"""Features whose larger values can only raise (GOOD) or only lower (BAD) the confidence: examples are too few to show each."""
 BINS = 10
 WITHOUT_CONFIDENCE = (Outcome.MIRRORED, Outcome.AMBIGUOUS)
-"""Outcomes of answers that a mirror image of the query rules out, however well they fit: they state no confidence."""
+"""Outcomes of answers that a mirror image of the query rules out, however well they fit; they have no confidence."""
 FEWEST = 30
-"""Least number of right and of wrong examples from which a model is learned."""
+"""Minimum number of right and of wrong examples from which a model is fitted."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Example:
 
 
 def examples(paths: Sequence[Path]) -> list[Example]:
-    """Read the rows whose answers state a confidence; none to an image of another scene is right."""
+    """Read the rows whose answers state a confidence. Answers to images of another scene are all wrong."""
     found = []
     for path in paths:
         for text in path.read_text().splitlines():
@@ -82,7 +82,7 @@ def example(row: dict[str, Any]) -> Example:
 def fitted(given: Sequence[Example], ridge: float = RIDGE) -> confidence.LogisticModel:
     """Fit a logistic regression whose weights have the right signs.
 
-    Features are standardised for the ridge, and the weights are those of the raw ones.
+    Features are standardised for the ridge penalty; the weights returned are for the raw features.
     """
     names = tuple(given[0].features)
     x = np.array([[e.features[name] for name in names] for e in given])
@@ -104,7 +104,7 @@ def fitted(given: Sequence[Example], ridge: float = RIDGE) -> confidence.Logisti
 
 
 def folds(given: Sequence[Example], by_fault: bool) -> list[tuple[list[Example], list[Example]]]:
-    """Return pairs of examples to fit and to test: of other scenes and, with ``by_fault``, of the other half of the faults."""
+    """Return pairs (fit, test) of examples from different scenes and, with ``by_fault``, different halves of the faults."""
     faults = sorted({e.fault for e in given})
     halves = [(set(faults[::2]), set(faults[1::2])), (set(faults[1::2]), set(faults[::2]))]
     pairs = []
@@ -140,7 +140,7 @@ def assessed(said: Sequence[float], right: Sequence[bool]) -> dict[str, Any]:
 
 
 def cross_validated(given: Sequence[Example], by_fault: bool) -> dict[str, Any]:
-    """Fit and test on every fold, and pool the answers, in all and by scene."""
+    """Fit and test on every fold, and pool the answers, overall and by scene."""
     said, right, scenes = [], [], []
     for fit, test in folds(given, by_fault):
         model = fitted(fit)

@@ -1,11 +1,11 @@
-r"""The noise that single depth images show, by themselves and with noise of known size added.
+r"""The noise estimated from single depth images, as they are and with noise of known size added.
 
     python benchmarks/depth_noise.py DATA [DATA ...] --frames 10
 
-Of each dataset, evenly spaced test frames are taken. Frames whose index in the test split is 1 modulo 5 are left out, since the
-estimate was set up on them. Results, for each fault of ``docs/faults.md`` that is tried: the median over the frames of the
-estimated noise over the depth at the image's median depth, the share that was added there, and the number of frames in which
-depth has steps of whole disparities.
+Evenly spaced test frames are taken from each dataset. Frames whose index in the test split is 1 modulo 5 are left out, since
+the estimate was developed on them. Results, for each fault of ``docs/faults.md`` that is tried: the median over the frames of
+the estimated relative noise at the image's median depth, the relative noise that was added there, and the number of frames
+whose depth has steps of whole disparities.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def one_image(view: View, fault: str) -> dict[str, Any]:
 
 
 def added(fault: str, depth: float) -> float:
-    """Return the standard deviation of the noise that a fault adds at a depth (metres), over that depth."""
+    """Return the standard deviation of the noise that a fault adds at a depth (metres), relative to that depth."""
     if fault == NO_FAULT:
         return 0.0
     (part,) = parse_faults(fault)

@@ -1,9 +1,9 @@
-"""Compare an evaluation that is killed at random moments and resumed with an undisturbed one and one on two dask workers.
+"""Compare an evaluation that is killed and resumed at random moments with an undisturbed one, and with one on two dask workers.
 
     python benchmarks/evaluate_killed.py [--kills 10] [--trials 40] [--name evaluate_killed]
 
-All run on a closed-form scene by the command line. The three files must be equal except for the time and memory of each
-line: no trial is lost, and none is there twice.
+All run on a closed-form scene through the command line. The three files must be equal except for the time and memory in each
+line: no trial may be missing, and none may occur twice.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def on_dask(out: Path, trials: int) -> None:
 
 
 def lines(path: Path) -> list[dict[str, Any]]:
-    """Return the results of whole lines without what varies from run to run."""
+    """Return the results in complete lines, without what varies from run to run."""
     whole = path.read_text().split("\n")[:-1] if path.exists() else []
     found = [json.loads(line) for line in whole]
     return [{name: value for name, value in line.items() if name not in VARIES} for line in found]

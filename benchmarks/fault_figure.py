@@ -21,9 +21,9 @@ DRAWN = {
     "converged": ("converged", COLOURS[0]),
     "converged, but wrong": ("silent", COLOURS[1]),
 }
-"""What is drawn: a label, the count in the record, and a colour."""
+"""The shares to draw: each a label, the count in the record, and a colour."""
 ROW, WIDTH = 0.26, 5.2
-"""Height of a fault and width of a panel, inches."""
+"""Height of a fault's row and width of a panel, inches."""
 
 
 def pooled(paths: Sequence[Path]) -> dict[str, dict[str, dict[str, int]]]:

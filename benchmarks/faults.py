@@ -1,18 +1,18 @@
-r"""How right and how honest localization is on images with faults.
+r"""Accuracy of localization, and of its own judgement, on images with faults.
 
     python benchmarks/faults.py MAP:DATA [MAP:DATA ...] [--faults FAULT ...] [--foreign DATA ...] [--frames 20] [--rgb | --rgbd]
 
 Each fault is applied to test frames, which method ``auto`` localizes without a start. ``docs/faults.md`` lists the faults; they
-are given as to ``bidnerf evaluate --fault``, and by default all are tried at the sizes of the catalogue. ``--foreign`` takes
+are given as for ``bidnerf evaluate --fault``, and by default all are tried at the sizes of the catalogue. ``--foreign`` takes
 queries from other datasets: no answer to them is right. Frames whose index in the test split is 1 modulo 5 are for tuning and
-left out; ``--tuning-frames`` takes those only.
+left out; ``--tuning-frames`` takes only those.
 
-Every answer is kept as a row of ``NAME.rows.jsonl`` beside the record, with all its numbers and the errors, so that an
-interrupted run goes on where it stopped and other programs can learn from them. A row is known by the contents of its map,
-its query and the settings, not by the program's version: remove the file, or take another ``--name``, to measure a change of
-the program. Results: how many of n answers are right (within 5 degrees and 0.05 units), strictly right (1 degree, 0.02),
-converged, silent (converged and wrong), and right but rejected; how many of the converged lie inside the bound that their
-covariance puts at 95 %; and the median CPU time.
+Every answer is kept as a row of ``NAME.rows.jsonl`` next to the record, with all its numbers and the errors, so that an
+interrupted run resumes where it stopped and other programs can use the rows. A row is identified by the content of its map,
+its query and the settings, not by the program's version: to measure a change of the program, remove the file or choose another
+``--name``. Results: how many of n answers are right (within 5 degrees and 0.05 units), strictly right (1 degree, 0.02),
+converged, silent (converged and wrong), and right but rejected; how many of the converged lie inside the 95 % bound of their
+covariance; and the median CPU time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from bidnerf_core.serialization import to_plain
 RESULTS = Path(__file__).resolve().parent / "results"
 FOREIGN = "another-scene"
 BOUND = float(chi2.ppf(0.95, 6))
-"""Normalised squared error below which nineteen of twenty errors lie, where the covariance is right."""
+"""Normalised squared error below which nineteen of twenty errors lie if the covariance is right."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Query:
     """One image to localize: a frame of a dataset with a fault."""
 
     map: str
-    data: str  # folder that the frame is from
+    data: str  # folder of the frame's dataset
     frame: str
     depth: bool
     fault: str
@@ -71,13 +71,13 @@ class Query:
         return Path(self.map).name, "RGB-D" if self.depth else "RGB", fault
 
     def view(self) -> View:
-        """Return the faulty image, with its true pose (of another scene's image: a pose in that scene)."""
+        """Return the faulty image with its true pose, which for an image of another scene is a pose in that scene."""
         dataset = dataset_of(self.data, map_of(self.map).bounds.background)
         view = faulty(dataset.views("test", [self.frame])[0], self.fault, self.seed)
         return view if self.depth else View(replace(view.frame, depth=None), view.T_ref_camera)
 
     def key(self) -> list[Any]:
-        """Return what the answer depends on, by content."""
+        """Return everything that the answer depends on, by content."""
         info = map_of(self.map).info
         baked = [info.weights, str(info.landmarks), str(info.surface)]
         return [*self.cell, self.frame, self.seed, self.config, *baked, views_digest([self.view()])]
@@ -85,24 +85,24 @@ class Query:
 
 @lru_cache(maxsize=2)
 def map_of(folder: str) -> Map:
-    """Return a map, which is read once while its cells are measured."""
+    """Return a map, cached while its cells are measured."""
     return load_map(Path(folder))
 
 
 @lru_cache(maxsize=8)
 def dataset_of(folder: str, background: tuple[float, float, float]) -> Dataset:
-    """Return a dataset, which is opened once."""
+    """Return a dataset, cached."""
     return open_dataset(Path(folder), background)
 
 
 @lru_cache(maxsize=2)
 def localizer_of(map: str, config: str) -> Localizer:
-    """Return the localizer of a map, which is made once while its cells are measured."""
+    """Return the localizer of a map, cached while its cells are measured."""
     return Localizer(map_of(map), "auto", parse_settings("auto", config))
 
 
 def answer(query: Query) -> dict[str, Any]:
-    """Localize one image; return everything that the answer holds, and its errors where there is a true pose."""
+    """Localize one image; return the whole answer, and its errors where there is a true pose."""
     torch.set_num_threads(1)
     localizer, view = localizer_of(query.map, query.config), query.view()
     began = time.process_time()
@@ -114,13 +114,13 @@ def answer(query: Query) -> dict[str, Any]:
 
 
 def diagnostics_of(found: Localization) -> dict[str, Any]:
-    """Return what an answer says about itself beside its pose, where it does."""
+    """Return the diagnostics of an answer, where it has any."""
     names = ("confidence", "diagnostics")
     return {name: to_plain(getattr(found, name)) for name in names if getattr(found, name, None) is not None}
 
 
 def errors_of(found: Localization, view: View | None) -> dict[str, Any]:
-    """Return the errors of an answer; none where the query shows another scene, or the answer is not finite."""
+    """Return the errors of an answer: None where the query shows another scene, or the answer is not finite."""
     names = ("translation", "rotation_deg", "normalized_error_squared")
     if view is None or not bool(found.T_world_camera.matrix().isfinite().all()):
         return dict.fromkeys(names)
@@ -133,12 +133,12 @@ def errors_of(found: Localization, view: View | None) -> dict[str, Any]:
 
 
 def within(row: dict[str, Any], metres: float, degrees: float) -> bool:
-    """Return whether an answer is that near to the true pose."""
+    """Return whether an answer is within these distances of the true pose."""
     return row["translation"] is not None and row["translation"] < metres and row["rotation_deg"] < degrees
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the counts of one cell, with Wilson intervals of the shares of right and of silent answers."""
+    """Return the counts of one cell, with Wilson intervals for the shares of right and of silent answers."""
     right = [within(row, 0.05, 5) for row in rows]
     accepted = [row["converged"] for row in rows]
     pairs = list(zip(accepted, right, strict=True))
@@ -186,7 +186,7 @@ def queries(given: argparse.Namespace) -> Iterator[Query]:
 def frames_of(
     given: argparse.Namespace, map: str, data: str, depth: bool, fault: str, foreign: bool
 ) -> Iterator[Query]:
-    """Yield queries of one cell: evenly spaced frames of those for tuning or of those for reports; none without depth."""
+    """Yield the queries of one cell: evenly spaced frames for tuning or for reports; none if depth is needed but missing."""
     dataset = dataset_of(data, map_of(map).bounds.background)
     names = [n for i, n in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == given.tuning_frames]
     if depth and not any(view.frame.has_depth for view in dataset.views("test", names[:1])):
@@ -200,7 +200,7 @@ def frames_of(
 def answered(
     asked: Iterator[Query], store: RowStore, executor: Executor, jobs: int
 ) -> Iterator[tuple[Query, dict[str, Any]]]:
-    """Yield all queries with their rows, in order; ``jobs`` of them are under way at once."""
+    """Yield all queries with their rows, in order, with ``jobs`` queries under way at a time."""
     waiting: deque[tuple[Query, list[Any], Future[dict[str, Any]] | None]] = deque()
 
     def first() -> tuple[Query, dict[str, Any]]:

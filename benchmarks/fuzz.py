@@ -1,11 +1,11 @@
-"""Give 10,000 malformed files, options and arguments to every command and to the Python door, and judge what comes back.
+"""Give 10,000 malformed files, options and arguments to all commands and to the Python interface, and judge the results.
 
     python benchmarks/fuzz.py [--count 10000] [--minutes 10] [--seed 0] [--name fuzz] [--only NUMBER...]
 
 Every case is drawn from its own seed, and runs in this process on a fresh copy of a folder of sound files, with a limit of
-10 s and 2 GB. It must end in a result, in one line on stderr with exit status 1, in wrong usage with exit status 2, or, at
-the Python door, in an ``InputError``. A traceback, a longer time, more memory, a character that controls the terminal, and
-a file that is left half-written are defects; they are listed with the numbers of their cases, and ``--only`` repeats them.
+10 s and 2 GB. It must end in a result, in one line on stderr with exit status 1, in wrong usage with exit status 2, or, in
+Python, in an ``InputError``. A traceback, exceeding the limits of time or memory, a character that controls the terminal, and
+a half-written file are defects; they are listed with the numbers of their cases, and ``--only`` repeats these.
 """
 
 from __future__ import annotations
@@ -47,23 +47,23 @@ from bidnerf_core.files import is_temporary
 
 RESULTS = Path(__file__).parent / "results"
 LONGEST, MOST_MEMORY = 10.0, 2 * 2**30
-"""Seconds of computing, and bytes beyond those of the process before the case."""
+"""CPU seconds, and bytes beyond those of the process before the case."""
 MOST_WAITING = 30.0
-"""Seconds on the clock, of which a busy machine may give a case a third only."""
+"""Seconds of wall time: on a busy machine a case may get only a third of it as CPU time."""
 NOBODY = 65534
 
 
 class TooLong(BaseException):
-    """The case ran into the limit of time; no handler of the library takes it for something else."""
+    """The case exceeded the time limit. As a ``BaseException``, no handler of the library catches it."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a case ended."""
+    """The outcome of a case."""
 
     ending: str  # "done", "refused", "wrong usage", "interrupted", or the type of an exception
     seconds: float
-    bytes: int  # most memory beyond that before the case
+    bytes: int  # peak memory beyond that before the case
     defects: tuple[str, ...]
 
 
@@ -106,7 +106,7 @@ def run_case(case: Case, folder: Path) -> Outcome:
 
 
 def through(case: Case) -> str:
-    """Go through the door of a case; return how a command ended."""
+    """Run a case through its entry point; return how a command ended."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if not isinstance(case.door, list):
@@ -118,7 +118,7 @@ def through(case: Case) -> str:
 
 @contextlib.contextmanager
 def limited() -> Iterator[None]:
-    """Stop what is inside after ``LONGEST`` seconds, and refuse it more than ``MOST_MEMORY``."""
+    """Limit the code in the context to ``LONGEST`` seconds and ``MOST_MEMORY``."""
     began, cpu = time.monotonic(), time.process_time()
 
     def stop(number: int, frame: Any) -> None:
@@ -141,7 +141,7 @@ def limited() -> Iterator[None]:
 
 @contextlib.contextmanager
 def as_user(case: Case, folder: Path) -> Iterator[None]:
-    """Work in the folder, as a user without privileges where permissions are what is tested."""
+    """Work in the folder, as a user without privileges if permissions are tested."""
     here = Path.cwd()
     os.chdir(folder)
     root = case.as_user and os.geteuid() == 0
@@ -181,7 +181,7 @@ def defects_of_files(folder: Path, before: set[Path]) -> Iterator[str]:
 
 
 def whole(path: Path) -> bool:
-    """Whether a new file can be read."""
+    """Return whether a new file can be read."""
     checks: dict[str, Callable[[Path], object]] = {
         ".json": lambda p: json.loads(p.read_bytes()),
         ".jsonl": lambda p: [json.loads(line) for line in p.read_bytes().splitlines()],

@@ -1,4 +1,4 @@
-"""What ``fuzz.py`` tries: a folder of sound files, the ways to damage it, and the doors that damaged files go through."""
+"""The cases of ``fuzz.py``: a folder of sound files, the ways to damage it, and the entry points that read damaged files."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ BAKED = ["--cells", "2000"]
 Words: TypeAlias = list[str]
 PythonDoor: TypeAlias = Callable[[Path], object]
 Door: TypeAlias = Words | PythonDoor
-"""Words of a command, in which ``{}`` stands for the folder; or a function of the folder."""
+"""An entry point: the words of a command, in which ``{}`` stands for the folder, or a function of the folder."""
 
 
 # A folder of sound files.
@@ -99,7 +99,7 @@ def _run(*words: object) -> None:
         raise SystemExit(f"the sound command failed: {' '.join(map(str, words))}")
 
 
-# Doors.
+# Entry points.
 
 
 def _frame(photo: str = "photo.png", **options: Any) -> PythonDoor:
@@ -200,7 +200,7 @@ TARGETS = [
 ]  # fmt: skip
 
 
-# Things in the place of a file.
+# Other things in place of a file.
 
 
 def no_permission(path: Path) -> None:
@@ -230,7 +230,7 @@ def link(to: str) -> Callable[[Path], None]:
 
 
 def hollow(path: Path) -> None:
-    """Extend the file to 4 GB, of which it takes none of the disk."""
+    """Extend the file to 4 GB without occupying disk space."""
     os.truncate(path, 4 * 2**30)
 
 
@@ -314,7 +314,7 @@ VALUES = (*TEXTS, *NUMBERS, "test", "train", "none", "auto", "bid", "0.3", "1", 
 
 
 def odd_words(chance: Random) -> Words:
-    """Return a command with options that are unknown, out of range, contradictory, or no text at all."""
+    """Return a command with options that are unknown, out of range, contradictory, or not even valid text."""
     words = list(chance.choice(COMMANDS))
     for _ in range(chance.choice((1, 1, 2, 4))):
         place = chance.randrange(1, len(words) + 1)
@@ -329,11 +329,11 @@ def odd_words(chance: Random) -> Words:
     return words
 
 
-# The Python door: values in the place of arrays and numbers.
+# The Python interface: unsuitable values in place of arrays and numbers.
 
 
 def odd_call(chance: Random) -> tuple[str, PythonDoor]:
-    """Return the name and the call of a public function with arguments that are of no use."""
+    """Return the name and the call of a public function with unusable arguments."""
     numbers: list[Any] = [
         0,
         -1,
@@ -412,12 +412,12 @@ def _photo(folder: Path) -> Frame:
 
 @dataclass(frozen=True)
 class Case:
-    """A damaged folder, and the door that it goes through."""
+    """A damaged folder, and the entry point that reads it."""
 
     kind: str
     door: Door
     words: str  # the command, or the name of the function
-    as_user: bool = False  # whether permissions count, which they do not for root
+    as_user: bool = False  # whether to run as another user, since root ignores permissions
 
 
 def draw_case(chance: Random, sound: Path, folder: Path) -> Case:

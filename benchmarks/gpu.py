@@ -1,16 +1,16 @@
-"""What a GPU makes of the methods: time of a step by backend and where it goes, no-start localization, the paper's tables.
+"""Performance on a GPU: time and profile of a step by backend, localization without a start, the paper's tables.
 
     python benchmarks/gpu.py DATA --map MAP [--map MAP ...] --out FOLDER [--part training steps no_start tables]
 
-- ``training``: ``map_quality.py`` on the device, for each backend that is named by ``--train``: time, quality, memory;
-- ``steps``: milliseconds of a step of ``bid`` with 2048 rays at each level of each map, timed with events of the device after a
-  warm-up: launched one operation after the other, under PyTorch's check that the host never waits, and as a CUDA graph, as
-  ``bid`` takes them; with the number of operations and those that take most of the time;
+- ``training``: ``map_quality.py`` on the device, for each backend that ``--train`` names: time, quality, memory;
+- ``steps``: milliseconds of a step of ``bid`` with 2048 rays at each level of each map, timed with device events after a
+  warm-up: launched one operation at a time, under PyTorch's check that the host never waits, and as a CUDA graph, as in
+  ``bid``; with the number of operations and those that take most of the time;
 - ``no_start``: method ``auto`` on RGB-D and on RGB test frames: median time and success;
 - ``tables``: ``paper_tables.py`` with preset ``paper`` and with ``paper-scene``, on the device.
 
-Finished rows are kept in FOLDER, safe against any kill: the same command goes on where it stopped. When all is done, the record
-``gpu.json`` is written there. Without a GPU the script says so and ends with status 0.
+Finished rows are kept in FOLDER and survive a kill at any moment: the same command resumes where it stopped. When everything is
+done, the record ``gpu.json`` is written there. Without a GPU the script prints a message and ends with status 0.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ from bidnerf_core.waiting import without_waiting
 
 TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
 FRAMES = 40
-"""Largest number of frames that are localized without a start."""
+"""Maximum number of frames that are localized without a start."""
 
 
 def made_steps(
     folder: str, data: str, level: int, device: torch.device, rays: int = TIMED_RAYS,
     generator: torch.Generator | None = None,
 ) -> AdamSteps:  # fmt: skip
-    """Return the steps of ``bid`` from 0.1 units beside the first test frame's pose."""
+    """Return the steps of ``bid`` that start 0.1 units from the first test frame's pose."""
     stored, dataset = opened(folder, data)
     there = None if device.type == "cpu" else device
     scene = Localizer(stored, "bid", device=there, warm_up=False).map
@@ -74,13 +74,13 @@ def made_steps(
         problem.on_device(), objective_of(usual.colour, usual.depth), RayCounts(rays),
         DescentSettings(rays=rays, level=level), ReachSettings(), generator or torch.Generator(device).manual_seed(0),
     )  # fmt: skip
-    # Poses stay where they are, so that all steps render alike.
+    # Poses hardly move, so that all steps render the same.
     rate = AdamSettings(learning_rate=1e-9, decay=1.0)
     return AdamSteps(loss, pivot("scene", problem), rate, problem.start_for("bid").to(device))
 
 
 def timed(step: Callable[[], None], count: int) -> tuple[float, float]:
-    """Return the median and the largest time of a step (ms) by the device's events."""
+    """Return the median and the maximum time of a step (ms), measured with device events."""
     torch.cuda.synchronize()
     marks = [torch.cuda.Event(enable_timing=True) for _ in range(count + 1)]
     for mark in marks[:-1]:
@@ -93,7 +93,7 @@ def timed(step: Callable[[], None], count: int) -> tuple[float, float]:
 
 
 def timed_steps(steps: AdamSteps, device: torch.device, generator: torch.Generator) -> dict[str, Any]:
-    """Return the times of a step, launched and as a graph, and the operations that take most of the time."""
+    """Return the times of a step, launched and as a graph, and the most expensive operations."""
     with without_waiting():
         for _ in range(WARM_UP):
             steps()
@@ -121,7 +121,7 @@ def timed_steps(steps: AdamSteps, device: torch.device, generator: torch.Generat
 
 
 def operations(steps: AdamSteps) -> dict[str, Any]:
-    """Return how many kernels a step launches, how long they take, and the ten that take most of that, with their share of it."""
+    """Return the number of kernels that a step launches, their total time, and the ten longest with their shares of it."""
     kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
     with torch.profiler.profile(activities=kinds, acc_events=True) as profile:
         for _ in range(PROFILED):
@@ -151,7 +151,7 @@ def step_rows(folder: str, data: str, device: torch.device) -> dict[str, Any]:
 
 
 def trained(backend: str, data: str, out: Path, device: torch.device) -> dict[str, Any]:
-    """Train a map with the defaults of a backend, and return its quality and what the training took."""
+    """Train a map with the defaults of a backend, and return its quality and the cost of training."""
     script, name = Path(__file__).with_name("map_quality.py"), f"map_gpu_{backend}"
     subprocess.run(
         [sys.executable, str(script), data, "--out", str(out / f"{backend}_map"), "--name", name,
@@ -186,7 +186,7 @@ def _without_depth(view: View) -> View:
 def table_rows(
     folder: str, data: str, out: Path, preset: str, device: torch.device, workers: int
 ) -> dict[str, Any]:
-    """Run the paper's tables in a process of their own, which goes on where it stopped."""
+    """Run the paper's tables in a process of their own, which resumes where it stopped."""
     script = Path(__file__).with_name("paper_tables.py")
     began, tables = time.perf_counter(), out / preset
     subprocess.run(
@@ -198,7 +198,7 @@ def table_rows(
 
 
 def attempted(what: str, make: Callable[[], Any]) -> Any:
-    """Return what ``make`` returns, or why it failed: the other rows are worth having all the same."""
+    """Return the result of ``make``, or why it failed, so that the other rows are measured nevertheless."""
     print(what, flush=True)
     try:
         return make()

@@ -1,4 +1,4 @@
-"""The hash encoding beside its plain formulation: time of a forward pass and of its gradients on one core.
+"""The hash encoding compared with its plain formulation: time of a forward pass and of its gradients on one core.
 
 The plain formulation is that of the torch fallback in nerfstudio: int64 hashes of all levels at once, one
 ``table[index]`` for each corner, and an elementwise trilinear interpolation. Both give the same numbers, which is
@@ -73,7 +73,7 @@ class PlainEncoding(nn.Module):
 
 
 def evaluate(module: nn.Module, points: Tensor, weight: Tensor, mode: str) -> Tensor:
-    """Output of one pass; the gradients of ``mode`` are left in place."""
+    """Return the output of one pass; the gradients of ``mode`` are left in place."""
     output: Tensor = module(points)
     if any(MODES[mode]):
         output.backward(weight)
@@ -87,7 +87,7 @@ def prepare(module: nn.Module, points: Tensor, mode: str) -> None:
 
 
 def time_of(module: nn.Module, points: Tensor, weight: Tensor, mode: str) -> float:
-    """Milliseconds of one pass."""
+    """Return the milliseconds of one pass."""
     prepare(module, points, mode)
     start = time.perf_counter()
     evaluate(module, points, weight, mode)
@@ -109,7 +109,7 @@ def check_equal(plain: PlainEncoding, ours: HashEncoding, points: Tensor, weight
 
     (expected, to_points_expected), (output, to_points) = run(plain), run(ours)
     close(output, expected)
-    # On a border between two cells the derivative has two values, and the plain code gives neither.
+    # At the border between two cells the derivative has two values, and the plain code returns neither.
     scaled = points.detach()[:, None] * plain.resolutions[:, None]
     inside = (scaled != scaled.floor()).flatten(1).all(dim=1)
     close(to_points[inside], to_points_expected[inside])
@@ -120,7 +120,7 @@ def check_equal(plain: PlainEncoding, ours: HashEncoding, points: Tensor, weight
 
 
 def compare(plain: Callable[[], float], ours: Callable[[], float], repeats: int) -> dict[str, float]:
-    """Alternate the two, so that a machine that changes its pace does so for both."""
+    """Time the two alternately, so that a change in the machine's speed affects both."""
     plain(), ours()
     times = [(plain(), ours()) for _ in range(repeats)]
     plain_ms, ours_ms = (statistics.median(column) for column in zip(*times, strict=True))

@@ -1,13 +1,13 @@
-"""Weights that others trained: how well they render real images, and how often poses are found in them.
+"""Weights trained by others: the quality of their renderings of real images, and the success of localization in them.
 
     pip install ./plugins/bidnerf-nerf-pytorch
     python benchmarks/imported_weights.py CHECKPOINT DATA --name imported_weights_lego
 
-The checkpoint is imported twice with the plugin's own command: as its README has it, for the PSNR of both levels on test
-images averaged over 2 x 2 pixels; and with ``--box`` and fewer samples a ray, for poses found by ``bid`` from starts of
+The checkpoint is imported twice with the plugin's own command: as in its README, for the PSNR of both levels on test
+images averaged over 2 x 2 pixels; and with ``--box`` and fewer samples per ray, for poses found by ``bid`` from starts of
 protocol ``bid``, in every combination of coarse and fine level with RGB and RGB-D, from the same starts. An RGB image
 has no depth at all, so that its pivot comes from the scene's box. One thread runs everything; finished rows are kept in
-``.jsonl`` files beside the record, so that an interrupted run goes on where it stopped.
+``.jsonl`` files next to the record, so that an interrupted run resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ SHRINK = 2  # of images, for their PSNR
 
 
 def quick_name(given: argparse.Namespace) -> str:
-    """Return a folder's name that differs where checkpoint, box or samples do: trials are known by it."""
+    """Return a folder's name that depends on checkpoint, box and samples, since it identifies trials."""
     asked = json.dumps([given.checkpoint.name, given.box, given.samples])
     return f"quick-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
 
 
 def imported(given: argparse.Namespace, folder: Path) -> tuple[Map, Map]:
-    """Return the map as the README imports it, and one within the object's box with few samples a ray."""
+    """Return the map as imported in the README, and one limited to the object's box with few samples per ray."""
     box = ["--box", *(str(edge) for edge in given.box)]
     quick = [*box, "--coarse-samples", str(given.samples[0]), "--fine-samples", str(given.samples[1])]
     names = "plain", quick_name(given)
@@ -76,7 +76,7 @@ def shrunk(frame: Frame) -> Frame:
 
 
 def seen(stored: Map, view: View, picture: Path | None) -> dict[str, float]:
-    """Return the PSNR of each level, and draw the images where a file is named."""
+    """Return the PSNR of each level, and draw the images if ``picture`` is given."""
     frame = shrunk(view.frame)
     images = [
         render_image(level, frame.intrinsics, view.T_ref_camera, stored.bounds)
@@ -109,7 +109,7 @@ def image_quality(stored: Map, dataset: Dataset, given: argparse.Namespace, kept
 
 
 def cell_trial(folder: Path, given: argparse.Namespace, cell: Cell, frame: str, seed: int) -> Trial:
-    """Return the trial of one level and sensor. Without depth, frames have none and the pivot is the middle of the box."""
+    """Return the trial of one level and sensor. Without depth, the pivot is the middle of the box."""
     level, sensor = cell
     blind = sensor == "RGB"
     settings = DESCENT | {"level": LEVELS[level], "depth_weight": 0.0 if blind else 1.0}
@@ -159,7 +159,7 @@ def difference(first: list[TrialResult], second: list[TrialResult]) -> dict[str,
     result: dict[str, Any] = {}
     for name in CRITERIA:
         good = [[steps < NEVER for steps in steps_of(rows, name)] for rows in (first, second)]
-        pairs = list(zip(*good, strict=False))  # starts that both were tried from
+        pairs = list(zip(*good, strict=False))  # starts from which both were tried
         only = (sum(a and not b for a, b in pairs), sum(b and not a for a, b in pairs))
         p = binomtest(only[0], sum(only)).pvalue if sum(only) else 1.0
         result[name] = {

@@ -1,4 +1,4 @@
-"""How poses suffer from a focal length that is wrong by a few percent.
+"""The effect on poses of a focal length that is wrong by a few percent.
 
     python benchmarks/intrinsics_error.py --map MAP [MAP ...] --data DATA [DATA ...] [--frames 8] [--name intrinsics_error]
 
@@ -26,14 +26,14 @@ NEAR = (0.05, 5.0)  # metres and degrees within which an answer counts as right
 
 
 def zoomed(frame: Frame, factor: float, depth: bool) -> Frame:
-    """Return the frame as a camera of ``factor`` times the focal length would claim it."""
+    """Return the frame with ``factor`` times its focal length in the stated intrinsics."""
     camera = frame.intrinsics
     wrong = dataclasses.replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
     return dataclasses.replace(frame, intrinsics=wrong, depth=frame.depth if depth else None)
 
 
 def summary(localizer: Localizer, views: Sequence[View], factor: float, depth: bool) -> dict[str, Any]:
-    """Localize all views from cameras that are wrong by one factor."""
+    """Localize all views with intrinsics that are wrong by one factor."""
     found = [localizer(zoomed(view.frame, factor, depth)) for view in views]
     errors = [pose_error(f.T_world_camera, v.T_ref_camera) for f, v in zip(found, views, strict=True)]
     metres, degrees = ([float(getattr(e, what)) for e in errors] for what in ("translation", "rotation_deg"))

@@ -1,4 +1,4 @@
-"""What it costs to build landmarks from photos: time, memory, and size.
+"""The cost of building landmarks from photos: time, memory, and size.
 
     python benchmarks/landmark_building.py DATA [DATA ...] [--threads 1] [--name landmark_building]
 
@@ -29,7 +29,7 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def built(data: Path, threads: int) -> dict[str, Any]:
-    """Build the landmarks of a dataset and return what that took."""
+    """Build the landmarks of a dataset, and return the cost."""
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     views = open_dataset(data).views("train")

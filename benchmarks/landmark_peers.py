@@ -1,11 +1,11 @@
-r"""Compare method ``auto`` with the plainest other ways to find a camera, on the same map, the same frames, without a start.
+r"""Compare method ``auto`` with the simplest other ways to localize a camera, on the same map and frames, without a start.
 
     python benchmarks/landmark_peers.py MAP:DATA [MAP:DATA ...] --name landmark_peers
 
 From images alone:
 
 - ``auto``: ours;
-- ``sift + pnp (pycolmap)``: SIFT points that COLMAP triangulates from the training images and their known poses, as hloc's maps;
+- ``sift + pnp (pycolmap)``: SIFT points that COLMAP triangulates from the training images and their known poses, as in hloc;
   exhaustive matching with a ratio test; pycolmap's RANSAC and refinement with default options;
 - ``sift + pnp (opencv)``: the same matches; ``solvePnPRansac`` and ``solvePnPRefineLM``.
 
@@ -15,13 +15,13 @@ Where frames have depth, from image and depth:
 - ``kiss-matcher + gicp``: KISS-Matcher, then small_gicp's GICP, on all pixels with a depth and the surfels of the map;
 - ``open3d fpfh + ransac + icp``, ``open3d fpfh + ransac + coloured icp``: the same points.
 
-Settings of the point cloud methods are tuned for each scene on the frames whose index in the test split is 1 modulo 5, which are
-left out, as they served for tuning of all methods; ``--tuning-frames`` takes those only. Peers take turns, frame by frame,
-in one process of one thread. CPU times begin with the frame in memory and with the map's points, features and trees made.
+Settings of the point cloud methods are tuned for each scene on the frames whose index in the test split is 1 modulo 5. These
+frames are left out, since all methods were tuned on them; ``--tuning-frames`` takes only those. Peers take turns, frame by
+frame, in one process of one thread. CPU times begin with the frame in memory and the map's points, features and trees built.
 
-Libraries that are not installed are skipped: ``pip install '.[eval]' pycolmap`` has all but Open3D, which
-``registration_baselines.py`` says how to get. Triangulated points are kept in ``--cache`` by the content of the images, and
-finished rows beside the record, so that an interrupted run goes on where it stopped.
+Libraries that are not installed are skipped: ``pip install '.[eval]' pycolmap`` installs all but Open3D, for which see
+``registration_baselines.py``. Triangulated points are kept in ``--cache`` by the content of the images, and finished rows next
+to the record, so that an interrupted run resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ OURS = "auto"
 
 
 def answer(peer: Peer, view: View, seed: int) -> dict[str, Any]:
-    """Return the errors of one answer, whether the peer accepts it, and its CPU time; without a pose, errors are none."""
+    """Return the errors of one answer (None without a pose), whether the peer accepts it, and its CPU time."""
     began = time.process_time()
     found = peer(view.frame, seed)
     seconds = time.process_time() - began
@@ -77,7 +77,7 @@ def compared(
     settings: dict[str, Any],
     store: RowStore,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of each peer; peers take turns on each frame. Work that is done once is not timed, but done on ``warm``."""
+    """Return the rows of each peer; peers take turns on each frame. One-time work is done on ``warm`` and not timed."""
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in peers}
     names, warmed = list(peers), set[str]()
 
@@ -97,7 +97,7 @@ def compared(
 
 
 def frames_of(dataset: Dataset, tuning: bool, count: int | None) -> tuple[list[str], list[int]]:
-    """Return the names and indices of ``count`` evenly spaced test frames, of those for tuning or of all others."""
+    """Return the names and indices of ``count`` evenly spaced test frames, from those for tuning or from all others."""
     chosen = [(name, i) for i, name in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == tuning]
     kept = min(count or len(chosen), len(chosen))
     picked = [chosen[place * len(chosen) // kept] for place in range(kept)]
@@ -137,7 +137,7 @@ def summaries(rows: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
 
 
 def totals(scenes: dict[str, Any], mode: str) -> dict[str, Any]:
-    """Return the summaries over the frames of all scenes, of peers that were tried on all of them."""
+    """Return the summaries over the frames of all scenes, for peers that were tried on all of them."""
     parts = [found[mode]["rows"] for found in scenes.values() if mode in found]
     shared = [name for name in (parts[0] if parts else ()) if all(name in part for part in parts)]
     return summaries({name: [row for part in parts for row in part[name]] for name in shared})

@@ -1,10 +1,10 @@
-r"""How the search by landmarks scales: time a query and memory, from one scene to a house of a million landmarks.
+r"""Scaling of the search by landmarks: time per query and memory, from one scene to a house of a million landmarks.
 
     python benchmarks/landmark_scale.py MAP DATA --landmarks 1000000
 
-The house consists of the scene and of copies beside it whose descriptors have their channels in another order: each looks as
-distinctive as the scene, and none like it. Test images of the scene are localized by landmarks alone, without depth and
-without a start, among ever more copies; frames whose index in the split is 1 modulo 5 are left out.
+The house consists of the scene and of copies next to it whose descriptors have their channels in another order: each looks as
+distinctive as the scene, but unlike it. Test images of the scene are localized by landmarks alone, without depth and without a
+start, among more and more copies; frames whose index in the split is 1 modulo 5 are left out.
 """
 
 from __future__ import annotations

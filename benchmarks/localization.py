@@ -6,8 +6,8 @@
 ``--start`` is a protocol, with a size where it has sizes: ``bid:SIZE``, ``perturb:METRES:DEGREES``, ``inerf``, ``none``; one
 record may hold several. Frames whose index in the test split is 1 modulo 5 are left out by default, since settings were
 tuned on them. Without ``--trials`` each frame is tried once. Trials run in processes of one thread; finished trials are
-kept in a ``.jsonl`` beside the record, so that an interrupted run goes on where it stopped. ``bidnerf evaluate`` is the
-command for other purposes.
+kept in a ``.jsonl`` next to the record, so that an interrupted run resumes where it stopped. For other purposes, use
+``bidnerf evaluate``.
 
 Where a method gives a covariance, ``consistent`` counts the answers whose normalised squared error lies inside the 95 %
 bound of chi-squared with 6 degrees of freedom.
@@ -41,7 +41,7 @@ BOUND = float(chi2(6).ppf(0.95))
 
 
 def summary(rows: list[TrialResult], truth: dict[str, SE3]) -> dict[str, Any]:
-    """Return the common statistics of trials, and how consistent their covariances are."""
+    """Return the usual statistics of trials, and the consistency of their covariances."""
     result = asdict(summarize(rows))
     normalized = [value for row in rows if (value := nees(row, truth)) is not None]
     if normalized:
@@ -55,7 +55,7 @@ def summary(rows: list[TrialResult], truth: dict[str, SE3]) -> dict[str, Any]:
 
 
 def nees(row: TrialResult, truth: dict[str, SE3]) -> float | None:
-    """Return the normalised (estimation) error squared, infinite for a singular covariance, none without one."""
+    """Return the normalised (estimation) error squared: infinite for a singular covariance, None without one."""
     if row.covariance is None or row.T_world_camera is None:
         return None
     found = SE3.from_matrix(torch.tensor(row.T_world_camera, dtype=torch.float64))

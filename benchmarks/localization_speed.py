@@ -1,12 +1,12 @@
-r"""Compare methods on maps in one run, from the same starts, one after the other.
+r"""Compare methods on maps in one run, from the same starts, one after another.
 
     python benchmarks/localization_speed.py DATA --map MAP [MAP ...] --start bid:0.5 --methods bid bid-lm auto --trials 20 \
         --name speed_lego
 
 ``--start`` is a protocol, with a size where it has sizes: ``bid:SIZE``, ``perturb:METRES:DEGREES``, ``inerf``, ``none``.
 The other methods are compared with the first one, on each map. Frames whose index in the test split is 1 modulo 5 are
-left out, since settings were tuned on them; ``--tuning-frames`` takes those only. One process of one thread runs all
-trials. Finished trials are kept in a ``.jsonl`` beside the record, so that an interrupted run goes on where it stopped.
+left out, since settings were tuned on them; ``--tuning-frames`` takes only those. One process of one thread runs all
+trials. Finished trials are kept in a ``.jsonl`` next to the record, so that an interrupted run resumes where it stopped.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Malformed files, drawn at random: JSON, images, arrays, tensors and points that are damaged in the ways that files are.
+"""Malformed files, drawn at random: JSON, images, arrays, tensors and points with typical damage.
 
 Each table maps the name of a kind of damage to a function of a ``random.Random`` and of the sound content, which returns
-the damaged content. ``fuzz.py`` puts such files in the place of the sound ones; ``tests/test_fuzz.py`` does so too.
+the damaged content. ``fuzz.py`` and ``tests/test_fuzz.py`` put such files in place of sound ones.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from PIL import Image
 Damage: TypeAlias = Callable[[Random, bytes], bytes]
 
 TERMINAL = "\x1b[2J\x1b]0;owned\x07\x9b31m\x00\r\u202e\ud800\u2028"
-"""Clears a terminal, sets its title, colours and reverses what follows; with half of a surrogate pair."""
+"""Text that clears a terminal, sets its title, and colours and reverses what follows; it has half of a surrogate pair."""
 TEXTS = (
     "",
     " ",
@@ -53,7 +53,7 @@ NUMBERS = (
 )
 OTHER_VALUES: tuple[Any, ...] = (None, True, [], {}, "text", 0, -1, 1.5, [[]], [None], {"": {}}, [1, 2, 3])
 LARGE = 100_000
-"""Columns and rows of images and arrays that no memory holds."""
+"""Columns and rows of images and arrays that are too large for any memory."""
 
 
 # Bytes of any kind.
@@ -92,7 +92,7 @@ BYTES: dict[str, Damage] = {
 }
 
 
-# JSON. A marker is put in the place of a value and replaced in the text, since Python's JSON writes no 1e400.
+# JSON. A marker replaces a value, and is itself replaced in the text, since Python's JSON does not write 1e400.
 
 MARKER = "@marker@"
 
@@ -148,7 +148,7 @@ def missing_key(chance: Random, content: bytes) -> bytes:
 
 
 def other_key(chance: Random, content: bytes) -> bytes:
-    """Rename a key, to a name with control characters or a slip of the pen."""
+    """Rename a key, to a name with control characters or a typing error."""
     whole = json.loads(content)
     places = [place for place in places_of(whole) if isinstance(place[-1], str)]
     if places:
@@ -206,7 +206,7 @@ def saved(image: Image.Image, kind: str, **more: Any) -> bytes:
 
 
 def size_in_header(chance: Random, content: bytes) -> bytes:
-    """Return a PNG with another size in its header, whose checksum is right."""
+    """Return a PNG with another size in its header, and a correct checksum."""
     width, height = chance.choice(
         ((LARGE, LARGE), (2**31 - 1, 1), (1, 2**31 - 1), (0, 5), (12_000, 12_000), (9000, 9000), (25, 24))
     )
@@ -251,7 +251,7 @@ def one_pixel(chance: Random, content: bytes) -> bytes:
 
 
 def compressed_zeros(chance: Random, content: bytes) -> bytes:
-    """Return a small PNG of many pixels, one byte of data for a thousand of the image."""
+    """Return a small PNG of many pixels, one byte of data for a thousand bytes of the image."""
     side = chance.choice((4000, 12_000))
     return png(
         struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0), zlib.compress(b"\0" * (side * (side + 1)), 9)

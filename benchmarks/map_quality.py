@@ -2,14 +2,14 @@
 
     python benchmarks/map_quality.py DATA --out MAP --name map_lego [-- OPTIONS OF bidnerf train]
 
-Records wall time, CPU time and peak memory of ``bidnerf train`` as a process, the size of the map, and on the test split the PSNR
-of images, the absolute error of depth where depth was measured, and how many samples a ray takes. A map does not have the
-exposure of a photo that it was not trained on: PSNR is measured as rendered, and after the gain and the offset of each colour
+Records wall time, CPU time and peak memory of ``bidnerf train`` as a process, the size of the map, and on the test split the
+PSNR of images, the absolute error of depth where depth was measured, and the number of samples per ray. A map cannot know the
+exposure of a photo that it was not trained on: PSNR is measured as rendered, and after the gain and the offset per colour
 channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
-measured at the poses that the map's landmarks give the test frames, and on training frames at the poses that the map has of
-them. Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the choice of samples that
-makes it fast, is judged beside that on every fifth frame. ``--without-depth`` keeps the measured depth of a ``transforms_train.json``
-from the training, and judges by that of the test split.
+measured at poses of the test frames that are refined with the map's landmarks, and on training frames at the poses in the map.
+Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the selection of samples that
+makes it fast, is compared with that on every fifth frame. ``--without-depth`` withholds the measured depth of a
+``transforms_train.json`` from the training, and uses that of the test split for judging.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from bidnerf_core.storage import Map, load_map
 from bidnerf_core.training import fitted_colours
 
 LEAST_LANDMARKS = 30
-"""Least number of landmarks from which the pose of a test frame is refined."""
+"""Minimum number of landmarks from which the pose of a test frame is refined."""
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -75,8 +75,10 @@ def train_without_depth(data: Path, out: Path, options: list[str]) -> dict[str, 
 
 
 def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, float | None]:
-    """Return the mean PSNR (as rendered, and after ``fitted_colours``) and SSIM, and the median and 90th percentile of the
-    absolute depth error (metres) over measured pixels, with the median of its ratio to the measured depth.
+    """Return the mean PSNR (as rendered, and after ``fitted_colours``) and SSIM, and statistics of the depth error.
+
+    These are the median and 90th percentile of the absolute error (metres) over measured pixels, and the median of its ratio
+    to the measured depth.
     """
     quality, fitted, likeness, errors, ratios, missing, measured = [], [], [], [], [], 0, 0
     for view in views:
@@ -108,7 +110,7 @@ def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[
 
 @torch.no_grad()
 def samples_per_ray(field: RadianceField, bounds: SceneBounds, views: list[View]) -> float:
-    """Mean number of queried samples over every fourth pixel along each axis, those that miss the scene included."""
+    """Return the mean number of queried samples over every fourth pixel along each axis, including rays that miss the scene."""
     taken, rays, device = 0, 0, device_of(field)
     for view in views:
         ray = view.frame.intrinsics.unproject(view.frame.intrinsics.pixel_centres())[::4, ::4].reshape(-1, 3)
@@ -120,9 +122,9 @@ def samples_per_ray(field: RadianceField, bounds: SceneBounds, views: list[View]
 
 
 def at_landmark_poses(stored: Map, views: list[View]) -> dict[str, Any] | None:
-    """Return the quality at the poses that fit the map's landmarks best near the given ones, and how far those are away.
+    """Return the quality at the poses near the given ones that fit the map's landmarks best, and the distances between both.
 
-    Frames that show too few landmarks are left out, of both ``given`` and ``refined``.
+    Frames that show too few landmarks are left out of both ``given`` and ``refined``.
     """
     if stored.landmarks is None:
         return None
@@ -148,7 +150,7 @@ def at_landmark_poses(stored: Map, views: list[View]) -> dict[str, Any] | None:
 
 
 def on_training_frames(stored: Map, data: Path) -> dict[str, float | None]:
-    """Return the quality on a few training frames, at the poses that the map has of them."""
+    """Return the quality on a few training frames, at their poses in the map."""
     views = open_dataset(data, stored.bounds.background).views("train")
     return judge(
         stored.field, stored.bounds, at_stored_poses(views, stored.info.cameras)[:: max(1, len(views) // 20)]
@@ -156,7 +158,7 @@ def on_training_frames(stored: Map, data: Path) -> dict[str, float | None]:
 
 
 def beside_dense(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[str, Any] | None:
-    """Return the quality of the field and of its ``dense`` counterpart, which is slow, on every fifth frame."""
+    """Return the quality of the field and of its slow ``dense`` counterpart on every fifth frame."""
     dense = getattr(field, "dense", None)
     if dense is None:
         return None

@@ -1,10 +1,10 @@
-r"""The look-up of the nearest surfel, in which the search by depth spends its time: sparse index against a dense grid.
+r"""The look-up of the nearest surfel, where the search by depth spends its time: sparse index against a dense grid.
 
     python benchmarks/nearest_surfel.py MAP [MAP ...] --name nearest_surfel
 
-The dense grid has the cells of the map's index and names a surfel for each of them; the look-up in it is the one of versions
-before the index was sparse. Both look up the same points, in the numbers of poses and points of the search's stages,
-alternating in one process of one thread; the ratio is the median over the pairs.
+The dense grid has the cells of the map's index and one surfel for each of them; its look-up is that of versions before the
+index was sparse. Both look up the same points, with the numbers of poses and points of the search's stages, alternating in one
+process of one thread; the ratio is the median over the pairs.
 """
 
 from __future__ import annotations

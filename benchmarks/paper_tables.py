@@ -7,14 +7,14 @@
 - ``table2``: 1 image, 8 images 15 degrees apart, 8 and wide sampling, at e_t 0.9, 1.7 and 3.4;
 - ``inerf``: ``bid`` and ``inerf`` from iNeRF's starts.
 
-All cells of a part share the frames, the starts, the numbers of rays and steps, and all settings but those compared. These are
-those of ``--preset``: ``paper``, with updates in the camera's frame as in the paper's Alg. 1, or ``paper-scene``, with ours. In
-``table1``, the frames of cells without depth have none, so that nothing profits
-from it: ``bid`` then turns about the middle of the map instead of the middle of the measured points. Frames whose index in
-the test split is 1 modulo 5 are left out, since settings were tuned on them.
+All cells of a part share the frames, the starts, the numbers of rays and steps, and all settings but those compared. The
+settings are those of ``--preset``: ``paper``, with updates in the camera's frame as in the paper's Alg. 1, or ``paper-scene``,
+with ours. In ``table1``, the frames of cells without depth have none, so that nothing can use it: ``bid`` then turns about the
+middle of the map instead of the middle of the measured points. Frames whose index in the test split is 1 modulo 5 are left
+out, since settings were tuned on them.
 
-Each part and map has a file of results in FOLDER, safe against any kill: the same command goes on where it stopped. When
-a part is complete, its record is written beside it; ``bidnerf report FOLDER/table1_*.jsonl`` draws it.
+Each part and map has a file of results in FOLDER, which survives a kill at any moment: the same command resumes where it
+stopped. When a part is complete, its record is written next to it; ``bidnerf report FOLDER/table1_*.jsonl`` draws it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ RESULTS = Path(__file__).parent / "results"
 
 Settings = dict[str, Any]
 Common = Callable[[str], Settings]
-"""Returns the settings of a method that all cells share, by its name."""
+"""A function from a method's name to the settings that all cells share."""
 
 PAPER = {
     "table1": {"RGB-D fine": 87.5, "RGB-D coarse": 95.83, "RGB fine": 25.0, "RGB coarse": 75.0},
@@ -61,7 +61,7 @@ PAPER = {
     },
     "inerf": {"bid": 95.0, "inerf, translation": 38.0, "inerf, rotation": 42.0},
 }
-"""Percent, as printed there."""
+"""Percentages as printed in the paper."""
 
 
 def table1(base: Plan, common: Common, trials: int | None) -> list[Plan]:
@@ -120,22 +120,22 @@ def preset_settings(preset: str, others: Settings, method: str) -> Settings:
 
 
 def test_frames(map_folder: str, data: str, tuning: bool) -> tuple[str, ...]:
-    """Return the test frames that settings are tuned on, or all others."""
+    """Return the test frames on which settings are tuned, or all others."""
     _, dataset = opened(map_folder, data)
     names = enumerate(dataset.frame_names("test"))
     return tuple(name for place, name in names if (place % 5 == 1) is tuning)
 
 
 def sequence_ends(plan: Plan) -> tuple[str, ...]:
-    """Return the frames that end a sequence of eight."""
+    """Return the frames with which a sequence of eight can end."""
     every = planned(replace(plan, images=8, trials=10_000, sizes=((0.9,),)))
     return tuple(dict.fromkeys(trial.frame for trial in every))
 
 
 def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float | None = None) -> list[Group]:
-    """Run what is missing and return the groups of all results; after ``minutes``, of those that there are.
+    """Run the missing trials and return the groups of all results; after ``minutes``, of those available by then.
 
-    Raises ``SystemExit`` where it is stopped, or where nothing was done in time.
+    Raises ``SystemExit`` if it is stopped, or if nothing was done in time.
     """
     began = time.monotonic()
 

@@ -28,7 +28,7 @@ LIBRARIES = {
     "pycolmap": "pycolmap", "kiss_matcher": "kiss-matcher", "small_gicp": "small_gicp",
     "open3d": "open3d or open3d-cpu",
 }  # fmt: skip
-"""Distributions that peers need, by the name of their module."""
+"""Distributions that peers need, by module name."""
 
 KISS_GICP = "kiss-matcher + gicp"
 OPEN3D_PEERS = {f"open3d fpfh + ransac + {name}": name for name in ("icp", "coloured icp")}
@@ -36,14 +36,14 @@ OPEN3D_PEERS = {f"open3d fpfh + ransac + {name}": name for name in ("icp", "colo
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """A pose, if one was found, and whether the peer takes it for right; none where it does not judge its answers."""
+    """A pose, if one was found, and whether the peer accepts it; None if the peer does not judge its answers."""
 
     T_world_camera: Matrix | None
     accepted: bool | None = None
 
 
 Peer = Callable[[Frame, int], Answer]
-"""Returns an answer from a frame and a seed."""
+"""A function from a frame and a seed to an answer."""
 
 
 def installed() -> dict[str, str | None]:
@@ -74,7 +74,7 @@ def auto(localizer: Localizer, depth: bool, frame: Frame, seed: int) -> Answer:
 
 
 def image_peers(stored: Map, dataset: Dataset, cache: Path) -> dict[str, Peer]:
-    """Return the methods that take an image; ``cache`` holds what is made of the training images."""
+    """Return the methods that take an image; ``cache`` holds the points triangulated from the training images."""
     peers: dict[str, Peer] = {"auto": partial(auto, Localizer(stored), False)}
     if find_spec("pycolmap"):
         matcher = SiftMatcher(sift_points(dataset.views("train"), cache))
@@ -138,14 +138,14 @@ def _kiss_settings(kiss: KissMatcher, gicp: SmallGicp, tries: Sequence[Case], vo
 def kiss_gicp(
     kiss: KissMatcher, gicp: SmallGicp, voxel: float, refine: Gicp, frame: Frame, seed: int
 ) -> Answer:
-    """Register a frame with KISS-Matcher, which draws nothing at random, and refine the pose."""
+    """Register a frame with KISS-Matcher, which is deterministic, and refine the pose."""
     measured = measured_points(frame)
     T, accepted = kiss.search(measured, voxel)
     return Answer(gicp.refine(measured, T, refine), accepted)
 
 
 def open3d(library: Open3d, ransac: Ransac, refine: Refine, frame: Frame, seed: int) -> Answer:
-    """Register a frame with Open3D, which judges nothing."""
+    """Register a frame with Open3D, which does not judge its answers."""
     library.seed(seed)
     measured = measured_points(frame)
     return Answer(library.refine(measured, library.search(measured, ransac), refine))

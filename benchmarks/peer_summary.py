@@ -1,4 +1,4 @@
-"""Counts of right and silent answers of each peer, and of the frames that only one of two peers finds."""
+"""Counts of right and silent answers of each peer, and of the frames that only one of two peers localizes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def within(row: dict[str, Any], name: str) -> bool:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return success with Wilson intervals, median errors (none where half have no answer), times and silent answers."""
+    """Return success with Wilson intervals, median errors (None if half have no answer), times and silent answers."""
     counts = {
         name: asdict(success_rate(sum(within(row, name) for row in rows), len(rows)))
         for name in CRITERIA_REPORTED
@@ -47,7 +47,7 @@ def _median(values: Sequence[float | None]) -> float | None:
 
 
 def _judged(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return how the peer's own judgement compares with the truth; none of a peer that does not judge."""
+    """Return counts of the peer's own judgement against the truth; None for a peer that does not judge its answers."""
     names = ("accepted", "silent", "right_but_rejected")
     if any(row["accepted"] is None for row in rows):
         return dict.fromkeys(names)
@@ -61,7 +61,7 @@ def _judged(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def against(ours: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return how many frames both, one or neither finds, with McNemar's exact p, and how many times longer theirs takes."""
+    """Return how many frames both, one or neither localizes, with McNemar's exact p, and their time relative to ours."""
     pairs = list(zip(ours, theirs, strict=True))
     result: dict[str, Any] = {}
     for name in CRITERIA_REPORTED:

@@ -1,12 +1,12 @@
-"""Seeded poses of every method, to tell whether a change of the code changes an answer.
+"""Seeded poses of every method, to detect whether a change of the code changes an answer.
 
     python benchmarks/pinned_poses.py record before.json [--map MAP DATA]...
     (change the code)
     python benchmarks/pinned_poses.py record after.json [--map MAP DATA]...
     python benchmarks/pinned_poses.py compare before.json after.json
 
-Always recorded is a closed-form scene; each ``--map`` adds a stored map with a dataset of what it shows. The settings are
-short. Answers repeat to the last digit on one machine with one thread; other processors round otherwise.
+A closed-form scene is always recorded; each ``--map`` adds a stored map with a dataset of the same scene. The settings are for
+short runs. Answers repeat to the last digit on one machine with one thread; other processors round differently.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def cases(pinned: PinnedMap) -> Iterator[Case]:
         for channels, seen in (("rgbd", views), ("rgb", bare)):
             for method in SETTINGS:
                 if method == "inerf" and which == "rig":
-                    continue  # it takes one image
+                    continue  # the method takes only one image
                 name = f"{pinned.name}/{which}/{channels}/{method}"
                 yield Case(f"{name}/start", pinned.map, seen, method, start)
                 if method == "auto":
@@ -100,7 +100,7 @@ def cases(pinned: PinnedMap) -> Iterator[Case]:
 
 
 def row(found: Localization) -> dict[str, Any]:
-    """Return what is compared."""
+    """Return the values to compare."""
     return {
         "T": found.T_world_camera.matrix().tolist(),
         "loss": found.loss,
@@ -110,7 +110,7 @@ def row(found: Localization) -> dict[str, Any]:
 
 
 def differences(expected: dict[str, Any], found: dict[str, Any], tolerance: float = TOLERANCE) -> list[str]:
-    """Return in words what two rows differ in."""
+    """Return the differences between two rows in words."""
     apart = (torch.tensor(expected["T"]) - torch.tensor(found["T"])).abs().max().item()
     loss = abs(expected["loss"] - found["loss"])
     words = [
@@ -131,7 +131,7 @@ def record(out: Path, maps: list[list[Path]]) -> None:
 
 
 def compare(one: Path, other: Path) -> int:
-    """Print what differs, and return how many cases do."""
+    """Print the differences, and return the number of cases that differ."""
     expected, found = (json.loads(path.read_text()) for path in (one, other))
     off = {name: differences(expected[name], found[name]) for name in expected if name in found}
     for name, words in off.items():

@@ -1,11 +1,11 @@
-r"""How ``auto`` finds images unlike those of the map: other resolutions, other lenses, JPEG, an unknown focal length, a rig.
+r"""Localization by ``auto`` of images unlike the map's: other resolutions and lenses, JPEG, an unknown focal length, a rig.
 
     python benchmarks/query_conditions.py MAP:DATA [MAP:DATA ...] [--frames 12]
 
-No start and no depth is given. The longer focal lengths are stated rightly: these are images from other cameras. Frames whose
-index in the test split is 1 modulo 5 are left out, since settings were tuned on them. A rig consists of a frame and the two test
-frames before it, with their true relative poses. One thread; finished answers are kept, so that an interrupted run goes on where
-it stopped.
+No start and no depth is given. The longer focal lengths are stated correctly: these are images from other cameras. Frames
+whose index in the test split is 1 modulo 5 are left out, since settings were tuned on them. A rig consists of a frame and the
+two test frames before it, with their true relative poses. Everything runs on one thread; finished answers are kept, so that an
+interrupted run resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ WRONG_FOCAL = 1.1
 
 
 def resized(frame: Frame, factor: float) -> Frame:
-    """Return the image at another resolution, with the camera that goes with it."""
+    """Return the image at another resolution, with the matching camera."""
     camera = frame.intrinsics.scaled(factor)
     kind = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     rgb = cv2.resize(frame.rgb.numpy(), (camera.width, camera.height), interpolation=kind)
@@ -44,7 +44,7 @@ def resized(frame: Frame, factor: float) -> Frame:
 
 
 def zoomed(frame: Frame, factor: float) -> Frame:
-    """Return the middle of the image at the full size, as a focal length that is ``factor`` times as long would show it."""
+    """Return the middle of the image at the full size, as seen with ``factor`` times the focal length."""
     camera = frame.intrinsics
     width, height = round(camera.width / factor), round(camera.height / factor)
     left, top = (camera.width - width) // 2, (camera.height - height) // 2
@@ -96,7 +96,7 @@ def answer(localizer: Localizer, views: Sequence[View], condition: str) -> dict[
 
 
 def summary(rows: Sequence[dict[str, Any]], condition: str) -> dict[str, Any]:
-    """Return successes with Wilson intervals, median errors, and how honest the answers are."""
+    """Return successes with Wilson intervals, median errors, and how well the answers judge themselves."""
     right = [r["translation"] < 0.05 and r["rotation_deg"] < 5 for r in rows]
     strict = [r["translation"] < 0.02 and r["rotation_deg"] < 1 for r in rows]
     pairs = [(r["converged"], good) for r, good in zip(rows, right, strict=True)]

@@ -2,7 +2,7 @@
 
     python benchmarks/registration_baselines.py MAP DATA --name registration_lego
 
-Compared, alternately, each on one thread, on every frame of the test split:
+The following are compared alternately, each on one thread, on every frame of the test split:
 
 - ``open3d icp``: FPFH features and RANSAC, then point-to-plane ICP; no start;
 - ``open3d coloured icp``: the same, then coloured ICP;
@@ -11,17 +11,17 @@ Compared, alternately, each on one thread, on every frame of the test split:
 - ``auto from start``: ours from the same starts;
 - ``auto + gicp``: GICP from the answer of ``auto``, which had no start.
 
-The other methods register every pixel with a depth with the surfels of the map, which ``bidnerf bake`` makes. ``--voxel``
-is where tuning begins: 5 cm in rooms, or 2 % of the extent of an object. Voxels, distances and stages are chosen for each
-scene on frames whose index in the split is 1 modulo 5, which do not count. Times begin with the frame in memory and the
-map's points, features and trees made.
+The other methods register all pixels that have a depth to the surfels of the map, which ``bidnerf bake`` makes. ``--voxel``
+is the value at which tuning begins: 5 cm in rooms, or 2 % of the extent of an object. Voxels, distances and stages are chosen
+for each scene on frames whose index in the split is 1 modulo 5, which are not reported. Times begin with the frame in memory
+and the map's points, features and trees built.
 
-small_gicp comes with ``pip install '.[eval]'``. Open3D is large and is wanted nowhere else: give it its own environment,
+small_gicp comes with ``pip install '.[eval]'``. Open3D is large and not needed elsewhere: give it its own environment,
 
     python3.11 -m venv .venv-open3d && .venv-open3d/bin/pip install -c constraints.txt '.[eval]' open3d
 
-Libraries that are not installed are skipped. Finished rows are kept in a ``.jsonl`` beside the record, so that an
-interrupted run goes on where it stopped.
+Libraries that are not installed are skipped. Finished rows are kept in a ``.jsonl`` next to the record, so that an
+interrupted run resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ from bidnerf_core.storage import Map
 RESULTS = Path(__file__).parent / "results"
 
 OPEN3D: dict[str, type] = {"ransac": Ransac, "icp": Refine, "coloured icp": Refine}
-"""The type of the settings, by their name."""
+"""The types of the settings, by their names."""
 
 Registration = Callable[[View, int], Matrix]
-"""Returns T_world_camera of a view from its seed; the view's own pose serves only to make a start from it."""
+"""A function from a view and a seed to T_world_camera; the view's own pose serves only to make a start."""
 
 
 def auto(localizer: Localizer, view: View, start: SE3 | None, seed: int) -> Matrix:
@@ -169,7 +169,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def times_slower(rows: dict[str, list[dict[str, Any]]], name: str, clock: str) -> float:
-    """Return how many times slower than ``auto`` a method is: the median over frames, on which both ran in turn."""
+    """Return how many times slower than ``auto`` a method is: the median over the frames, on which both ran in turn."""
     pairs = zip(rows[name], rows["auto"], strict=True)
     return statistics.median(row[clock] / ours[clock] for row, ours in pairs)
 
@@ -188,7 +188,7 @@ def versions() -> dict[str, str | None]:
 def compared(runs: dict[str, Registration], views: Sequence[View], kept: RowStore) -> dict[str, Any]:
     """Return the rows of each method on the frames that settings were not tuned on."""
     names = list(runs)
-    for run in runs.values():  # work that is done only once is not timed
+    for run in runs.values():  # one-time work is not timed
         run(views[1], 0)
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for place, view in enumerate(views):

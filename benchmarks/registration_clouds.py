@@ -1,4 +1,4 @@
-"""What registration of point clouds is given: the points of a baked map, and those that a frame measured."""
+"""The inputs of point cloud registration: the points of a baked map, and those that a frame measured."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bidnerf_core.pixels import observe
 from bidnerf_core.se3 import SE3
 
 WITNESSES = 24
-"""Keyframes that are asked which side of a surfel they see."""
+"""Number of keyframes that vote on the outward side of surfels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of one frame of reference, float64 as the libraries take them."""
+    """Points in one frame of reference, float64 as the libraries require."""
 
     positions: NDArray[np.float64]  # (n, 3), metres
     rgb: NDArray[np.float64]  # (n, 3), 0 to 1
@@ -28,14 +28,14 @@ class Points:
 
 
 def map_points(surface: SurfaceMap) -> Points:
-    """The surfels, their normals turned to where they were seen from: feature histograms depend on that."""
+    """Return the surfels, with normals towards the side they were seen from: feature histograms depend on that."""
     surfels = surface.surfels
     normals = surfels.normals * _outwards(surface)[:, None]
     return Points(*(part.double().numpy() for part in (surfels.positions, surfels.rgb, normals)))
 
 
 def measured_points(frame: Frame) -> Points:
-    """Every pixel that has a depth, in the frame of the camera."""
+    """Return the points of all pixels that have a depth, in the frame of the camera."""
     assert frame.depth is not None
     rows, columns = (frame.depth > 0).nonzero().unbind(-1)
     seen = observe(View(frame, SE3.identity()), torch.stack([columns, rows], dim=-1), torch.float64)
@@ -43,7 +43,7 @@ def measured_points(frame: Frame) -> Points:
 
 
 def _outwards(surface: SurfaceMap) -> torch.Tensor:
-    """1 or -1 a surfel: the side on which most keyframes lie that see it; where none does, all are asked."""
+    """Return 1 or -1 for each surfel: the side of most keyframes that see it or, if none sees it, of most keyframes."""
     keyframes = surface.keyframes[:: max(1, len(surface.keyframes) // WITNESSES)]
     votes = torch.zeros((2, len(surface.surfels)))
     for centre in keyframes[:, :3, 3].to(surface.surfels.positions):

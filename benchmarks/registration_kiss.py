@@ -11,11 +11,11 @@ from registration_methods import Gicp, Matrix, SmallGicp
 from registration_tuning import Case, Score, scored, timed
 
 FEWEST_INLIERS = 5
-"""Number of inliers from which a registration passes for successful, in the library's own example."""
+"""Number of inliers from which the library's own example considers a registration successful."""
 
 
 class KissMatcher:
-    """A map, and how to find frames in it. The library describes the map anew for each frame."""
+    """Registration of frames to a map. The library computes the map's descriptors anew for each frame."""
 
     def __init__(self, points: Points) -> None:
         import kiss_matcher
@@ -35,7 +35,7 @@ class KissMatcher:
 def tuned_kiss(
     library: KissMatcher, gicp: SmallGicp, tries: Sequence[Case], voxel: float
 ) -> tuple[float, list[Matrix]]:
-    """Return the voxel with which most frames are found once GICP has refined them, and the poses before that."""
+    """Return the voxel size with which most frames are localized after refinement by GICP, and the poses before it."""
     rough = Gicp(voxel / 2, (2 * voxel, voxel))
 
     def search(size: float) -> tuple[Score, list[Matrix]]:

@@ -1,6 +1,6 @@
-"""Registration of point clouds by Open3D and small_gicp, as their tutorials have it, one thread.
+"""Registration of point clouds by Open3D and small_gicp as in their tutorials, on one thread.
 
-What can be made of the map beforehand is made once and not timed: its points, features and trees.
+What can be computed from the map beforehand is computed once and not timed: its points, features and trees.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ class Ransac:
     """FPFH features (Rusu et al. 2009) and RANSAC. Lengths in metres."""
 
     voxel: float
-    distance: float = 1.5  # of matched points that agree, in voxels
-    mutual: bool = False  # take matches only that are each other's nearest
+    distance: float = 1.5  # largest distance of matched points that agree, in voxels
+    mutual: bool = False  # take only matches that are each other's nearest
     iterations: int = 100_000
     confidence: float = 0.999
 
 
 @dataclass(frozen=True)
 class Refine:
-    """ICP after it, in one stage or from coarse to fine."""
+    """ICP after RANSAC, in one stage or from coarse to fine."""
 
     colour: bool
-    voxels: tuple[float, ...]  # metres: of both clouds, a stage each
-    distances: tuple[float, ...]  # of matched points, in voxels
+    voxels: tuple[float, ...]  # metres: voxel size of both clouds, for each stage
+    distances: tuple[float, ...]  # largest distance of matched points, in voxels, for each stage
     iterations: int = 50
 
 
@@ -44,19 +44,19 @@ class Gicp:
     """small_gicp's generalised ICP (Segal et al. 2009), in one stage or from coarse to fine."""
 
     voxel: float  # metres
-    distances: tuple[float, ...]  # metres: of matched points, a stage each
+    distances: tuple[float, ...]  # metres: largest distance of matched points, for each stage
     iterations: int = 50
 
 
 def ransac_choices(voxel: float) -> Iterator[Ransac]:
-    """About a voxel that is likely to do."""
+    """Yield settings of RANSAC for voxel sizes around a likely one."""
     for share in (1.0, 1.6):
         for mutual in (False, True):
             yield Ransac(round(share * voxel, 4), mutual=mutual)
 
 
 def ransac_neighbours(best: Ransac) -> Iterator[Ransac]:
-    """What else may be tried once voxel and matching are chosen."""
+    """Yield further settings to try once voxel size and matching are chosen."""
     for distance in (0.8, 3.0):
         yield replace(best, distance=distance)
     yield replace(best, iterations=300_000)
@@ -69,7 +69,7 @@ def refine_choices(voxel: float, colour: bool) -> Iterator[Refine]:
 
 
 def gicp_choices(voxel: float, near: bool) -> Iterator[Gicp]:
-    """Yield settings of GICP for starts that are near the answer, or far off."""
+    """Yield settings of GICP for starts that are near the answer, or far from it."""
     for size in (voxel / 2, voxel):
         far = ((20,), (10,), (5,), (20, 4), (20, 8, 2), (10, 2))
         for steps in ((1,), (2,), (4,), (2, 1)) if near else far:
@@ -77,7 +77,7 @@ def gicp_choices(voxel: float, near: bool) -> Iterator[Gicp]:
 
 
 class Open3d:
-    """A map, and how to find frames in it."""
+    """Registration of frames to a map by Open3D."""
 
     def __init__(self, points: Points) -> None:
         import open3d
@@ -91,7 +91,7 @@ class Open3d:
         self.library.utility.random.seed(seed)
 
     def search(self, measured: Points, config: Ransac) -> Matrix:
-        """Register two clouds without a start."""
+        """Register a frame to the map without a start."""
         registration = self.library.pipelines.registration
         target, target_features = self.features(config.voxel)
         source, source_features = self._described(self._seen(measured, config.voxel), config.voxel)
@@ -108,7 +108,7 @@ class Open3d:
         return np.asarray(found.transformation)
 
     def refine(self, measured: Points, start: Matrix, config: Refine) -> Matrix:
-        """Point-to-plane (Chen and Medioni 1992) or coloured ICP (Park et al. 2017)."""
+        """Refine a pose with point-to-plane (Chen and Medioni 1992) or coloured ICP (Park et al. 2017)."""
         registration = self.library.pipelines.registration
         criteria = registration.ICPConvergenceCriteria(1e-6, 1e-6, config.iterations)
         if config.colour:
@@ -128,7 +128,7 @@ class Open3d:
                 T = np.asarray(
                     run(source, self.at(voxel), distance * voxel, T, estimate, criteria).transformation
                 )
-            except RuntimeError:  # coloured ICP where no points match
+            except RuntimeError:  # raised by coloured ICP if no points match
                 return T
         return T
 
@@ -136,7 +136,7 @@ class Open3d:
         return self._described(self.at(voxel), voxel)
 
     def _described(self, cloud: Any, voxel: float) -> tuple[Any, Any]:
-        """Radii as in the library's tutorial of global registration."""
+        """Return a cloud and its FPFH features, with radii as in the library's tutorial on global registration."""
         around = self.library.geometry.KDTreeSearchParamHybrid(radius=5 * voxel, max_nn=100)
         return cloud, self.library.pipelines.registration.compute_fpfh_feature(cloud, around)
 
@@ -156,7 +156,7 @@ class Open3d:
 
 
 class SmallGicp:
-    """A map, and how to find frames in it from a start."""
+    """Registration of frames to a map from a start, by small_gicp."""
 
     def __init__(self, points: Points) -> None:
         import small_gicp

@@ -1,4 +1,4 @@
-"""Settings with which registration does best on the frames that are kept for tuning."""
+"""Choice of the settings with which registration does best on the frames reserved for tuning."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from bidnerf_core.evaluation.errors import CRITERIA, pose_error
 from bidnerf_core.se3 import SE3
 
 LEAST = 4
-"""Cases to tune on, at least: few frames are searched with several seeds."""
+"""Minimum number of cases to tune on; if there are fewer frames, each is tried with several seeds."""
 
 Setting = TypeVar("Setting")
 
@@ -43,10 +43,10 @@ class Case:
 
 @dataclass(frozen=True)
 class Score:
-    """How well a setting did."""
+    """The performance of a setting."""
 
-    successes: int  # within 5 degrees and 0.05, and again within 1 degree and 0.02
-    error: float  # median, in shares of the strict bars
+    successes: int  # number within 5 degrees and 0.05, plus number within 1 degree and 0.02
+    error: float  # median sum of both errors, in units of the strict limits
     seconds: float  # median
 
 
@@ -60,7 +60,7 @@ def cases(frames: Sequence[tuple[Points, SE3]]) -> list[Case]:
 
 
 def tuned_open3d(library: Open3d, tries: Sequence[Case], voxel: float) -> tuple[Ransac, Refine, Refine]:
-    """The search; then, from what it finds, the ICP on points and planes, and that with colours."""
+    """Return the best settings of the search and, from its answers, of point-to-plane and of coloured ICP."""
     rough = Refine(False, (voxel, voxel / 2), (1.5, 1.5))
 
     def search(setting: Ransac) -> tuple[Score, list[Matrix]]:
@@ -86,7 +86,7 @@ def tuned_gicp(
 
 
 def timed(tries: Sequence[Case], run: Callable[[int, Case], Matrix]) -> tuple[list[Matrix], list[float]]:
-    """Answers, and processor seconds of each."""
+    """Return the answers, and the CPU seconds of each."""
     found, seconds = [], []
     for i, case in enumerate(tries):
         began = time.process_time()
@@ -108,7 +108,7 @@ def _searched(library: Open3d, case: Case, setting: Ransac) -> Matrix:
 
 
 def _quickest(results: dict[Ransac, tuple[Score, list[Matrix]]]) -> Ransac:
-    """Return the quickest of the settings that succeed most often; ICP does the fine alignment."""
+    """Return the fastest of the settings that succeed most often; ICP does the fine alignment."""
     return max(results, key=lambda setting: (results[setting][0].successes, -results[setting][0].seconds))
 
 

@@ -1,10 +1,11 @@
-r"""How often answers of method ``auto`` are right, by the confidence that they report: a diagram and its calibration error.
+r"""The reliability of method ``auto``'s confidence: how often answers are right, as a diagram, and its calibration error.
 
     python benchmarks/reliability.py benchmarks/results/faults_rgb.rows.jsonl ... --out docs/reliability.png
 
 Takes the rows of ``benchmarks/faults.py`` on frames that the confidence was not fitted to. Answers without a confidence are
-counted and left out. Right is within 5 degrees and 0.05 units of the truth; beside it, whether the truth lies inside the bound
-that the answer's own covariance puts at 95 %. The error is the expected calibration error in ten bins, in all and by scene.
+counted and left out. Answers within 5 degrees and 0.05 units of the truth are right; a second criterion is whether the truth
+lies inside the 95 % bound of the answer's own covariance. The error is the expected calibration error in ten bins, overall and
+by scene.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
 
 
 def reliability(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return, for both criteria, the diagram and counts of all rows and of each scene's."""
+    """Return, for both criteria, the diagram and counts over all rows and for each scene."""
     stated = [row for row in rows if row["confidence"] is not None]
     found: dict[str, Any] = {"without a confidence": len(rows) - len(stated)}
     for name, met in CRITERIA.items():

@@ -1,11 +1,11 @@
-"""A dataset of a scene of which there is only a map, such as weights that others trained.
+"""A dataset of a scene that exists only as a map, such as weights trained by others.
 
     bidnerf render MAP DATA --split train --out RENDERS/train
     bidnerf render MAP DATA --split test --out RENDERS/test
     python benchmarks/rendered_scene.py RENDERS DATA --out FOLDER
 
 Takes what ``bidnerf render`` wrote for the poses of ``DATA``, and writes a folder of ``transforms_SPLIT.json``, images with an
-alpha channel (0 where the map has no depth) and depth, on which maps can be trained and poses found as on any other.
+alpha channel (0 where the map has no depth) and depth, which can be used for training and localization like any other dataset.
 """
 
 from __future__ import annotations

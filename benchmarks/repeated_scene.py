@@ -1,12 +1,13 @@
-"""Whether poses are believed in a scene that repeats itself.
+"""Acceptance of poses in a scene that repeats itself.
 
     python benchmarks/repeated_scene.py MAP:DATA [MAP:DATA ...] [--frames 40] [--tuning-frames]
 
-Each map is doubled: its field and its landmarks stand once more, far away and turned by 0, 90 or 180 degrees about an axis of the world.
-Both copies' descriptors get noise of their own, as if each was built from its own photos. The test frames show nothing that tells the
-copies apart, so that no pose should be accepted, of images alone or with measured depth. With a start near the true pose (a tenth of the
-copies' distance away; only where the copy is not turned), the right copy should be. The doubled maps have no surface. Frames whose index in
-the test split is 1 modulo 5 are for tuning and left out.
+Each map is doubled: its field and its landmarks are repeated far away, turned by 0, 90 or 180 degrees about an axis of the
+world. Each copy's descriptors get noise of their own, as if each had been built from its own photos. The test frames show
+nothing that distinguishes the copies, so that no pose should be accepted, from images alone or with measured depth. With a
+start near the true pose (a tenth of the copies' distance away; only where the copy is not turned), the pose in the right copy
+should be accepted. The doubled maps have no surface. Frames whose index in the test split is 1 modulo 5 are for tuning and
+left out.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from bidnerf_core.se3 import SE3
 RESULTS = Path(__file__).resolve().parent / "results"
 TURNS = (0.0, 90.0, 180.0)
 DESCRIPTOR_NOISE = 5.0
-"""Standard deviation of the noise of each channel of a descriptor, of 256 steps."""
+"""Standard deviation of the noise in each channel of a descriptor, whose values range from 0 to 255."""
 
 
 class DoubledField(nn.Module):
@@ -56,7 +57,7 @@ class DoubledField(nn.Module):
         return self.field.query(*self._home(positions, directions.expand_as(positions)))
 
     def _home(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions and directions in the frame of the copy that they belong to."""
+        """Return positions and directions in the frame of the copy to which they belong."""
         centre = positions.new_tensor(self._bounds.centre)
         there = (positions - self._T.apply(centre)).norm(dim=-1) < (positions - centre).norm(dim=-1)
         back = self._T.inverse()
@@ -67,7 +68,7 @@ class DoubledField(nn.Module):
 
 
 def doubled(map: Map, T_world_copy: SE3) -> Map:
-    """Return a map with all that it has twice, without its surface."""
+    """Return a map with its field and landmarks doubled, without its surface."""
     if map.landmarks is None:
         raise InputError("a map without landmarks, expected one that was baked")
     bounds = map.bounds
@@ -85,7 +86,7 @@ def doubled(map: Map, T_world_copy: SE3) -> Map:
 
 
 def twice(landmarks: LandmarkMap, T_world_copy: SE3, share: float = 1.0) -> LandmarkMap:
-    """Return landmarks of which a random share also stands elsewhere; the descriptors of all get noise."""
+    """Return landmarks of which a random share is repeated elsewhere; the descriptors of all get noise."""
     T, generator = T_world_copy.to("cpu", torch.float32), Generator().manual_seed(0)
     chosen = torch.rand(len(landmarks), generator=Generator().manual_seed(1)) < share
 
@@ -107,7 +108,7 @@ def twice(landmarks: LandmarkMap, T_world_copy: SE3, share: float = 1.0) -> Land
 
 
 def copies(bounds: SceneBounds) -> list[SE3]:
-    """Return where the copy of a map stands, so far away that neither is within the space that the other models."""
+    """Return poses for the copy of a map, so far away that neither is within the space that the other models."""
     away = torch.tensor([4 * max(bounds.far, bounds.side), 0.0, 0.0], dtype=torch.float64)
     found = []
     for turn in TURNS:

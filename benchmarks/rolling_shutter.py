@@ -1,11 +1,12 @@
-"""What it brings to estimate the motion of the camera while its rows were exposed.
+"""The benefit of estimating the camera's motion while its rows were exposed.
 
     python benchmarks/rolling_shutter.py MAP:DATA [MAP:DATA ...] [--degrees 0 0.5 2] [--frames 40] [--tuning-frames]
 
-Poses of test frames, as images without depth, are found by landmarks alone: once with the motion where keypoints show one, and once taken
-as still. The images are as they are, and with the rolling shutter of a camera that turns by so many degrees (``evaluation.faults``). Records
-the median errors, how many true poses lie inside the 95 % bound of the covariance, how many images show a motion, and the CPU time. Frames whose
-index in the test split is 1 modulo 5 are for tuning and left out; ``--tuning-frames`` takes those only.
+Test frames, as images without depth, are localized by landmarks alone: once with the motion where keypoints show one, and once
+under the assumption of a still camera. The images are used as they are, and with the rolling shutter of a camera that turns by
+each number of ``--degrees`` (``evaluation.faults``). Records the median errors, how many true poses lie inside the 95 % bound
+of the covariance, how many images show a motion, and the CPU time. Frames whose index in the test split is 1 modulo 5 are for
+tuning and left out; ``--tuning-frames`` takes only those.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ WAYS = {"with motion": True, "taken as still": False}
 
 
 def summary(answers: Sequence[tuple[LandmarkPose, View, float]], tried: int) -> dict[str, Any]:
-    """Return the figures of answers: the pose found, the view, and the CPU seconds that it took."""
+    """Return the statistics of answers, each of which is the pose found, the view, and the CPU seconds taken."""
     errors = [pose_error(found.T_world_camera, view.T_ref_camera) for found, view, _ in answers]
     squared = [
         normalized_error_squared(found.T_world_camera, view.T_ref_camera, found.full_covariance)
@@ -59,7 +60,7 @@ def summary(answers: Sequence[tuple[LandmarkPose, View, float]], tried: int) -> 
 
 
 def compared(matcher: LandmarkMatcher, views: Sequence[View], degrees: float) -> dict[str, Any]:
-    """Localize each view both ways, in turns, and return the figures of each way."""
+    """Localize each view both ways, in turn, and return the statistics of each way."""
     answers: dict[str, list[tuple[LandmarkPose, View, float]]] = {way: [] for way in WAYS}
     for number, view in enumerate(views):
         frame = replace(view.frame, depth=None)

@@ -1,4 +1,4 @@
-"""Camera poses from SIFT matches with triangulated points, by pycolmap and by OpenCV: what one would write without a library.
+"""Camera poses from SIFT matches with triangulated points, by pycolmap and by OpenCV: the usual minimal solution.
 
 Each keypoint of the query is compared with all descriptors of all points, and the nearest point is taken where it passes
 Lowe's ratio test against the second nearest point. Poses come from RANSAC and a refinement on its inliers.
@@ -21,18 +21,18 @@ from bidnerf_core.frames import Frame
 RATIO = 0.8
 """Largest ratio of the distances to the nearest and to the second nearest descriptor."""
 CANDIDATES = 30
-"""Number of nearest descriptors among which the second nearest point is sought."""
+"""Number of nearest descriptors that are searched for the second nearest point."""
 FEWEST_INLIERS = 15
-"""Number of inliers from which a pose passes for found."""
+"""Minimum number of inliers of a pose that counts as found."""
 OPENCV_TRIALS, OPENCV_CONFIDENCE = 10_000, 0.9999
-"""OpenCV's own 100 trials and 99 % are too few for matches with many outliers; pycolmap's defaults are about these."""
+"""OpenCV's defaults of 100 trials and 99 % are too low for matches with many outliers; pycolmap's are about as here."""
 OPENCV_ERROR = 2.0
-"""Largest reprojection error (pixels) of an inlier; of 2, 4 and OpenCV's own 8, the best on the frames for tuning."""
+"""Largest reprojection error (pixels) of an inlier; of 2, 4 and OpenCV's default 8, the best on the frames for tuning."""
 
 
 @dataclass(frozen=True, eq=False)
 class PnpResult:
-    """A pose and how many matches agree with it."""
+    """A pose and the number of its inliers."""
 
     T_world_camera: NDArray[np.float64]  # 4x4
     inliers: int
@@ -59,7 +59,7 @@ class SiftMatcher:
         other = squared.masked_fill(point == point[:, :1], torch.inf).amin(dim=1)
         second = torch.minimum(
             other, squared[:, -1]
-        )  # if all are of one point, others are farther than the last
+        )  # if all belong to one point, other points are farther away than the last of these descriptors
         good = (squared[:, 0] < RATIO**2 * second).numpy()
         number = point[:, 0].numpy()[good]
         return keypoints[good, :2].astype(np.float64), self.points.positions[number]
@@ -73,7 +73,7 @@ def _unit(descriptors: NDArray[np.uint8]) -> torch.Tensor:
 def colmap_pnp(
     pixels: NDArray[np.float64], points: NDArray[np.float64], intrinsics: Intrinsics, seed: int
 ) -> PnpResult | None:
-    """Estimate T_world_camera with pycolmap's LO-RANSAC and refinement, which have their default options."""
+    """Estimate T_world_camera with pycolmap's LO-RANSAC and refinement, with default options."""
     import pycolmap
 
     pycolmap.set_random_seed(seed)

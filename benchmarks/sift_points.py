@@ -1,8 +1,8 @@
-"""Points with SIFT descriptors, triangulated by COLMAP from images whose poses are known, as hloc makes its maps.
+"""Points with SIFT descriptors, triangulated by COLMAP from images with known poses, as in hloc.
 
-Everything has the default settings of pycolmap, whose SIFT is root-normalised: matching with a ratio test of 0.8 in both
-directions, verification of the matches by the known poses, and triangulation with bundle adjustment of the points. Only
-tracks of two images, which pycolmap drops by default, are kept: on the frames for tuning, they help.
+All settings are pycolmap's defaults (its SIFT is root-normalised): matching with a ratio test of 0.8 in both directions,
+verification of the matches with the known poses, and triangulation with bundle adjustment of the points. The only exception is
+that tracks of two images, which pycolmap drops by default, are kept: on the frames for tuning, they help.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.mapping.view_pairs import likely_pairs
 
 NEIGHBOURS = 20
-"""Number of images near it that each image is matched with; hloc's examples take 20 as well."""
+"""Number of nearby images with which each image is matched, as in hloc's examples."""
 
 
 @dataclass(frozen=True, eq=False)
 class SiftPoints:
-    """Triangulated points, and the descriptors of all keypoints that show them, in the order of the points."""
+    """Triangulated points, and the descriptors of all their keypoints, in the order of the points."""
 
     positions: NDArray[np.float64]  # (n, 3), world frame, metres
-    descriptors: NDArray[np.uint8]  # (m, 128), of length 512
-    first: NDArray[np.int64]  # (n,), each point's first descriptor
+    descriptors: NDArray[np.uint8]  # (m, 128), of norm 512
+    first: NDArray[np.int64]  # (n,), index of each point's first descriptor
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -53,7 +53,7 @@ class SiftDetector:
         self.extractor: Any = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
 
     def __call__(self, frame: Frame) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return keypoints (n, 4), whose first columns are u and v, and descriptors (n, 128) of length 512."""
+        """Return keypoints (n, 4), whose first columns are u and v, and descriptors (n, 128) of norm 512."""
         pixels = (frame.rgb * 255).round().byte().contiguous().numpy()
         grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
         keypoints, descriptors = self.extractor.extract_from_uint8_array(grey)
@@ -61,7 +61,7 @@ class SiftDetector:
 
 
 def colmap_camera(intrinsics: Intrinsics, number: int = 1) -> Any:
-    """Return a camera for pycolmap; its pixel coordinates have the convention of ``Intrinsics``."""
+    """Return a camera for pycolmap, whose pixel coordinates follow the same convention as ``Intrinsics``."""
     import pycolmap
 
     model, parameters = "PINHOLE", [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]
@@ -79,7 +79,7 @@ def colmap_camera(intrinsics: Intrinsics, number: int = 1) -> Any:
 
 
 def sift_points(views: Sequence[View], cache: Path) -> SiftPoints:
-    """Return the points of ``views``, whose poses are T_world_camera; a folder keeps them by the views' content."""
+    """Return the points of ``views``, whose poses are T_world_camera; ``cache`` keeps them by the views' content."""
     import pycolmap
 
     path = cache / f"sift-{views_digest(views)}-{pycolmap.__version__}-{NEIGHBOURS}.npz"
@@ -115,7 +115,7 @@ def triangulated(views: Sequence[View]) -> SiftPoints:
 
 
 def _write_views(views: Sequence[View], detector: SiftDetector, path: Path) -> dict[int, NDArray[np.uint8]]:
-    """Write cameras and keypoints to a database of COLMAP, and return the descriptors by image, counted from 1."""
+    """Write cameras and keypoints to a COLMAP database, and return the descriptors by image number, from 1."""
     pycolmap, described = detector.library, {}
     with pycolmap.Database.open(path) as database:
         for number, view in enumerate(views, start=1):
@@ -146,7 +146,7 @@ def _frame(image: Any, camera: Any, pycolmap: Any) -> Any:
 
 
 def _posed(views: Sequence[View], pycolmap: Any) -> Any:
-    """Return a model of COLMAP that has poses but no points."""
+    """Return a COLMAP model that has poses but no points."""
     model = pycolmap.Reconstruction()
     for number, view in enumerate(views, start=1):
         T_camera_world = view.T_ref_camera.inverse().matrix().double().numpy()

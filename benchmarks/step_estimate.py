@@ -1,13 +1,13 @@
-"""An estimate of a step's time on a GPU, where there is none: the operations and bytes of a step of ``bid``, counted.
+"""An estimate of a step's time on a GPU, without one, from the number of operations and bytes of a step of ``bid``.
 
     python benchmarks/step_estimate.py DATA --map MAP [MAP ...] --name step_estimate_lego
 
-The step runs on the simulated device of ``bidnerf_core.testing.elsewhere``, in the shapes that it would have on a GPU. Each
+The step runs on the simulated device of ``bidnerf_core.testing.elsewhere``, with the shapes that it would have on a GPU. Each
 operation that is not a mere view counts as one kernel, which reads its arguments and writes its results once; matrix products
 count 2 m n k operations. From these follow three lower bounds, of which the largest is the estimate: traffic at ``BANDWIDTH``,
-arithmetic at ``ARITHMETIC``, and launches at ``LAUNCH`` each. It is an estimate and no measurement: caches make traffic
-cheaper, and scattered reads dearer. With a CUDA graph, launches cost next to nothing; the step has no wait and no shape that
-depends on values, which a graph demands.
+arithmetic at ``ARITHMETIC``, and launches at ``LAUNCH`` each. It is an estimate and not a measurement: caches make traffic
+cheaper, and scattered reads make it more expensive. With a CUDA graph, launches cost next to nothing; the step has no waits and
+no shapes that depend on values, as a graph requires.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from bidnerf_core.waiting import without_waiting
 
 RESULTS = Path(__file__).parent / "results"
 BANDWIDTH = 0.6 * 3.35e12
-"""Bytes a second: 60 % of what the memory of an H100 SXM can do."""
+"""Bytes per second: 60 % of what the memory of an H100 SXM can do."""
 ARITHMETIC = 0.5 * 67e12
-"""Operations a second: half of an H100's single precision."""
+"""Operations per second: half of an H100's single precision."""
 LAUNCH = 5e-6
 """Seconds that PyTorch takes to launch an operation from Python."""
 

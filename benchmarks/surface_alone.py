@@ -1,11 +1,11 @@
-r"""What method ``auto`` finds by measured depth on the baked surface alone, and what the surface costs.
+r"""Localization by method ``auto`` with measured depth on the baked surface alone, and the cost of the surface.
 
     python benchmarks/surface_alone.py MAP:DATA [MAP:DATA ...]
 
-No start is given, landmarks are not used. Each frame is tried with the surface that the map has (before) and with one baked
-anew from the dataset's training views (after), in turns; to compare two versions, bake the map's surface with the older.
+No start is given, and landmarks are not used. Each frame is tried in turn with the surface that the map has (before) and with
+one baked anew from the dataset's training views (after); to compare two versions, bake the map's surface with the older one.
 Frames whose index in the test split is 1 modulo 5 are left out, since settings were tuned on them; ``--tuning-frames`` takes
-those only. Each dataset has a record of its own. One process of one thread.
+only those. Each dataset has a record of its own. Everything runs in one process of one thread.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def localized(localizer: Localizer, view: View) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return successes, median errors, and how often the answers are accepted rightly and wrongly."""
+    """Return successes, median errors, and how often right and wrong answers are accepted."""
     right = [r["translation"] < 0.05 and r["rotation_deg"] < 5 for r in rows]
     accepted = [r["outcome"] == "converged" for r in rows]
     return {
@@ -67,7 +67,7 @@ def measured_views(stored: Map, data: Path) -> list[View]:
 
 
 def baked(stored: Map, data: Path) -> tuple[Map, dict[str, float]]:
-    """Return the map with a surface baked anew, as ``bidnerf bake`` does it, and the seconds that took."""
+    """Return the map with a surface baked anew, as by ``bidnerf bake``, and the seconds that this took."""
     measured = measured_views(stored, data)
     began, cpu = time.perf_counter(), time.process_time()
     surface = bake(stored.field, stored.bounds, [] if measured else cameras_of(stored.info), measured)
@@ -103,7 +103,7 @@ def compared(data: Path, tuning: bool, **maps: Map) -> dict[str, dict[str, Any]]
 
 
 def ratio_of_times(rows: dict[str, dict[str, Any]]) -> float:
-    """Return the median over frames of the time after, divided by the time before."""
+    """Return the ratio of the time after to the time before, the median over frames."""
     before, after = ([row["cpu_seconds"] for row in rows[what]["frames"]] for what in ("before", "after"))
     return statistics.median(b / a for a, b in zip(before, after, strict=True))
 

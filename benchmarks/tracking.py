@@ -1,13 +1,14 @@
-r"""Track a sequence in a map: error, undetected losses, recovery from faults, consistency, time; and what others reach.
+r"""Track a sequence in a map: error, undetected losses, recovery from faults, consistency and time, and those of baselines.
 
     python benchmarks/tracking.py MAP:SEQUENCE [MAP:SEQUENCE ...] --name tracking
 
-Each sequence is tracked in the order of time; and its first 160 frames backwards, with every 2nd and 4th frame, with a
-window of several frames on noisy depth, and with faults; with depth and without. Frames of splits other than the training's are summarised apart, too.
-Baselines: method ``auto`` on every 6th frame anew, generalised ICP from its own last pose (small_gicp), and, where it is
-installed, Open3D's odometry. Frames of depth alone, which a LiDAR records between photos, are left out without depth.
-Settings were chosen on the training frames of tum_fr1_xyz alone (``--tuning-frames`` takes only those); nothing was chosen by
-other frames or sequences. One process of one thread; finished runs are kept, so that an interrupted benchmark goes on.
+Each sequence is tracked in chronological order; and its first 160 frames backwards, with every 2nd and 4th frame, with a
+window of several frames on noisy depth, and with faults; with depth and without. Frames of splits other than the training
+split are also summarised separately. Baselines: method ``auto`` anew on every 6th frame, generalised ICP from its own last pose
+(small_gicp), and, where it is installed, Open3D's odometry. Frames with only depth, which a LiDAR records between photos, are
+left out of runs without depth. Settings were chosen on the training frames of tum_fr1_xyz alone (``--tuning-frames`` takes only
+those), and on no other frames or sequences. Everything runs in one process of one thread; finished runs are kept, so that an
+interrupted benchmark can be resumed.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def read(path: Path) -> Frames:
 def tracked(
     run: Run, step: Callable[[Frame, float | None], Localization], depth: bool
 ) -> list[dict[str, Any]]:
-    """Track a run; return a row a frame."""
+    """Track a run; return one row per frame."""
     rows = []
     for timed in run.frames:
         frame = timed.frame if depth else replace(timed.frame, depth=None)
@@ -90,7 +91,7 @@ def _row(timed: TimedFrame, found: Localization, seconds: float) -> dict[str, An
 
 
 def frames_until_accepted(rows: Sequence[dict[str, Any]], first: int) -> int:
-    """Return how many frames from ``first`` on it takes to the first accepted pose; 1 if that is of ``first``."""
+    """Return the number of frames, counted from ``first``, up to the first accepted pose; 1 if it is that of ``first``."""
     later = (number for number, row in enumerate(rows[first:], start=1) if row["accepted"])
     return next(later, len(rows) - first + 1)
 
@@ -98,7 +99,7 @@ def frames_until_accepted(rows: Sequence[dict[str, Any]], first: int) -> int:
 def summary(
     rows: Sequence[dict[str, Any]], blind: range = range(0), returns: int | None = None
 ) -> dict[str, Any]:
-    """Return errors of accepted poses, how honest the answers are, recovery, and time."""
+    """Return errors of accepted poses, how well the answers judge themselves, recovery, and time."""
     known = [r for r in rows if r["truth"] is not None]
     accepted = [r for r in known if r["accepted"]]
     seeing = [r for i, r in enumerate(rows) if i not in blind and r["truth"] is not None]
@@ -135,7 +136,7 @@ def _losses(rows: Sequence[dict[str, Any]], blind: range) -> list[tuple[int, int
 
 
 def plan(localizer: Localizer, quick: bool) -> list[tuple[str, Callable[[Frames], Run], bool, Any]]:
-    """Return all runs: name, what is done to the sequence, whether depth is used, and what makes the tracker."""
+    """Return all runs: name, the change to the sequence, whether depth is used, and the factory of the tracker."""
     track = partial(Tracker, localizer)
     runs: list[tuple[str, Callable[[Frames], Run], bool, Any]] = []
     for kind, depth in (("RGB-D", True), ("RGB", False)):
@@ -164,7 +165,7 @@ def sequence(stored: Map, path: Path, given: argparse.Namespace, store: RowStore
         if given.only and not any(word in name for word in given.only):
             continue
         run = change(frames if name.endswith("in order") else frames[:SHORT])
-        if not depth:  # frames of depth alone would then show nothing
+        if not depth:  # frames with only depth would then show nothing
             run = without_depth_frames(run)
         key = [path.name, stored.info.weights, name, len(run.frames), given.tuning_frames]
         rows = store.get(key, lambda run=run, make=make, depth=depth: tracked(run, make(), depth))
@@ -193,7 +194,7 @@ def _line(sequence: str, name: str, s: dict[str, Any]) -> str:
 
 
 def sift_milliseconds() -> float:
-    """Return the CPU time of SIFT on a 320 x 240 image, by which times on a busy machine can be compared."""
+    """Return the CPU time of SIFT on a 320 x 240 image, as a reference for times on a busy machine."""
     image = (255 * torch.rand((240, 320), generator=torch.Generator().manual_seed(0))).byte().numpy()
     image = cv2.GaussianBlur(image, (0, 0), 1.5)
     times = []

@@ -1,4 +1,4 @@
-"""What the tracker is compared with: a search in each frame, ICP from the last pose, odometry."""
+"""Baselines of the tracker: a search in each frame, ICP from the last pose, odometry."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bidnerf_core.localization import Localization
 
 
 class EachAnew:
-    """Method ``auto`` on each frame, without what was known before."""
+    """Method ``auto`` on each frame, without information from earlier frames."""
 
     def __init__(self, localizer: Localizer) -> None:
         self._localizer = localizer
@@ -21,7 +21,7 @@ class EachAnew:
 
 
 class GicpFromLast:
-    """Generalised ICP (small_gicp) between measured points and the map's surface, from the last pose; it judges nothing."""
+    """Generalised ICP (small_gicp) of measured points to the map's surface, from the last pose; it accepts all its poses."""
 
     def __init__(self, localizer: Localizer) -> None:
         import small_gicp
@@ -55,7 +55,7 @@ class GicpFromLast:
 
 
 class Open3dOdometry:
-    """Open3D's RGB-D odometry from frame to frame (Park et al. 2017), with ``auto`` at first, every 30 frames, and when it fails."""
+    """Open3D's frame-to-frame RGB-D odometry (Park et al. 2017), with ``auto`` initially, every 30 frames, and on failure."""
 
     EVERY = 30
 

@@ -2,9 +2,9 @@
 
     python benchmarks/tracking_memory.py MAP SEQUENCE --frames 10000 --name tracking_memory
 
-The sequence is read once and its frames are shown again and again, at the intervals at which they were taken, so that whatever
-grows grows in the tracker. In every thousand frames the camera is covered for five, so that losses and searches are part of
-it. With ``--no-depth`` the tracker sees colours alone. One process of one thread.
+The sequence is read once and its frames are repeated at the intervals at which they were taken, so that any growth of memory
+is the tracker's. In every thousand frames the camera is covered for five, so that losses and searches are included. With
+``--no-depth`` the tracker sees only colours. Everything runs in one process of one thread.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ COVERED = range(500, 505)
 
 
 def back_and_forth(frames: Frames, count: int) -> Iterator[TimedFrame]:
-    """Yield ``count`` frames: the sequence forwards, backwards, and so on; time goes on by the true intervals."""
+    """Yield ``count`` frames: the sequence forwards, backwards, and so on; time advances by the true intervals."""
     around = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
     now, before = 0.0, frames[0]
     for number in range(count):
@@ -54,7 +54,7 @@ def resident_bytes() -> int:
 
 
 def tracked(tracker: Tracker, frames: Iterator[TimedFrame], depth: bool) -> Iterator[dict[str, Any]]:
-    """Track the frames; yield a row for every thousand."""
+    """Track the frames; yield one row per thousand."""
     generator = torch.Generator().manual_seed(0)
     milliseconds, counts = list[float](), dict.fromkeys(("accepted", "wrong", "accepted_while_covered"), 0)
     for number, timed in enumerate(frames, start=1):

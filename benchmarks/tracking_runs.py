@@ -1,4 +1,4 @@
-"""Sequences as benchmarks of tracking show them: in other orders, at lower rates, and with faults."""
+"""Sequences for benchmarks of tracking: in other orders, at lower rates, and with faults."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bidnerf_core import Frame
 from bidnerf_core.datasets import TimedFrame
 
 SHORT = 160
-"""The number of frames that all runs but those "in order" are shown."""
+"""The number of frames in all runs except those "in order"."""
 FIRST = 40
 """The number of the frame at which faults begin."""
 
@@ -22,11 +22,11 @@ Frames = list[TimedFrame]
 
 @dataclass(frozen=True)
 class Run:
-    """A sequence as it is shown to a tracker, and the frames in which its scene is not to be seen."""
+    """A sequence as shown to a tracker, and the frames in which its scene is not visible."""
 
     frames: Frames
     blind: range = range(0)
-    returns: int | None = None  # the frame in which the scene comes back into sight, or is another part of it
+    returns: int | None = None  # the frame in which the scene is visible again, or another part of it
 
 
 def whole(frames: Frames) -> Run:
@@ -42,13 +42,13 @@ def backwards(frames: Frames) -> Run:
 
 
 def covered(frames: Frames) -> Run:
-    """Cover the camera for 15 frames; what it takes then is dark noise."""
+    """Cover the camera for 15 frames, which then show dark noise."""
     dark = partial(covered_frame, generator=torch.Generator().manual_seed(0))
     return changed(frames, range(FIRST, FIRST + 15), dark)
 
 
 def covered_frame(frame: Frame, generator: torch.Generator) -> Frame:
-    """Return what the camera takes with its lens covered: dark noise, and no depth."""
+    """Return the frame as taken with the lens covered: dark noise, and no depth."""
     noise = 0.02 + 0.01 * torch.rand(frame.rgb.shape, generator=generator)
     return replace(frame, rgb=noise, depth=None if frame.depth is None else torch.zeros_like(frame.depth))
 
@@ -67,7 +67,7 @@ def plain_wall(frames: Frames) -> Run:
 
 
 def half_covered(frames: Frames) -> Run:
-    """Move a textured thing with depth over the left half of the image for 30 frames; the scene stays in sight."""
+    """Move a textured object with depth over the left half of the image for 30 frames; the scene stays visible."""
     shifts = iter(range(0, 10**6, 3))
 
     def half(frame: Frame) -> Frame:
@@ -85,7 +85,7 @@ def half_covered(frames: Frames) -> Run:
 
 
 def carried(frames: Frames) -> Run:
-    """Leave out up to 100 frames without a trace in the time stamps."""
+    """Leave out up to 100 frames, and close the gap in the time stamps."""
     there = min(FIRST + 100, len(frames) - 20)
     before, after = frames[:FIRST], frames[there:]
     if before[-1].time is None or after[0].time is None or frames[FIRST].time is None:
@@ -95,7 +95,7 @@ def carried(frames: Frames) -> Run:
 
 
 def depth_stops(frames: Frames) -> Run:
-    """Leave out the depth of the second half, and with it the frames that have nothing else."""
+    """Remove the depth of the second half, and the frames there that have nothing else."""
     half = len(frames) // 2
     bare = [replace(f, frame=replace(f.frame, depth=None)) for f in frames[half:] if f.frame.has_colour]
     return Run(frames[:half] + bare)
@@ -142,7 +142,7 @@ def noisy_depth(frames: Frames) -> Run:
 
 
 def without_depth_frames(run: Run) -> Run:
-    """Return the frames with colours alone."""
+    """Return the run with only colours."""
     kept = [number for number, timed in enumerate(run.frames) if timed.frame.has_colour]
     blind = [place for place, number in enumerate(kept) if number in run.blind]
     returns = None if run.returns is None else sum(number < run.returns for number in kept)
@@ -151,7 +151,7 @@ def without_depth_frames(run: Run) -> Run:
 
 
 def changed(frames: Frames, part: range, change: Callable[[Frame], Frame]) -> Run:
-    """Change the frames of a part, in which nothing of the scene is to be seen then."""
+    """Change the frames of a part, in which nothing of the scene is visible then."""
     shown = [replace(f, frame=change(f.frame)) if i in part else f for i, f in enumerate(frames)]
     return Run(shown, part, part.stop)
 

@@ -1,13 +1,13 @@
-"""What a step of training costs, where its time goes, and how far that is from what the machine can do.
+"""The cost of a training step, its profile, and its distance from what the machine can do.
 
     python benchmarks/training_step.py DATA MAP... --name training_step
 
-Each map's training goes on from the trained field, with its own backend and settings, for ``--steps`` steps on all threads and
-as many on one: wall time, CPU time and their ratio, the number of busy cores. A few steps on one thread are profiled: the share
-of gathers and scatters (reading and adding to tables), of matrix products, of the optimizer, of sorting, and of all other
-operators, which are elementwise. Beside it stands the least time that the same work takes in the same process: the
-step's matrix products at the rate of a large one, and reading the corners of the hash encoding, twice (forward, backward), at
-the rate of a random gather from a table of that size.
+Each map's training continues from the trained field, with its own backend and settings, for ``--steps`` steps on all threads
+and the same number on one: wall time, CPU time and their ratio, the number of busy cores. A few steps on one thread are
+profiled: the share of gathers and scatters (reading from and adding to tables), of matrix products, of the optimizer, of
+sorting, and of all other operators, which are elementwise. For comparison, a lower bound of the time for the same work in the
+same process is given: the step's matrix products at the rate of a large one, and reading the corners of the hash encoding,
+twice (forward, backward), at the rate of a random gather from a table of that size.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ KINDS = {
     "optimizer": ("_fused_adam",),
     "sorting and searching": ("sort", "searchsorted", "cumsum"),
 }
-"""Kinds of operators, by a part of their name; the first that fits counts."""
+"""Kinds of operators, by a part of their name; the first that matches counts."""
 
 
 @dataclass
 class Timed(Silent):
-    """A report that resumes from a state and takes the time of each step."""
+    """A report that resumes from a state and times each step."""
 
     state: TrainingState
     wall: list[float] = field(default_factory=list)
@@ -71,7 +71,7 @@ class Timed(Silent):
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """A finished training that can be carried on for some steps."""
+    """A finished training that can be continued for some steps."""
 
     stored: Map
     views: list[View]
@@ -86,9 +86,9 @@ class Training:
         return TrainingState(self.config.steps, own, moments)
 
     def run(self, steps: int, observer: Any = None) -> Timed:
-        """Carry the training on. The learning rate is at its least by then: the field stays what it is.
+        """Continue the training. The learning rate is at its minimum by then, so that the field hardly changes.
 
-        The ``observer`` is a context that all steps but the first run in.
+        ``observer`` is a context in which all steps but the first run.
         """
         report = Timed(self.state(), observer=observer or nullcontext())
         config = replace(self.config, steps=self.config.steps + steps)
@@ -133,7 +133,7 @@ def shares(training: Training) -> dict[str, float]:
 
 
 def least(training: Training) -> dict[str, float]:
-    """Return the least milliseconds a step on one thread: matrix products, and the gathers of the hash encoding."""
+    """Return a lower bound of a step's milliseconds on one thread, from matrix products and gathers of the hash encoding."""
     torch.set_num_threads(1)
     counter = FlopCounterMode(display=False)
     training.run(PROFILED + 1, counter)

@@ -7,12 +7,12 @@ import os
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
-# Threads of OpenMP that wait should sleep. On cores that other work shares, spinning was measured to make training
-# more than ten times slower. It has to be set before torch is loaded; a user's own setting is kept.
+# OpenMP threads that wait should sleep. On cores shared with other work, spinning made training more than ten times
+# slower in measurements. It has to be set before torch is loaded; a user's own setting is kept.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# torch and typeguard (which the command line's parser uses) look for plugins among all entry points as they are imported,
-# and fail on a malformed file of any package. Where there is such a file, they are imported without plugins.
+# When they are imported, torch and typeguard (which the command line's parser uses) look for plugins among all entry
+# points, and fail if any package has a malformed file. Where there is such a file, they are imported without plugins.
 try:
     entry_points(group="bidnerf.backends")
 except Exception:
@@ -51,8 +51,8 @@ HOMES = {
     "se3": ("SE3",),
     "storage": ("Map", "load_map"),
 }
-"""The modules that define the public names. They are imported with the first use of a name (PEP 562): to import torch
-takes seconds, and ``bidnerf --help`` does without it."""
+"""The modules that define the public names. They are imported when a name is first used (PEP 562): importing torch takes
+seconds, and ``bidnerf --help`` does not need it."""
 
 __all__ = [
     "SE3",

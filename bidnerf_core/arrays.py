@@ -1,4 +1,4 @@
-"""Arrays in files of numpy, whose size is checked before memory is taken for them."""
+"""Arrays in NumPy files, whose size is checked before memory is allocated for them."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.re
 
 
 def read_array(path: Path, expected: str) -> np.ndarray:
-    """Read the array of a ``.npy`` file. Raises ``InputError`` for anything else, pickled objects among it.
+    """Read the array of a ``.npy`` file. Raises ``InputError`` for anything else, including pickled objects.
 
-    ``expected`` says in a few words what the file should be.
+    ``expected`` describes in a few words what the file should be.
     """
     with open_binary(path, expected) as file:
         try:
             return _array(file, os.fstat(file.fileno()).st_size)
-        except Exception as error:  # numpy parses the header as Python, and raises whatever that raises
+        except Exception as error:  # NumPy parses the header as Python, which may raise anything
             raise _unreadable(path, error, expected) from error
 
 
 def read_archive(path: Path, names: Sequence[str], expected: str) -> dict[str, np.ndarray]:
-    """Read those arrays of a ``.npz`` file that ``names`` names and it holds. Raises ``InputError`` as ``read_array`` does."""
+    """Read those of the arrays ``names`` that a ``.npz`` file holds. Raises ``InputError`` as ``read_array`` does."""
     with open_binary(path, expected) as file:
         try:
             with zipfile.ZipFile(file) as archive:
                 held = {name: f"{name}.npy" for name in names if f"{name}.npy" in archive.namelist()}
                 return {name: _member(archive, member) for name, member in held.items()}
-        except Exception as error:  # as above; and zipfile has errors of its own
+        except Exception as error:  # as above; zipfile has errors of its own as well
             raise _unreadable(path, error, expected) from error
 
 
@@ -51,7 +51,7 @@ def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 
 
 def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
-    """Read an array from a file of ``size`` bytes. Raises ``ValueError``, and ``OSError`` of numpy."""
+    """Read an array from a file of ``size`` bytes. Raises ``ValueError``, and NumPy's ``OSError``."""
     version = np.lib.format.read_magic(file)
     if version not in HEADERS:
         raise ValueError(f"version {version} of the format")

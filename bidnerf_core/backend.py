@@ -1,4 +1,4 @@
-"""What an entry point of the group ``bidnerf.backends`` names, and the usual way to make one."""
+"""The interface of a backend, the object that an entry point of ``bidnerf.backends`` names, and the usual way to make one."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Backend(Protocol):
         ...
 
     def train(self, field: RadianceField, views: Sequence[View], config: Any, report: Report) -> None:
-        """Fit the field to views whose reference frame is the world, and give ``report`` the progress of each step."""
+        """Fit the field to views whose reference frame is the world, and pass each step's progress to ``report``."""
         ...
 
 
 @runtime_checkable
 class QuickConfig(Protocol):
-    """An optional part of a backend: settings for small and simple scenes, which ``bidnerf demo`` trains with."""
+    """An optional part of a backend: settings for small and simple scenes, with which ``bidnerf demo`` trains."""
 
     def quick_config(self) -> Any:
         """Return a config of the backend's ``config_type`` that trains such a scene in about a minute."""
@@ -48,7 +48,7 @@ class QuickConfig(Protocol):
 
 @runtime_checkable
 class UpgradingField(Protocol):
-    """An optional part of a field: it takes the states that earlier versions of its backend stored."""
+    """An optional part of a field, which accepts states that earlier versions of its backend stored."""
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return a stored state, of this version or of an earlier one, with the tensors that the field has now."""

@@ -15,8 +15,8 @@ from bidnerf_core.field import FieldValues, RadianceField, RaySampler
 class Blurred:
     """A field that is queried at points displaced at random, by ``sigma`` metres along each axis.
 
-    Its expectation is the field convolved with a Gaussian (randomized smoothing, Duchi et al. 2012), at the price of one
-    query. The sampler is the field's own: where it leaves out empty cells, matter is not blurred into them.
+    In expectation it is the field convolved with a Gaussian (randomized smoothing, Duchi et al. 2012), at the cost of one
+    query. The sampler is the field's own: where it skips empty cells, matter is not blurred into them.
     """
 
     field: RadianceField

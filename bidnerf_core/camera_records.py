@@ -1,4 +1,4 @@
-"""Intrinsics as NeRF's and nerfstudio's JSON describe them, for pixel centres at +0.5 as ours are."""
+"""Intrinsics as in NeRF's and nerfstudio's JSON, for which pixel centres are at +0.5 like ours."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CameraRecord:
         """
         fx = self.focal_x if self.angle_x is None else focal_length(width, self.angle_x)
         fy = self.focal_y if self.angle_y is None else focal_length(height, self.angle_y)
-        assert fx is not None  # camera_record saw to it
+        assert fx is not None  # camera_record ensures it
         cx = width / 2 if self.cx is None else self.cx
         cy = height / 2 if self.cy is None else self.cy
         try:
@@ -77,7 +77,7 @@ def _check_model(record: Record) -> None:
 
 
 def _focal(record: Record, axis: str) -> tuple[float | None, float | None]:
-    """Return the focal length or the angle of an axis. A frame's own goes before the file's, pixels before radians."""
+    """Return the focal length or the angle of an axis. A frame's own precedes the file's, and pixels precede radians."""
     for scope in record.scopes():
         focal, angle = scope.number(f"fl_{axis}"), scope.number(f"camera_angle_{axis}")
         if focal is not None:
@@ -92,7 +92,7 @@ def _focal(record: Record, axis: str) -> tuple[float | None, float | None]:
 
 
 def _distortion(record: Record) -> tuple[float, ...]:
-    """Return the coefficients in OpenCV's order, none where the lens is ideal."""
+    """Return the coefficients in OpenCV's order; an ideal lens has none."""
     if record.number("k4"):
         raise record.error("k4 is not 0, expected no distortion beyond k1 k2 p1 p2 k3")
     values = tuple(record.number(key) or 0.0 for key in DISTORTION_KEYS)

@@ -1,4 +1,4 @@
-"""The cameras of a map's images as cameras of images with another size: portrait instead of landscape, cropped, or stretched."""
+"""A map's cameras, adapted to images of another size: portrait instead of landscape, cropped, or stretched."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ CameraGroup = tuple[Intrinsics, ...]
 
 @lru_cache(maxsize=64)
 def cameras_at_size(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return the ``cameras`` of images with the shape of another size, resized to it.
+    """Return the ``cameras`` whose images have the aspect ratio of another size, resized to it.
 
-    If there are none, those of images with that shape after a quarter turn are returned: turned to one side, and to the other.
-    Empty if there are none either.
+    If there are none, those whose images have it after a quarter turn are returned, in two groups: turned to one side, and to
+    the other. Empty if there are none of these either.
     """
     size = (width, height)
     same = tuple(c.resized(*size) for c in cameras if same_aspect((c.width, c.height), size))
@@ -28,9 +28,9 @@ def cameras_at_size(cameras: CameraGroup, width: int, height: int) -> tuple[Came
 
 @lru_cache(maxsize=64)
 def centre_crop_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return all ``cameras``, cropped about the middle to the shape of another size and resized to it.
+    """Return all ``cameras``, cropped about the centre to the aspect ratio of another size and resized to it.
 
-    Landscape ones are turned for a portrait size, to either side, and the other way round.
+    Landscape cameras are turned to either side for a portrait size, and vice versa.
     """
     size = (width, height)
     return tuple(tuple(c.centre_crop(*size) for c in group) for group in _oriented(cameras, *size))
@@ -38,7 +38,10 @@ def centre_crop_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[
 
 @lru_cache(maxsize=64)
 def stretched_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return all ``cameras``, resized to another size whatever their shape; landscape ones are turned for a portrait size, to either side."""
+    """Return all ``cameras``, resized to another size whatever their aspect ratio.
+
+    Landscape cameras are turned to either side for a portrait size, and vice versa.
+    """
     return tuple(
         tuple(dict.fromkeys(camera.resized(width, height) for camera in group))
         for group in _oriented(cameras, width, height)
@@ -46,12 +49,12 @@ def stretched_cameras(cameras: CameraGroup, width: int, height: int) -> tuple[Ca
 
 
 def median_camera(group: CameraGroup) -> Intrinsics:
-    """Return the camera with the median focal length, the lower one of two."""
+    """Return the camera with the median focal length, the lower of the two middle ones."""
     return sorted(group, key=lambda camera: camera.fx)[(len(group) - 1) // 2]
 
 
 def _oriented(cameras: CameraGroup, width: int, height: int) -> tuple[CameraGroup, ...]:
-    """Return the cameras as those of landscape or portrait images, as another size is: one group, or two if any had to be turned."""
+    """Return the cameras turned to landscape or portrait like another size: one group, or two if any had to be turned."""
     ways = [
         (camera,) if (camera.width - camera.height) * (width - height) >= 0 else camera.quarter_turns()
         for camera in cameras

@@ -1,4 +1,4 @@
-"""Where the intrinsics of a photo come from: the user, a file, or the photo's own EXIF."""
+"""The sources of a photo's intrinsics: the user, a file, or the photo's own EXIF."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from bidnerf_core.records import parse_record
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
 """Millimetres; 35 mm-equivalent focal lengths refer to it (CIPA DCG-001)."""
 LEAST_CROP = 0.5
-"""Share of the width or of the height from which on a cropped photo is taken to have kept its resolution."""
+"""Smallest share of the width or of the height at which a cropped photo is assumed to have kept its resolution."""
 MIDDLE = "the principal point is assumed in the middle"
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
 COLMAP_MODELS: dict[str, tuple[int, ...]] = {
-    # Places of fx, fy, cx, cy and of the distortion in OpenCV's order among the parameters; -1 is a coefficient of 0.
+    # Indices of fx, fy, cx, cy and the distortion (in OpenCV's order) among the parameters; -1 is a coefficient of 0.
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
     "SIMPLE_RADIAL": (0, 0, 1, 2, 3, -1, -1, -1),
@@ -31,7 +31,7 @@ COLMAP_MODELS: dict[str, tuple[int, ...]] = {
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
-"""Parameters of COLMAP's perspective models (https://colmap.github.io/cameras.html), which also has pixel centres at +0.5."""
+"""Parameters of COLMAP's perspective models (https://colmap.github.io/cameras.html). Its pixel centres are at +0.5 as well."""
 COLMAP_MODEL_IDS = {
     0: "SIMPLE_PINHOLE",
     1: "PINHOLE",
@@ -40,12 +40,12 @@ COLMAP_MODEL_IDS = {
     4: "OPENCV",
     6: "FULL_OPENCV",
 }
-"""How ``cameras.bin`` names these models."""
+"""The ids of these models in ``cameras.bin``."""
 
 
 @dataclass(frozen=True)
 class CameraSource:
-    """The camera of an upright image, and a line that says where it comes from."""
+    """The camera of an upright image, and a one-line description of its source."""
 
     intrinsics: Intrinsics
     description: str
@@ -54,7 +54,7 @@ class CameraSource:
 
 @dataclass(frozen=True)
 class Raster:
-    """The size of an image as its file stores it, and how it is turned upright."""
+    """The size of an image as stored in its file, and the orientation that turns it upright."""
 
     width: int
     height: int
@@ -71,9 +71,9 @@ class Raster:
         return self.orientation.upright_size(self.width, self.height)
 
     def upright(self, camera: Intrinsics) -> Intrinsics | None:
-        """Return a given camera for the upright image, or None where its aspect ratio is that of another image.
+        """Return a given camera for the upright image, or None where its aspect ratio fits neither orientation.
 
-        A camera whose shape fits the stored image is taken for the camera of that (COLMAP ignores EXIF's orientation, too).
+        A camera that fits the stored image is assumed to describe that (COLMAP ignores EXIF's orientation, too).
         """
         given = (camera.width, camera.height)
         if same_aspect(given, self.size):
@@ -90,11 +90,11 @@ def find_camera(
     hfov: float | None = None,
     assumed: Sequence[Intrinsics] = (),
 ) -> CameraSource:
-    """Return the camera of an upright photo: ``camera``, ``focal`` or ``hfov`` where one is given, else what EXIF says.
+    """Return the camera of an upright photo: ``camera``, ``focal`` or ``hfov`` where one is given, else that of EXIF.
 
     ``focal`` is in pixels of the stored image and ``hfov`` in degrees across the upright one. Where EXIF has no focal length,
-    that of the ``assumed`` cameras, if there are any, is taken. ``where`` opens the message of the ``InputError`` that is raised
-    where several are given, where none is known, and where the camera belongs to an image of another shape.
+    that of the ``assumed`` cameras, if there are any, is used. Raises ``InputError``, whose message begins with ``where``, if
+    several are given, if none is known, and if the camera belongs to an image of another aspect ratio.
     """
     if sum(given is not None for given in (camera, focal, hfov)) > 1:
         raise InputError(f"{where}: several cameras are given, expected one of {WAYS}")
@@ -117,7 +117,7 @@ def find_camera(
 
 
 def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intrinsics]) -> CameraSource:
-    """Return the camera by EXIF, or one of the ``assumed`` ones."""
+    """Return the camera from EXIF, or one of the ``assumed`` ones."""
     if exif.has_focal_length and assumed and exif.size and _is_cropped(raster, exif.size):
         return _camera_of_crop(where, raster, exif, exif.size)
     assumable = None if exif.has_focal_length else _assumed(raster, assumed)
@@ -143,7 +143,7 @@ def _focal(camera: Intrinsics) -> str:
 
 
 def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
-    """Return the camera that EXIF describes; it is good to some percent, and the lens is taken as free of distortion.
+    """Return the camera that EXIF describes, accurate to a few percent; the lens is assumed to be free of distortion.
 
     Raises ``InputError`` where there is no focal length, and where the image was cropped after it was taken.
     """
@@ -157,9 +157,9 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
 
 
 def _camera_of_crop(where: str, raster: Raster, exif: Exif, taken: tuple[int, int]) -> CameraSource:
-    """Return the camera of a photo that was cropped after EXIF was written, at a size of ``taken``.
+    """Return the camera of a photo that was cropped after EXIF was written, when its size was ``taken``.
 
-    It is taken to have kept its resolution, unless it is far smaller or larger: then for a centre crop that was resized.
+    It is assumed to have kept its resolution, unless it is far smaller or larger: then it is taken for a resized centre crop.
     """
     ratio = max(raster.width / taken[0], raster.height / taken[1])
     fits = raster.width <= taken[0] and raster.height <= taken[1]
@@ -174,12 +174,12 @@ def _is_cropped(raster: Raster, taken: tuple[int, int]) -> bool:
 
 
 def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> CameraSource:
-    """Return the camera of an image which is, or is cut out of, one of the size ``whole``."""
+    """Return the camera of an image that is, or was cropped from, one of the size ``whole``."""
     if exif.equivalent_mm is not None:
         focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*whole)
         return _from_focal(where, raster, focal, f"{exif.equivalent_mm:g} mm equivalent in EXIF")
     if exif.focal_mm is not None and exif.pixels_per_mm is not None:
-        # The resolution is that of the image when it was taken.
+        # ``pixels_per_mm`` refers to the image as it was taken.
         scale = max(whole) / max(exif.size) if exif.size else 1.0
         focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
@@ -188,9 +188,9 @@ def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> 
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource | None:
-    """Return the one of the ``cameras`` with the median focal length, of those whose images have the same shape or else of their crops.
+    """Return the camera with the median focal length among those of the same aspect ratio, or else among centre crops.
 
-    If it is not known to which side it was turned, only its focal length is taken.
+    Where it is not known to which side the camera was turned, only its focal length is used.
     """
     size = raster.upright_size
     whole = cameras_at_size(tuple(cameras), *size)
@@ -228,7 +228,7 @@ def read_camera(path: Path, size: tuple[int, int]) -> Intrinsics:
 
 
 def read_text_cameras(path: Path) -> dict[int, Intrinsics]:
-    """Read COLMAP's ``cameras.txt``; its cameras by their ids. Raises ``InputError``."""
+    """Read COLMAP's ``cameras.txt`` and return its cameras by their ids. Raises ``InputError``."""
     return _colmap_cameras(path, read_file(path, "COLMAP's cameras.txt"))
 
 
@@ -270,7 +270,7 @@ def colmap_parameters(model: str) -> int:
 
 
 def colmap_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Intrinsics:
-    """Return a camera of one of ``COLMAP_MODELS``. Raises ``InputError``, which begins with ``where``."""
+    """Return a camera of one of ``COLMAP_MODELS``. Raises ``InputError``, whose message begins with ``where``."""
     if len(parameters) != colmap_parameters(model):
         raise InputError(
             f"{where}: {model} has {len(parameters)} parameters, expected {colmap_parameters(model)}"

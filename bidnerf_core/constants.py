@@ -1,4 +1,4 @@
-"""Constants as tensors: each is made once on each device, since making one copies it there from the host."""
+"""Constants as tensors. Each is made once per device, since making one copies it there from the host."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _notes: list[list[Tensor]] = []
 
 
 def constant(values: tuple[float, ...], like: Tensor) -> Shaped[Tensor, "n"]:
-    """Return ``values`` in the type and on the device of ``like``. Do not write into the result: it is shared."""
+    """Return ``values`` with the dtype and device of ``like``. Do not write into the result: it is shared."""
     found = _constant(values, like.dtype, like.device)
     for notes in _notes:
         notes.append(found)
@@ -23,7 +23,7 @@ def constant(values: tuple[float, ...], like: Tensor) -> Shaped[Tensor, "n"]:
 
 @contextmanager
 def noted() -> Iterator[list[Tensor]]:
-    """Note all constants that are asked for meanwhile, in any thread: who keeps the notes keeps the constants."""
+    """Collect all constants that are requested within the context, in any thread: the list keeps them alive."""
     notes: list[Tensor] = []
     _notes.append(notes)
     try:
@@ -39,5 +39,5 @@ def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.devic
 
 
 def forget() -> None:
-    """Forget all constants, as after a device has gone."""
+    """Forget all constants, for instance once a device no longer exists."""
     _constant.cache_clear()

@@ -1,8 +1,8 @@
 """Contraction of unbounded space (Barron et al. 2022, mip-NeRF 360, section 2).
 
-What lies within a unit of the origin stays where it is, and all the rest is drawn into the shell between 1 and 2, so that a
-field of bounded size models near things finely and the distance coarsely. We measure length by the largest coordinate, as
-nerfstudio does: the contracted space is then a cube, which a grid fills.
+Points within a unit of the origin stay where they are, and all others are drawn into the shell between 1 and 2, so that a
+field of bounded size models near things finely and distant ones coarsely. The norm is the largest coordinate, as in
+nerfstudio: the contracted space is then a cube, which a grid fills.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def expand(points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
 
 @dataclass(frozen=True, eq=False)
 class RaySpacing:
-    """A coordinate along rays in which steps of equal length are equally fine for a contracted field (eq. 11).
+    """A coordinate along rays in which equal steps match the resolution of a contracted field (eq. 11).
 
     It is the distance (metres) up to ``exit``, where the ray leaves the uncontracted box, and ``exit + radius * x / (1 + x)``
     beyond, where ``x`` is the distance from there in units of ``radius``.

@@ -17,33 +17,33 @@ from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.images import decode, to_numpy
 
 FARTHEST = 1e9
-"""Metres. No sensor measures more, and float32 has no use for it."""
+"""Metres. No sensor measures more."""
 NOTHING = 1e10
-"""Floating-point values from here on stand for "nothing", whatever the unit: Blender's 1e10, the largest float."""
+"""Floating-point values from here on mean "nothing", whatever the unit: Blender's 1e10, the largest float."""
 MILLIMETRE = 0.001
 """Metres."""
 INTEGER_UNIT, FLOAT_UNIT = MILLIMETRE, 1.0
-"""Metres a step where the user gives none."""
+"""Metres per step where the user gives no unit."""
 SPIKE, SPIKE_PIXELS = 0.05, 20
-"""Share and count of an image's pixels from which on its largest value may be the sensor's limit, not a measurement ..."""
+"""Share and number of pixels above which an image's largest value may be the sensor's limit, not a measurement ..."""
 NEAREST_LIMIT, LIMIT_STEP = 4.0, 0.5
-"""... if that is a round number: a multiple of 0.5 m, as ranges are set and data sheets have them, from 4 m on ..."""
+"""... if it is a round number, as ranges in settings and data sheets are: a multiple of 0.5 m, from 4 m on ..."""
 LARGEST_OF_BITS = tuple(2**bits - 1 for bits in range(11, 17))
-"""... or all bits of a sensor of 11 to 16 ..."""
+"""... or has all bits set, for a sensor of 11 to 16 bits ..."""
 STANDS_OUT = 4
-"""... and is so many times as frequent as any other. Walls that face the camera have one depth as well, but rarely a round
-one, and images of flat pieces have several."""
+"""... and is at least this many times as frequent as any other. A wall that faces the camera has a single depth as well, but
+rarely a round one, and images of several flat surfaces have several."""
 SATURATED = np.iinfo(np.uint16).max
 """A 16-bit sensor writes this for "too far" or "nothing"; 65.535 once it is converted to metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """A depth image, and what stood in the place of measurements."""
+    """A depth image, and the values that were found in place of measurements."""
 
     metres: Float[Tensor, "h w"]  # planar z, 0 where nothing was measured
-    unit: float  # metres a step
-    replaced: dict[str, int]  # how often each kind of value that is not a depth occurred, zeros not counted
+    unit: float  # metres per step
+    replaced: dict[str, int]  # how often each kind of value that is not a depth occurred, except zeros
 
     @property
     def median(self) -> float | None:
@@ -52,7 +52,7 @@ class DepthImage:
         return float(measured.median()) if measured.numel() else None
 
     def remark(self, unit_assumed: bool) -> str | None:
-        """Return a line that says which unit was assumed, what is missing and which values were dropped, or None."""
+        """Return one line on the assumed unit, missing depth and dropped values, or None if there is nothing to report."""
         parts = []
         if self.median is None:
             parts.append("the depth image holds no measurement, so colour alone is used")
@@ -63,13 +63,13 @@ class DepthImage:
 
     @property
     def dropped(self) -> str | None:
-        """A clause that says which values were dropped, or None."""
+        """A clause that lists the values dropped, or None if there were none."""
         found = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
         return f"counted as not measured: {found}" if found else None
 
 
 def read_depth(path: Path, unit: float) -> Float[Tensor, "h w"]:
-    """Read planar z in metres, ``unit`` metres a step; 0 where nothing was measured (see ``depth_image``)."""
+    """Read planar z in metres, ``unit`` metres per step; 0 where nothing was measured (see ``depth_image``)."""
     return read_depth_image(path, unit).metres
 
 
@@ -83,13 +83,13 @@ def read_depth_image(path: Path, unit: float | None) -> DepthImage:
 
 
 def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> DepthImage:
-    """Convert an array (h, w) or (h, w, 1) of ``unit`` metres a step; None is 0.001 for integers and 1 for floats.
+    """Convert an array (h, w) or (h, w, 1) of ``unit`` metres per step; None is 0.001 for integers and 1 for floats.
 
-    Values that no sensor measures become 0: NaN, infinite, negative, the largest of an integer type, 65535 and 65.535 of a
-    floating-point one, and floats of more than 1e9 m (1e10, the largest float). So does the largest value of the image
-    where it is a sensor's limit: a round number (``LIMIT_STEP``, ``LARGEST_OF_BITS``) in a twentieth of all pixels or more,
-    far more frequent than any other, but not all that was measured. Raises ``InputError``, which begins with ``what``, for arrays of another shape or type
-    and a unit that is not positive.
+    Values that no sensor measures become 0: NaN, infinite and negative values, the largest of an integer type, 65535 and
+    65.535 of a floating-point one, and floats of more than 1e9 m (1e10, the largest float). So does the largest value of the
+    image where it is a sensor's limit: a round number (``LIMIT_STEP``, ``LARGEST_OF_BITS``) in a twentieth of all pixels or
+    more, far more frequent than any other, but not the only value measured. Raises ``InputError``, whose message begins with
+    ``what``, for arrays of another shape or type and a unit that is not positive.
     """
     values = to_numpy(raw)
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
@@ -113,7 +113,7 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
 
 
 def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
-    """Return masks of the values that mean "not measured", by their name in messages; no pixel is in two of them."""
+    """Return masks of the values that mean "not measured", by their names in messages; no pixel is in two of them."""
     if values.dtype.kind != "f":
         largest = np.iinfo(values.dtype).max
         saturated = values == largest
@@ -133,7 +133,7 @@ def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the mask of the pixels at the sensor's limit, by its name in messages; nothing where there is none."""
+    """Return the mask of the pixels at the sensor's limit, by its name in messages; empty where there are none."""
     measured = metres[~unmeasured]
     if not measured.size:
         return {}
@@ -152,17 +152,17 @@ def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) ->
 
 
 class DepthReader:
-    """Reads the depth images of a recording, and warns once of each kind of value that stands for "not measured".
+    """Reads the depth images of a recording, and warns once about each kind of value that means "not measured".
 
-    ``documented`` are kinds that the format of the recording defines, by their names in ``DepthImage.replaced``; they are
-    not mentioned.
+    ``documented`` are the kinds that the recording's format defines, by their names in ``DepthImage.replaced``; they cause
+    no warning.
     """
 
     def __init__(self, documented: Collection[str] = ()) -> None:
         self._mentioned = set(documented)
 
     def __call__(self, path: Path, unit: float) -> DepthImage:
-        """Read an image as ``read_depth_image`` does. New kinds of values are an ``InputWarning``."""
+        """Read an image as ``read_depth_image`` does. New kinds of values cause an ``InputWarning``."""
         found = read_depth_image(path, unit)
         new = {name: count for name, count in found.replaced.items() if name not in self._mentioned}
         if new:

@@ -1,4 +1,4 @@
-"""The noise of measured depth, estimated from one depth image: how far its pixels are from planes through their neighbours."""
+"""The noise of measured depth, estimated from one depth image by the distance of its pixels from locally fitted planes."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from bidnerf_core.depth_steps import DepthSteps, depth_steps, lines_of_sensor
 from bidnerf_core.robust import MAD_TO_SIGMA
 
 WINDOW_SIDE = 8
-"""Rows and columns of the pixels to which a plane is fitted."""
+"""Side, in pixels, of the square windows to which planes are fitted."""
 PLANAR = 0.25
-"""Quantile of the windows' residuals: as many are taken for planes. The others may show edges, curved things and relief."""
+"""Quantile of the windows' residuals: this share is assumed planar. The others may show edges, curved surfaces and relief."""
 QUANTILE_BIAS = 1.11
-"""The noise over that quantile, where all windows are planes and all pixels independent."""
+"""Ratio of the noise to that quantile where all windows are planar and all pixels independent."""
 LEAST_WINDOWS = 20
-"""Least number of windows in a range of depths from which its noise is estimated."""
+"""Minimum number of windows in a range of depths from which its noise is estimated."""
 DEPTH_RANGES = 8
-"""Largest number of ranges of depths, with equal numbers of windows."""
+"""Maximum number of ranges of depths, with equal numbers of windows."""
 ENOUGH_SPREAD = 1.5
-"""Least ratio of the farthest to the nearest range with which the growth of the noise is estimated."""
+"""Minimum ratio of the farthest to the nearest range for which the growth of the noise with depth is estimated."""
 
 
 def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> DepthNoise | None:
     """Return the noise of a depth image (planar z, metres, 0: not measured), as a function of the depth.
 
-    It is relative noise that is constant or grows linearly, ``linear + quadratic * z``, fitted to robust residuals of local
-    planes and to the rounding of stored values, the larger of both. None where too few windows of the image are measured
-    without gaps. Errors that neighbouring pixels share are not noticed, such as those of a warped image, or what is left of
-    a lidar's after interpolation. Where hardly a window shows a plane, relief of the scene counts as noise.
+    Its relative noise is constant or grows linearly, ``linear + quadratic * z``; it is fitted to the larger of the robust
+    residuals of local planes and the rounding of stored values. None where too few windows of the image are measured without
+    gaps. Errors that neighbouring pixels share go unnoticed, such as those of a warped image, or what remains of a lidar's
+    after interpolation. Where hardly any window is planar, relief of the scene counts as noise.
     """
     if min(depth.shape) < WINDOW_SIDE:
         return None
@@ -45,10 +45,10 @@ def estimated_depth_noise(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -
 
 
 def _residuals(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> Float[Tensor, "n 2"]:
-    """Return the median depth (metres) of each window that is measured throughout, and its relative noise about a plane.
+    """Return the median depth (metres) of each window without gaps, and its relative noise about a plane.
 
-    The inverse depth of a plane is linear in the coordinates of the image, whichever its slant. A deviation of 1/z by e is
-    one of z by the share ``z e``.
+    The inverse depth of a plane is linear in the image coordinates, whatever its slant. A deviation e of 1/z corresponds to
+    a relative deviation ``z e`` of z.
     """
     depth = depth.detach().cpu()
     rows, columns = lines_of_sensor(depth)
@@ -66,7 +66,7 @@ def _residuals(depth: Float[Tensor, "h w"], intrinsics: Intrinsics) -> Float[Ten
 
 
 def _windows(image: Float[Tensor, "h w"]) -> Float[Tensor, "n p"]:
-    """Return the pixels of windows side by side; rows and columns that are left over are not used."""
+    """Return the pixels of adjacent windows, one window per row; left-over rows and columns of the image are not used."""
     return (
         image.unfold(0, WINDOW_SIDE, WINDOW_SIDE)
         .unfold(1, WINDOW_SIDE, WINDOW_SIDE)
@@ -75,7 +75,7 @@ def _windows(image: Float[Tensor, "h w"]) -> Float[Tensor, "n p"]:
 
 
 def _by_depth(windows: Float[Tensor, "n 2"], steps: DepthSteps | None) -> Float[Tensor, "b 2"]:
-    """Return the median depth and the relative noise of ranges of depths with equal numbers of windows."""
+    """Return the median depth and the relative noise of depth ranges with equal numbers of windows."""
     ordered = windows[windows[:, 0].argsort()]
     count = min(DEPTH_RANGES, len(windows) // LEAST_WINDOWS)
     found = []

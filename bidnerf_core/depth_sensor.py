@@ -1,7 +1,7 @@
-"""Models of depth sensors: what is known of a measured depth before it is compared with anything.
+"""Models of depth sensors: how accurate a measured depth is known to be before it is compared with anything.
 
 All assumptions about the accuracy of measured depth are here. Standard deviations are one sigma. An error of the scale or
-the offset is the same in all pixels of an image and moves the whole pose; noise is independent from pixel to pixel.
+the offset is the same in all pixels of an image and shifts the whole pose; noise is independent from pixel to pixel.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ class DepthNoise:
     """The standard deviation of a pixel's depth, a polynomial in the depth."""
 
     constant: float = 0.0  # metres
-    linear: float = 0.0  # metres a metre, so that it holds in any unit of length
-    quadratic: float = 0.0  # metres a square metre; sensors that measure disparity have this kind of noise
+    linear: float = 0.0  # metres per metre, so that it holds in any unit of length
+    quadratic: float = 0.0  # metres per square metre; sensors that measure disparity have this kind of noise
 
     def __post_init__(self) -> None:
         if not all(0 <= value < math.inf for value in (self.constant, self.linear, self.quadratic)):
@@ -39,7 +39,7 @@ class DepthNoise:
 
 @dataclass(frozen=True)
 class DepthSensorModel:
-    """How far the depths of one kind of sensor are off, as standard deviations.
+    """The errors of one kind of depth sensor, as standard deviations.
 
     Lengths in metres are stated only for sensors that are given by name. For an unknown sensor everything is relative, since
     a scene may have any unit of length.
@@ -57,7 +57,7 @@ class DepthSensorModel:
 
 
 UNKNOWN = DepthSensorModel(scale=0.01, noise=DepthNoise(linear=0.01))
-"""A sensor of which nothing is said: 1 % each for scale and noise, a round figure for consumer sensors at a few metres."""
+"""An unspecified sensor: 1 % each for scale and noise, a round figure for consumer sensors at a few metres."""
 
 KINECT = DepthSensorModel(scale=0.027, offset=0.0, noise=DepthNoise(quadratic=0.001425))
 """Microsoft's first Kinect, and other sensors by PrimeSense, as they leave the factory.
@@ -76,22 +76,22 @@ REALSENSE = DepthSensorModel(
 The noise was fitted to a D435 (Ahn et al., "Analysis and Noise Modeling of the Intel RealSense D435 for Mobile Robots", UR
 2019). It agrees with Intel's formula for the root mean square error, 0.08 px z^2 / (focal length x baseline) = 0.0038 z^2 at
 848x480; that of a D415 is 0.0015 z^2 at 1280x720, so this model is cautious there. The data sheet of the D400 series limits
-the error of the distance to 2 % within 2 m, which is taken for two standard deviations.
+the error of the distance to 2 % within 2 m, which is taken as two standard deviations.
 """
 
 LIDAR = DepthSensorModel(scale=0.01, offset=0.01, noise=DepthNoise(constant=0.005, linear=0.0025))
 """The lidar of Apple's phones and tablets, as ARKit returns it: few measured points, interpolated along the edges of the image.
 
 Luetzenburg, Kroon and Bjørk, "Evaluation of the Apple iPhone 12 Pro LiDAR for an Application in Geosciences", Scientific
-Reports 11, 2021, found an accuracy of 1 cm on objects with sides of more than 10 cm, which is taken for the offset and, at
-2 m, for the noise. The scale is that of an unknown sensor.
+Reports 11, 2021, found an accuracy of 1 cm on objects with sides of more than 10 cm, which is taken as the offset and, at
+2 m, as the noise. The scale is that of an unknown sensor.
 """
 
 EXACT = DepthSensorModel(scale=0.0, noise=DepthNoise())
 """A sensor without errors, with which the systematic part of a covariance is left out."""
 
 RENDERED = DepthSensorModel(scale=0.0, noise=DepthNoise(linear=0.001))
-"""Depth that was computed from a model of the scene: exact but for rounding, as to the whole millimetres of a PNG from 1 m on."""
+"""Depth computed from a model of the scene: exact but for rounding, such as to the whole millimetres of a PNG from 1 m on."""
 
 DEPTH_SENSORS: dict[str, DepthSensorModel] = {
     "unknown": UNKNOWN,
@@ -100,11 +100,11 @@ DEPTH_SENSORS: dict[str, DepthSensorModel] = {
     "lidar": LIDAR,
     "rendered": RENDERED,
 }
-"""Sensors by the names that users give; a further one may be added."""
+"""Sensors by the names that users give; others may be added."""
 
 
 def find_depth_sensor(name: str) -> DepthSensorModel:
-    """Return the model of a sensor. Raises ``InputError``, which lists the names, for another one."""
+    """Return the model of a sensor. Raises ``InputError``, which lists the known names, for an unknown one."""
     if name not in DEPTH_SENSORS:
         raise unknown_name("depth sensor", name, DEPTH_SENSORS)
     return DEPTH_SENSORS[name]

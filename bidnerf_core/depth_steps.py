@@ -10,25 +10,25 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 REPEATED = 4
-"""Least mean number of pixels with the same depth; where it is less, depth is continuous or most of its values do not occur."""
+"""Minimum mean number of pixels per depth value; below it, depth is continuous or most of its possible values do not occur."""
 RANGE_VALUES, MOST_RANGES = 8, 40
-"""Least number of distinct values in a range of depths of which the median spacing is taken, and largest number of ranges."""
+"""Minimum number of distinct values in a depth range, of which the median spacing is taken, and maximum number of ranges."""
 LEAST_LINES, MOST_LINES = 8, 0.8
-"""Least number of different rows, and of columns, of a depth image that was resampled, and largest share of all of them."""
+"""Minimum number of distinct rows (and columns) of a resampled depth image, and their maximum share of all of them."""
 BETTER = 2.0
-"""Factor by which the misfit of constant steps must exceed that of growing ones before these are assumed."""
+"""Factor by which the misfit of constant steps must exceed that of growing steps for growing steps to be assumed."""
 
 
 @dataclass(frozen=True)
 class DepthSteps:
-    """The spacing of neighbouring depth values: the larger of a constant and a multiple of the squared depth."""
+    """The spacing of adjacent depth values: the larger of a constant and a multiple of the squared depth."""
 
     constant: float  # metres: the unit in which depth is stored
-    quadratic: float  # metres a square metre; 0 where depth was not computed from whole steps of disparity
+    quadratic: float  # metres per square metre; 0 where depth was not computed from whole steps of disparity
 
     @property
     def of_disparity(self) -> bool:
-        """Whether the steps grow with the square of the depth, as those of a sensor that measures disparity."""
+        """Whether the steps grow with the square of the depth, like those of a sensor that measures disparity."""
         return self.quadratic > 0
 
     def step(self, depth: float) -> float:
@@ -43,9 +43,9 @@ class DepthSteps:
 def depth_steps(depth: Float[Tensor, "h w"]) -> DepthSteps | None:
     """Return the steps of a depth image (metres, 0: not measured), or None where its values are continuous or too few.
 
-    Depth of whole millimetres has the same spacing everywhere. Where a disparity d is measured in whole steps, the depth
-    ``f b / d`` has a spacing that is proportional to its square. So have the rows of an exact image of a floor, which cannot be
-    distinguished from that.
+    Depth in whole millimetres has the same spacing everywhere. Where a disparity d is measured in whole steps, the spacing
+    of the depth ``f b / d`` is proportional to its square. The same holds for the rows of an exact image of a floor, which
+    cannot be distinguished from that.
     """
     rows, columns = lines_of_sensor(depth)
     depth = depth[rows][:, columns]
@@ -60,9 +60,9 @@ def depth_steps(depth: Float[Tensor, "h w"]) -> DepthSteps | None:
 def lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[Tensor, "c"]]:
     """Return the numbers of the rows and columns that do not repeat the one before.
 
-    Depth of a lower resolution than its image was resampled to the nearest measurement: its repeated pixels are no
-    measurements of their own. All lines are returned where few repeat another, such as empty ones along a border, and where
-    hardly any would be left, as of an exact image of a wall.
+    Depth whose sensor has a lower resolution than the image was resampled to the nearest measurement: repeated pixels are not
+    separate measurements. All lines are returned where few repeat another, such as empty ones along a border, and where
+    hardly any would be left, as in an exact image of a wall.
     """
     found = []
     for lines in (depth, depth.T):
@@ -79,7 +79,7 @@ def lines_of_sensor(depth: Float[Tensor, "h w"]) -> tuple[Int[Tensor, "r"], Int[
 
 
 def _spacings(values: Float[Tensor, "v"], counts: Tensor) -> Float[Tensor, "b 2"]:
-    """Return the median depth and the median spacing of the values in ranges of depths where nearly all values occur."""
+    """Return the median depth and the median spacing of the values in depth ranges where nearly all values occur."""
     ranges, found = min(MOST_RANGES, len(values) // RANGE_VALUES), []
     for some, pixels in zip(values.tensor_split(ranges), counts.tensor_split(ranges), strict=True):
         if int(pixels.sum()) >= REPEATED * len(some):
@@ -88,7 +88,7 @@ def _spacings(values: Float[Tensor, "v"], counts: Tensor) -> Float[Tensor, "b 2"
 
 
 def _fitted(spacings: Float[Tensor, "b 2"]) -> DepthSteps:
-    """Return the steps with the least mean deviation of the spacings' logarithms, among all that meet spacings exactly."""
+    """Return the best fit to the logarithms of the spacings, among steps that match some of the spacings exactly."""
     depth, gap = spacings.unbind(-1)
     units, factors = gap.unique(), gap / depth.square()
     same = (gap.log() - units.log()[:, None]).abs().mean(-1)

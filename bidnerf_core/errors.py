@@ -1,4 +1,4 @@
-"""What a user's mistake raises, and what is said of an assumption: one line that names the file and the finding."""
+"""Errors for a user's mistakes and warnings about assumptions: each is one line that names the file and the finding."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Collection, Sequence
 
 
 class InputError(ValueError):
-    """An input is not usable; the message is a line that can be shown to the user as it is."""
+    """An input is not usable; the message is one line that can be shown to the user as it is."""
 
 
 class InputWarning(UserWarning):
-    """An input was ambiguous and a convention was assumed; the message is a line that says which."""
+    """An input was ambiguous and a convention was assumed; the message is one line that states which."""
 
 
 def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
-    """Return the error for a name that is not among ``known``; it suggests the one that is spelt most alike."""
+    """Return the error for a name that is not among ``known``; it suggests the known name with the most similar spelling."""
     listed = f", expected one of {', '.join(known)}"
     return InputError(f"no {what} {name!r}{spelling_hint(name, known, listed)}")
 
 
 def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str:
-    """Return the question whether the one of ``known`` was meant that is spelt most alike, or ``otherwise`` if none is."""
+    """Return a question that suggests the most similarly spelt of the ``known`` names, or ``otherwise`` if none is similar."""
     near = difflib.get_close_matches(name, known, n=1)
     return f", did you mean {near[0]!r}?" if near else otherwise
 

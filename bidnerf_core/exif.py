@@ -1,4 +1,4 @@
-"""What a camera wrote beside its photo: orientation, focal length, size of the sensor's pixels (EXIF 2.32, CIPA DC-008)."""
+"""A photo's EXIF metadata: orientation, focal length, size of the sensor's pixels (EXIF 2.32, CIPA DC-008)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 @dataclass(frozen=True)
 class Exif:
-    """The tags that say something about the camera; None where a tag is missing or makes no sense."""
+    """The tags that describe the camera; None where a tag is missing or makes no sense."""
 
     orientation: Orientation = UPRIGHT
     size: tuple[int, int] | None = None  # width and height of the stored image when the photo was taken
@@ -42,7 +42,7 @@ def read_exif(path: Path) -> Exif:
         try:
             tags = image.getexif()
             return _exif({**tags, **tags.get_ifd(IFD.Exif)})
-        except Exception:  # Pillow's parser raises whatever it likes; a photo may do without EXIF
+        except Exception:  # Pillow's parser may raise anything; EXIF is optional
             return Exif()
 
 

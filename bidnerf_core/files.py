@@ -13,7 +13,7 @@ from typing import BinaryIO
 from bidnerf_core.errors import InputError
 
 LARGEST_TEXT = 128 * 2**20
-"""Bytes. What is parsed as text takes ten times as much memory as its file; the size is checked before it is read."""
+"""Bytes. Parsed text takes ten times as much memory as its file, so the size is checked before the file is read."""
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}")
 FILE_KINDS = {
     stat.S_IFDIR: "a folder",
@@ -25,10 +25,10 @@ FILE_KINDS = {
 
 
 def open_binary(path: Path, expected: str) -> BinaryIO:
-    """Open a regular file for reading. ``expected`` says in a few words what it should be ("an image file").
+    """Open a regular file for reading. ``expected`` describes in a few words what it should be ("an image file").
 
     Raises ``InputError`` where there is no such file, where reading is not permitted, and for folders, pipes and devices:
-    reading from a pipe would wait for ever.
+    reading from a pipe could block forever.
     """
     try:
         mode = path.stat().st_mode
@@ -52,7 +52,7 @@ def read_file(path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
 
 
 def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGEST_TEXT) -> bytes:
-    """Return the rest of the open file ``path``. Raises ``InputError`` where it cannot be read or has more than ``most`` bytes."""
+    """Return the rest of the open file ``path``. Raises ``InputError`` if it is unreadable or larger than ``most`` bytes."""
     size = os.fstat(file.fileno()).st_size
     if size > most:
         found, limit = (f"{count / 2**20:,.0f} MiB" for count in (size, most))
@@ -64,7 +64,7 @@ def read_open_file(file: BinaryIO, path: Path, expected: str, most: int = LARGES
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a name that a file states is that of a file; no name that the system refuses is one."""
+    """Return whether a path that was read from a file is that of a file; False for names that the system rejects."""
     return os.path.isfile(path)
 
 
@@ -74,14 +74,14 @@ def temporary(path: Path) -> Path:
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether a file of this name was being written when its process was killed."""
+    """Return whether a name is that of a temporary file, left behind if its process was killed while writing."""
     return TEMPORARY.fullmatch(name) is not None
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file that appears under its name only once all of it is on the disk.
+    """Write a file atomically: it appears under its name only once all of it is on disk.
 
-    Raises ``OSError``, which names the file; whatever stood there before is then untouched.
+    Raises ``OSError``, which names the file; an earlier file of that name is then left untouched.
     """
     beside = temporary(path)
     try:
@@ -100,7 +100,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Flush a folder's list of names to the disk, on systems that can."""
+    """Flush a folder's directory entries to disk, on systems that support it."""
     with contextlib.suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:

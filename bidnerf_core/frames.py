@@ -1,4 +1,4 @@
-"""Images with their camera, and images with their camera's pose."""
+"""Images with their cameras, and images with their cameras' poses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bidnerf_core.photos import fit_depth, read_photo
 from bidnerf_core.se3 import SE3
 
 SPARSE = 0.05
-"""Share of an image's pixels below which measured depth is sparse: it says nothing about the pixels in between."""
+"""Share of an image's pixels below which measured depth is sparse: the pixels in between then remain unknown."""
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -39,7 +39,7 @@ class Frame:
     depth: Float[Tensor, "dh dw"] | None = None
     alpha: Float[Tensor, "ah aw"] | None = None
     camera_source: str | None = None
-    """A line that says where the intrinsics come from, of frames that ``open`` made."""
+    """One line about the source of the intrinsics, in frames that ``open`` returned."""
 
     focal_is_approximate: bool = False
     """Whether the focal length is a nominal one, such as that in EXIF, which may be off by several percent."""
@@ -50,8 +50,8 @@ class Frame:
     hidden: Bool[Tensor, "hh hw"] | None = None
     """The pixels where something that the map does not have hides the scene.
 
-    Depth is not measured there. No rays are drawn there and no keypoints found, and no landmarks are expected there; only
-    the thumbnails of a search by colour alone still show it.
+    Depth counts as not measured there. No rays are drawn there, no keypoints are detected and no landmarks are expected;
+    only the thumbnails of a search by colour alone still show it.
     """
 
     def __post_init__(self) -> None:
@@ -98,20 +98,20 @@ class Frame:
         background: Background = BLACK,
         largest: int | None = None,
     ) -> Frame:
-        """Read a photo, turn it upright as its EXIF orientation says, and find its camera.
+        """Read a photo, turn it upright according to its EXIF orientation, and find its camera.
 
         The camera is ``camera`` (intrinsics, or a file: ``transforms.json``, ``cameras.json``, COLMAP's ``cameras.txt``),
         or has the focal length ``focal`` (pixels of the image file), or the horizontal field of view ``hfov`` (degrees, of
         the upright image); at most one of them. Without them it comes from the focal length in EXIF or, where there is none,
-        from the ``assumed`` cameras, say those of a map's landmarks (``map.landmarks.cameras``). A camera of another
-        resolution is scaled, and one of the image as it is stored is turned with it. ``camera_source`` of the result says
-        in a line where the camera comes from.
+        from the ``assumed`` cameras, for instance those of a map's landmarks (``map.landmarks.cameras``). A camera of another
+        resolution is scaled, and one of the image as stored is turned with it. ``camera_source`` of the result describes in
+        one line where the camera comes from.
 
-        ``depth`` is an image or a ``.npy`` file of planar z, ``depth_unit`` metres a step. Without a unit, 0.001 m is
-        assumed for integers and 1 m for floats, and an ``InputWarning`` says so. It also names values that stand for
-        "nothing measured" (NaN, infinite, negative, 65535, 1e10 and the like), which become 0. Depth of another resolution
-        is resampled to the nearest measurement. ``background`` (rgb in [0, 1], "white" or "black") lies behind transparent
-        pixels. Where the longer side has more than ``largest`` pixels, the image is reduced to that size.
+        ``depth`` is an image or a ``.npy`` file of planar z, in steps of ``depth_unit`` metres. Without a unit, 0.001 m is
+        assumed for integers and 1 m for floats, with an ``InputWarning``, which also lists values that mean "nothing
+        measured" (NaN, infinite, negative, 65535, 1e10 and the like); they become 0. Depth of another resolution is resampled
+        to the nearest measurement. ``background`` (rgb in [0, 1], "white" or "black") lies behind transparent pixels. Where
+        the longer side has more than ``largest`` pixels, the image is reduced to that size.
 
         Raises ``InputError`` where a file is not readable or has more than 100 megapixels, where the camera is not known or
         given twice, and where camera or depth belong to an image of another aspect ratio.
@@ -152,7 +152,7 @@ class Frame:
         name: str = "image",
         background: Background = BLACK,
     ) -> Frame:
-        """Make a frame of arrays of numpy or torch.
+        """Make a frame from NumPy arrays or torch tensors.
 
         ``rgb`` is (h, w) or (h, w, 1 to 4): uint8 in [0, 255], uint16 in [0, 65535], or floats in [0, 1]; a second or
         fourth channel is alpha, which may be given as ``alpha`` (h, w) instead. Colours are straight (not premultiplied) and
@@ -195,12 +195,12 @@ class Frame:
 
     @property
     def has_depth(self) -> bool:
-        """Whether anything was measured."""
+        """Whether any depth was measured."""
         return self.depth is not None and bool((self.depth > 0).any())
 
     @property
     def has_dense_depth(self) -> bool:
-        """Whether more than a few points were measured."""
+        """Whether depth was measured at more than a few points."""
         return self.depth is not None and float((self.depth > 0).float().mean()) >= SPARSE
 
 
@@ -214,7 +214,7 @@ def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Floa
 
 @dataclass(frozen=True, eq=False)
 class SeenLandmarks:
-    """Landmarks that an image shows, and how far from its camera they are."""
+    """Landmarks that an image shows, and their distances from its camera."""
 
     pixels: Float[Tensor, "n 2"]  # column and row; the centre of the first pixel is (0.5, 0.5)
     distance: Float[Tensor, "n"]  # metres from the camera, not z
@@ -223,14 +223,14 @@ class SeenLandmarks:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A frame and where its camera is in some reference frame: the world, or the last camera of a rig."""
+    """A frame and the pose of its camera in some reference frame: the world, or the last camera of a rig."""
 
     frame: Frame
     T_ref_camera: SE3
-    landmarks: SeenLandmarks | None = None  # those that training takes distances from
+    landmarks: SeenLandmarks | None = None  # those from which training takes distances
     motion: Float[Tensor, "6"] | None = None
-    """Motion of the camera while its rows were exposed one after the other, see ``rolling_shutter``; the pose is then that of the
-    middle row."""
+    """Motion of the camera while its rows were exposed one after another, see ``rolling_shutter``; the pose is then that of
+    the middle row."""
 
     def to(self, device: torch.device | str) -> View:
         """Return the view with its images and its pose on ``device``."""

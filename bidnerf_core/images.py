@@ -22,22 +22,22 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.files import open_binary
 
 Background: TypeAlias = str | Sequence[float]
-"""What a user may write: "white", "black" or an rgb triple in [0, 1]."""
+"""A background as users give it: "white", "black" or an rgb triple in [0, 1]."""
 
 LARGEST_IMAGE = 100_000_000
-"""Pixels. A small file can describe an image of any size; its size is checked before memory is taken for it."""
+"""Pixels. A small file can describe an image of any size, so the size is checked before memory is allocated."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV")
 FULL_SCALE = {"bool": 1, "uint8": 255, "uint16": 65535}
 COLOUR_ROUNDING = 1e-3
-"""How far a floating-point channel may leave [0, 1], as resampling and colour conversion cause it."""
+"""How far a floating-point channel may exceed [0, 1], as happens in resampling and colour conversion."""
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What an image file says before its pixels are decoded."""
+    """The properties of an image file that are known before its pixels are decoded."""
 
     width: int
     height: int
@@ -45,7 +45,7 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Read size and channels, no pixels. Raises ``InputError`` where ``read_image`` would for the same reason."""
+    """Read size and channels, but no pixels. Raises ``InputError`` where ``read_image`` would for the same reason."""
     with open_image(path) as image:
         has_alpha = image.mode in ("LA", "RGBA", "PA") or (image.mode == "P" and image.has_transparency_data)
         return ImageHeader(image.width, image.height, has_alpha)
@@ -54,8 +54,8 @@ def read_header(path: Path) -> ImageHeader:
 def read_image(path: Path) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
     """Read straight (not premultiplied) colour in [0, 1], and alpha where there is such a channel.
 
-    Grey becomes three channels. The raster is the stored one, whatever orientation EXIF asks for. Raises ``InputError``
-    where the file is not a whole image of 1 to 4 channels of 8 bits (or 16 bits of grey), or is too large.
+    Grey becomes three channels. The raster is the stored one, whatever the EXIF orientation. Raises ``InputError`` where
+    the file is not a complete image of 1 to 4 channels of 8 bits (or 16 bits of grey), or is too large.
     """
     return channels(decode(path), f"{path}: image decodes to")
 
@@ -107,7 +107,7 @@ def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"
 
 
 def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
-    """Return the values of an array of numpy or torch (any device and type) as numpy's. Raises ``InputError``."""
+    """Return the values of a NumPy array or torch tensor (any device and dtype) as a NumPy array. Raises ``InputError``."""
     if not isinstance(array, Tensor):
         try:
             return np.asarray(array)
@@ -159,7 +159,7 @@ def reduced(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Te
 
 
 def _area_weights(old: int, new: int) -> csr_array:
-    """Return (new, old): which part of each new pixel along an axis lies in each old one."""
+    """Return a matrix (new, old): the share of each new pixel, along an axis, that lies in each old one."""
     edges = np.union1d(np.arange(old + 1), np.linspace(0, old, new + 1))
     middles, lengths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     places = ((middles * new / old).astype(int), middles.astype(int))
@@ -193,12 +193,12 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     """Open an image file; its pixels are decoded when they are first used, within the context.
 
     Raises ``InputError`` where there is no such regular file, where it is not readable as an image, and where the image has
-    more than ``LARGEST_IMAGE`` pixels. That is found in the header, before memory is taken.
+    more than ``LARGEST_IMAGE`` pixels, which the header shows before memory is allocated.
     """
     if path.suffix.lower() in HEIF_SUFFIXES:
         _register_heif(path)
     with open_binary(path, "an image file") as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of Pillow's: about large images, odd EXIF, palettes
+        warnings.simplefilter("ignore")  # Pillow's warnings about large images, odd EXIF, palettes
         try:
             with Image.open(file) as image:
                 _check_pixels(path, image.width, image.height)
@@ -207,7 +207,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             raise
         except Image.DecompressionBombError as error:
             raise _too_large(path, "more than 178 megapixels") from error
-        except Exception as error:  # decoders raise whatever they like, SyntaxError included
+        except Exception as error:  # decoders may raise anything, even SyntaxError
             raise InputError(
                 f"{path}: not readable as an image ({_why_unreadable(file, error)}), expected a whole image file"
             ) from error
@@ -241,6 +241,6 @@ def _register_heif(path: Path) -> None:
 
 
 def reason(error: Exception) -> str:
-    """Return the first line of what a decoder says, which may be many."""
+    """Return the first line of a decoder's message, which may have many."""
     text = str(error).strip()
     return text.splitlines()[0][:120] if text else type(error).__name__

@@ -21,13 +21,13 @@ MatrixRows = tuple[tuple[float, float, float, float], ...]
 
 @dataclass(frozen=True)
 class StoredCamera:
-    """Camera and pose of a training image, from which the scene is known to be visible."""
+    """Camera and pose of a training image: a viewpoint from which the scene is known to be visible."""
 
     name: str
     intrinsics: Intrinsics
     T_world_camera: MatrixRows
-    given_T_world_camera: MatrixRows | None = None  # the dataset's, where training refined it
-    moved_pixels: float | None = None  # how far the points that the image shows move in it from there, median
+    given_T_world_camera: MatrixRows | None = None  # the dataset's pose, where training refined it
+    moved_pixels: float | None = None  # median motion (pixels) of the image's points by the refinement
 
     @property
     def pose(self) -> SE3:
@@ -45,14 +45,14 @@ class StoredCamera:
 
     @property
     def update(self) -> Float[Tensor, "6"] | None:
-        """The right update (translation in metres first) from the given to the refined pose; None where that was kept."""
+        """The right update (translation in metres first) from the given to the refined pose; None where the pose was kept."""
         if self.given_T_world_camera is None:
             return None
         return (_pose(self.given_T_world_camera).inverse() @ self.pose).log()
 
     @property
     def moved(self) -> MovedCamera | None:
-        """How far refinement moved the camera; None where it kept the given pose."""
+        """How far refinement moved the camera; None where the given pose was kept."""
         if (update := self.update) is None:
             return None
         metres, radians = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
@@ -61,17 +61,17 @@ class StoredCamera:
 
 @dataclass(frozen=True)
 class MovedCamera:
-    """How far the refined pose of an image is from the given one."""
+    """The distance of an image's refined pose from the given one."""
 
     name: str
     translation: float  # metres
     rotation_deg: float
-    pixels: float  # that points in the image move, median
+    pixels: float  # median distance by which points move in the image
 
 
 @dataclass(frozen=True)
 class PoseConsistency:
-    """How well the given poses of images fit the keypoints that the images share, and how well adjusted ones do."""
+    """The fit of the given poses, and of adjusted ones, to the keypoints that images share."""
 
     noise_before: float  # pixels: standard deviation of the keypoints about their points at the given poses
     noise_after: float
@@ -84,10 +84,10 @@ class PoseConsistency:
 
 @dataclass(frozen=True)
 class PoseRefinement(PoseConsistency):
-    """What training found of the given poses of a map's images, and which ones it took."""
+    """The consistency of the poses given for a map's images, and which poses training used."""
 
-    refined: bool  # whether training took the adjusted poses
-    replaced: tuple[str, ...] = ()  # images whose given pose was wrong; landmarks of the others placed them
+    refined: bool  # whether training used the adjusted poses
+    replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized by the others' landmarks
 
 
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
@@ -96,7 +96,7 @@ def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
 
 
 def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
-    """Return the cameras with the poses that the dataset gives them."""
+    """Return the cameras with the poses that the dataset gives."""
     return tuple(
         StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras
     )
@@ -105,7 +105,7 @@ def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
 def moved_from(
     given: Sequence[View], refined: Sequence[StoredCamera], pixels: Sequence[float]
 ) -> tuple[StoredCamera, ...]:
-    """Return refined cameras with the poses of the ``given`` views, for those whose pose changed."""
+    """Return the refined cameras; those whose pose changed also record the pose of the ``given`` view."""
     return tuple(
         camera
         if camera.T_world_camera == (rows := _rows(view.T_ref_camera))
@@ -115,7 +115,7 @@ def moved_from(
 
 
 def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> list[str]:
-    """Return in a line or two what was found of the given poses, and how far they were moved."""
+    """Return a sentence or two on the consistency of the given poses and how far they were moved."""
     moved = [camera.moved for camera in cameras if camera.moved is not None]
     wrong = [m for m in moved if m.name in found.replaced]
     error = f"errors of the given poses add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
@@ -139,7 +139,7 @@ def _typical_motion(moved: Sequence[MovedCamera]) -> str:
 
 
 def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
-    """Return the views with refined poses, those that are among ``cameras`` with the pose that the view has."""
+    """Return the views at their refined poses; a view keeps its pose unless ``cameras`` records a refinement of that pose."""
     known = {(c.name, c.given_T_world_camera): c.pose for c in cameras if c.given_T_world_camera}
     poses = [known.get((view.frame.name, _rows(view.T_ref_camera)), view.T_ref_camera) for view in views]
     return [replace(view, T_ref_camera=T) for view, T in zip(views, poses, strict=True)]

@@ -15,12 +15,12 @@ from bidnerf_core.tensor_files import load_part
 
 
 def load_surface(path: Path) -> SurfaceMap:
-    """Raises ``InputError`` where the file does not hold what ``surface_tensors`` gives."""
+    """Return the baked surface of a map. Raises ``InputError`` where the file does not hold the tensors of one."""
     return load_part(path, surface_from_tensors, "a baked surface")
 
 
 def load_landmarks(path: Path) -> LandmarkMap:
-    """Raises ``InputError`` where the file does not hold what ``landmark_tensors`` gives."""
+    """Return the landmarks of a map. Raises ``InputError`` where the file does not hold the tensors of landmarks."""
     return load_part(path, landmarks_from_tensors, "landmarks")
 
 

@@ -1,4 +1,4 @@
-"""Moving what consists of tensors to a device."""
+"""Moving objects that hold tensors to a device."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _T = TypeVar("_T")
 
 
 def working_device(device: torch.device | str) -> torch.device:
-    """Return a device after computing on it: whether it works here does not follow from its name.
+    """Return a device after a test computation on it: its name alone does not show whether it works on this machine.
 
-    Raises ``InputError`` for one that does not.
+    Raises ``InputError`` for one that does not work.
     """
     try:
         found = torch.device(device)
         torch.ones((), device=found).item()
-    except (RuntimeError, AssertionError, TypeError) as error:  # torch's own builds differ in which
+    except (RuntimeError, AssertionError, TypeError) as error:  # which one depends on the build of torch
         raise InputError(
             f"device {str(device)!r} does not work here, expected one that does, such as cpu"
         ) from error
@@ -32,9 +32,9 @@ def working_device(device: torch.device | str) -> torch.device:
 def moved(value: _T, device: torch.device | str) -> _T:
     """Return ``value`` with every tensor in it on ``device``; ``value`` itself is left as it is.
 
-    Tensors are found in modules, in the fields of dataclasses, and in lists, tuples and dictionaries of these; whatever else
-    there is stays the same object, and so does all of ``value`` if it lies on ``device`` already. What a dataclass has cached
-    is computed anew on the device.
+    Tensors are found in modules, in the fields of dataclasses, and in lists, tuples and dictionaries of these; anything else
+    stays the same object, and so does ``value`` as a whole if it is on ``device`` already. Values that a dataclass has cached
+    are computed anew on the device.
     """
     found: Any = _moved(value, torch.device(device))
     return found
@@ -61,7 +61,7 @@ def _moved(value: Any, device: torch.device) -> Any:
 
 
 def _with_fields(value: Any, parts: dict[str, Any]) -> Any:
-    """Return another dataclass of the same kind with these fields, those that its constructor does not take among them."""
+    """Return a new instance of a dataclass with these fields, including those that its constructor does not take."""
     found = object.__new__(type(value))
     for name, part in parts.items():
         object.__setattr__(found, name, part)
@@ -69,6 +69,6 @@ def _with_fields(value: Any, parts: dict[str, Any]) -> Any:
 
 
 def _is_on(tensor: Tensor, device: torch.device) -> bool:
-    """Return whether a tensor lies on ``device``, whose number, where it has none, does not matter."""
+    """Return whether a tensor is on ``device``; a device without an index matches any of its type."""
     here = tensor.device
     return here.type == device.type and device.index in (None, here.index)

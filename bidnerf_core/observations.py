@@ -1,7 +1,7 @@
 """Measured rays: colours and distances that sensors measured along half-lines in a reference frame.
 
-The same bundle serves pixels of an RGB-D image, the returns of a lidar and the points of structure from motion. Each ray
-holds what was measured along it: ``coloured`` marks rays with a colour, and ``distance`` is 0 where none was measured.
+One class serves the pixels of an RGB-D image, the returns of a lidar and the points of structure from motion. Each ray holds
+what was measured along it: ``coloured`` marks rays with a colour, and ``distance`` is 0 where none was measured.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Observations:
     def from_points(points: Float[Tensor, "n 3"], T_ref_sensor: SE3) -> Observations:
         """Return rays to ``points`` (metres), as measured by a sensor at the origin of their frame; float64.
 
-        Points that are not finite or lie at the origin are the returns that a lidar did not get, and are left out. Raises
-        ``InputError`` where none is left.
+        Points that are not finite or lie at the origin are a lidar's missing returns and are left out. Raises ``InputError``
+        where none is left.
         """
         points = points.to(torch.float64)
         distance = torch.linalg.vector_norm(points, dim=-1)
@@ -46,7 +46,7 @@ class Observations:
     def of_depth(
         origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], distance: Float[Tensor, "n"]
     ) -> Observations:
-        """Return rays along which a distance (metres, > 0) but no colour was measured. Raises ``InputError`` for none."""
+        """Return rays along which only a distance (metres, > 0) was measured. Raises ``InputError`` if there are none."""
         if len(distance) == 0:
             raise InputError("depth rays: nothing was measured, expected at least one finite point in front")
         coloured = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
@@ -61,7 +61,7 @@ class Observations:
 
     @staticmethod
     def stacked(parts: Sequence[Observations]) -> Observations:
-        """Stack parts with equally many rays along a new first axis."""
+        """Stack parts with equal numbers of rays along a new first axis."""
         return Observations(
             *(torch.stack(values) for values in zip(*(part._tensors() for part in parts), strict=True))
         )
@@ -70,12 +70,12 @@ class Observations:
         return len(self.distance)
 
     def __getitem__(self, index: Tensor | slice | None) -> Observations:
-        """Return some of the rays, by their place along the first axis or by a mask; None adds an axis of length 1."""
+        """Return some of the rays, by their index along the first axis or by a mask; None adds an axis of length 1."""
         return Observations(*(part[index] for part in self._tensors()))
 
     @property
     def measured(self) -> Bool[Tensor, "*p"]:
-        """Where a distance was measured."""
+        """The mask of the rays along which a distance was measured."""
         return self.distance > 0
 
     @property
@@ -84,12 +84,12 @@ class Observations:
         return self.origins + self.distance[..., None] * self.directions
 
     def without_colour(self) -> Observations:
-        """Return the rays along which a distance was measured, without colours. Raises ``InputError`` for none."""
+        """Return the rays along which a distance was measured, without colours. Raises ``InputError`` if there are none."""
         measured = self[self.measured]
         return Observations.of_depth(measured.origins, measured.directions, measured.distance)
 
     def gathered(self, index: Int[Tensor, "k m"]) -> Observations:
-        """Return the rays of shape (k p) at ``index`` along their second axis, m of each row."""
+        """Return m rays from each row of rays of shape (k p), at ``index`` along the second axis."""
         wide = index[..., None].expand(*index.shape, 3)
         origins, directions, rgb = (
             part.gather(1, wide) for part in (self.origins, self.directions, self.rgb)
@@ -104,7 +104,7 @@ class Observations:
         return Observations(origins, directions, rgb, self.distance.reshape(-1), self.coloured.reshape(-1))
 
     def repeated(self, times: int) -> Observations:
-        """Return rays of shape (n) as often as ``times`` one after the other, for as many poses."""
+        """Return rays of shape (n) repeated ``times`` times in sequence, for as many poses."""
         return Observations(*(part.expand(times, *part.shape).flatten(0, 1) for part in self._tensors()))
 
     def drawn(

@@ -1,4 +1,4 @@
-"""How an image is stored and how it is meant to be seen: the eight orientations of EXIF."""
+"""The eight orientations of EXIF, which relate an image as stored to the image as it should be shown."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Orientation:
-    """The way from the stored raster to the upright image: mirror columns, mirror rows, then transpose."""
+    """The operations that turn the stored raster upright: mirror columns, mirror rows, then transpose."""
 
     mirrors_columns: bool = False
     mirrors_rows: bool = False
@@ -18,11 +18,11 @@ class Orientation:
 
     @staticmethod
     def from_exif(code: int) -> Orientation:
-        """Return what the EXIF tag 0x0112 stands for (CIPA DC-008, table 6); other codes mean an upright image."""
+        """Return the orientation of EXIF tag 0x0112 (CIPA DC-008, table 6); unknown codes mean an upright image."""
         return Orientation(*CODES.get(code, (False, False, False)))
 
     def upright(self, image: Shaped[Tensor, "sh sw *channels"]) -> Shaped[Tensor, "h w *channels"]:
-        """Turn a stored image."""
+        """Return the upright image of a stored one."""
         axes = [axis for axis, flips in ((0, self.mirrors_rows), (1, self.mirrors_columns)) if flips]
         turned = image.flip(axes) if axes else image
         return turned.transpose(0, 1).contiguous() if self.transposes else turned
@@ -40,9 +40,9 @@ CODES = {
     3: (True, True, False),
     4: (False, True, False),
     5: (False, False, True),
-    6: (False, True, True),  # the camera was turned by a quarter: most portrait photos
+    6: (False, True, True),  # the camera was turned by 90 degrees: most portrait photos
     7: (True, True, True),
     8: (True, False, True),
 }
 QUARTER_TURNS = tuple(Orientation(*CODES[code]) for code in (6, 8))
-"""The orientations of a camera that is turned to one side, and to the other."""
+"""The orientations of a camera that was turned by 90 degrees to one side, and to the other."""

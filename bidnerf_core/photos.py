@@ -39,7 +39,7 @@ class Photo:
     alpha: Float[Tensor, "h w"] | None  # 1 where the scene covers the pixel
     camera: CameraSource
     depth: Float[Tensor, "h w"] | None  # planar z in metres, 0 where nothing was measured
-    remark: str | None  # a line about the assumptions that were made about depth
+    remark: str | None  # one line on the assumptions that were made about depth
 
 
 def read_photo(

@@ -25,7 +25,7 @@ from bidnerf_core.rolling_shutter import exposure_moments, poses_of_rows
 
 @runtime_checkable
 class PixelDrawer(Protocol):
-    """Draws ``count`` pixels (column, row) of a frame; they lie where ``generator`` does."""
+    """Draws ``count`` pixels (column, row) of a frame; they are on the device of ``generator``."""
 
     def __call__(self, frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"]: ...
 
@@ -41,7 +41,7 @@ def uniform(frame: Frame, count: int, generator: Generator) -> Int[Tensor, "n 2"
 
 
 def all_pixels(frame: Frame) -> Int[Tensor, "n 2"]:
-    """Return all pixels of a frame, row by row. Centres lie at +0.5, so that truncation gives the index."""
+    """Return all pixels (column, row) of a frame, row by row: their centres at +0.5, truncated."""
     return frame.intrinsics.pixel_centres().long().reshape(-1, 2)
 
 
@@ -53,7 +53,7 @@ def observe(
 ) -> Observations:
     """Return the measurements of ``view`` at ``pixels``, as half-lines in its reference frame.
 
-    They lie on ``device``, by default the image's. Nothing is copied where the image, the pose and ``pixels`` lie there.
+    They are on ``device``, by default that of the image. Nothing is copied if the image, the pose and ``pixels`` are there.
     """
     frame = view.frame
     columns, rows = pixels.to(frame.rgb.device).unbind(-1)
@@ -82,9 +82,9 @@ def draw(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
 ) -> Observations:
-    """Draw ``count`` pixels, equally many from each view; every tensor has leading axes (views, pixels per view).
+    """Draw ``count`` pixels, the same number from each view; every tensor has leading axes (views, pixels per view).
 
-    Images may lie anywhere; what was drawn lies on ``device``, by default where the images are.
+    Images may be on any device; the result is on ``device``, by default that of the images.
     """
     share = max(1, count // len(views))
     parts = [observe(view, drawer(view.frame, share, generator), dtype, device) for view in views]
@@ -94,21 +94,21 @@ def draw(
 def depth_rays_of(views: Sequence[View]) -> Observations:
     """Return all pixels with measured depth as rays without colour, in the views' reference frame; float64.
 
-    For depth images of few points, such as those of structure from motion, which pixels drawn at random would miss. Raises
-    ``InputError`` where nothing was measured.
+    This is for depth images with few points, such as those from structure from motion, which random pixels would miss.
+    Raises ``InputError`` where nothing was measured.
     """
     parts = [observe(view, all_pixels(view.frame), torch.float64, "cpu") for view in views]
     return Observations.joined(parts).without_colour()
 
 
 MOST_FOR_MIDDLE = 200_000
-"""Number of measured points of a view, above which only some of them give the middle."""
+"""Number of a view's measured points above which only a part of them is used for the median."""
 
 
 def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
-    """Return the median, axis by axis, of the measured points, in the views' reference frame; None if there are none.
+    """Return the component-wise median of the measured points, in the views' reference frame; None if there are none.
 
-    Every fourth pixel counts, fewer of an image with millions of them.
+    Every fourth pixel is used, and fewer in an image with millions of them.
     """
     points = []
     for view in views:
@@ -126,13 +126,13 @@ def measured_middle(views: Sequence[View]) -> Float[Tensor, "3"] | None:
 
 DrawerName = Literal["uniform", "interest-points", "interest-regions"]
 QUALITY = 0.01
-"""Least corner response of an interest point, as a share of the strongest response in the image."""
+"""Minimum corner response of an interest point, as a share of the strongest response in the image."""
 FAINTEST = 1e-5
-"""Least corner response of an interest point in any image. A blank wall with noise of 1/255 stays below it."""
+"""Minimum corner response of an interest point in any image. A blank wall with noise of 1/255 stays below it."""
 BORDER = 3
 """Width, in pixels, of the margin that the corner detector needs; smaller images have no corners."""
 REACH, ROUNDS = 5, 3
-"""Regions are points dilated by squares of so many pixels, so many times."""
+"""Interest regions are interest points dilated with a square of REACH by REACH pixels, ROUNDS times."""
 
 
 def interest_points(frame: Frame) -> Int[Tensor, "n 2"]:
@@ -156,10 +156,10 @@ def interest_regions(frame: Frame) -> Int[Tensor, "n 2"]:
 
 
 class Among:
-    """Draws among the pixels that ``choose`` finds in a frame, each as likely as any other, with replacement.
+    """Draws uniformly among the pixels that ``choose`` finds in a frame, with replacement.
 
-    A frame is searched once. In one where nothing is found, such as the image of a blank wall, pixels are drawn
-    uniformly: it still tells of depth, and of where the edges are not.
+    Each frame is searched once. Where nothing is found, as in the image of a blank wall, pixels are drawn uniformly: they
+    still carry depth, and evidence of where there are no edges.
     """
 
     def __init__(self, choose: Callable[[Frame], Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""JSON objects in files that people wrote. Values are read by type, and every error names the place."""
+"""JSON objects in files that users wrote. Values are read by type, and every error names the place."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 from bidnerf_core.errors import InputError
 from bidnerf_core.files import read_file
 
-LARGEST_FILE = sys.float_info.max  # JSON knows NaN, 1e999 and integers that no float holds
+LARGEST_FILE = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
 
 
 @dataclass(frozen=True)
 class Record:
     """A JSON object. A key that is missing or ``null`` is looked up in ``defaults``."""
 
-    where: str  # the beginning of every message: the file, and which part of it
+    where: str  # the beginning of every message: the file, and the part of it
     values: Mapping[str, Any]
     defaults: Record | None = None
 
@@ -42,7 +42,7 @@ class Record:
         return None if found is None else self.checked_number(found, key)
 
     def size(self, key: str) -> int | None:
-        """Return a positive whole number of pixels, which some programs write as 800.0, or None."""
+        """Return a positive whole number of pixels, which some programs write as 800.0, or None where the key is missing."""
         found = self.number(key)
         if found is not None and (found < 1 or found != int(found)):
             raise self.error(f"{key} is {found:g}, expected a positive whole number of pixels")
@@ -68,12 +68,12 @@ class Record:
 
 
 def read_record(path: Path) -> Record:
-    """Read the JSON object in the file ``path``. Raises ``InputError`` with line and column where it is broken."""
+    """Read the JSON object in the file ``path``. Raises ``InputError``, with line and column where the JSON is malformed."""
     return parse_record(str(path), read_file(path, "a JSON file"))
 
 
 def parse_record(where: str, content: bytes) -> Record:
-    """Read a JSON object; ``where`` opens the message of the ``InputError`` that a broken one raises."""
+    """Parse a JSON object; ``where`` begins the message of the ``InputError`` that a malformed one raises."""
     try:
         values = json.loads(content.decode("utf-8-sig"))
     except json.JSONDecodeError as error:
@@ -88,6 +88,6 @@ def parse_record(where: str, content: bytes) -> Record:
 
 
 def _short(value: Any) -> str:
-    """Return a value as JSON on one line, cut where it is long."""
+    """Return a value as JSON on one line, truncated if it is long."""
     text = json.dumps(value)
     return text if len(text) <= 40 else text[:37] + "..."

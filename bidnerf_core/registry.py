@@ -1,8 +1,8 @@
 """Discovery of backends by entry-point name.
 
-A distribution offers a backend by an entry point of the group ``bidnerf.backends``. Listing reads metadata and source
-text only, so that a broken backend cannot break the list: its fault surfaces when that backend is loaded, in an
-error that names the entry point, its value, its distribution and the cause.
+A distribution offers a backend through an entry point of the group ``bidnerf.backends``. Listing reads only metadata and
+source text, so that a broken backend cannot break the list: its fault surfaces when that backend is loaded, in an error
+that names the entry point, its value, its distribution and the cause.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from bidnerf_core.errors import InputError, spelling_hint
 if TYPE_CHECKING:
     from bidnerf_core.backend import Backend
 else:
-    Backend = Any  # its module imports torch, which takes seconds and which a list of backends does without
+    Backend = Any  # its module imports torch, which takes seconds and is not needed to list backends
 
 GROUP = "bidnerf.backends"
 
 AnyDistribution: TypeAlias = Any
 AnyEntryPoint: TypeAlias = Any
 """Types of ``importlib.metadata``, left open: once anything imports the backport ``importlib_metadata``, look-ups return
-classes of its own, which are no subclasses of the standard library's."""
+its own classes, which are not subclasses of the standard library's."""
 
 UNREADABLE = "?"
 """Stands for the name of entry points that cannot be read."""
@@ -46,22 +46,22 @@ class BackendError(InputError):
 
 @dataclass(frozen=True)
 class BackendInfo:
-    """What is known of a backend without importing it."""
+    """What is known about a backend without importing it."""
 
     name: str
     value: str  # "module:object", as declared
     distribution: str
     version: str
     summary: str = ""
-    fault: str | None = None  # why it cannot be loaded, as far as metadata shows
-    hidden: tuple[str, ...] = ()  # other versions of the same distribution, farther down sys.path
+    fault: str | None = None  # why it cannot be loaded, as far as the metadata shows
+    hidden: tuple[str, ...] = ()  # other versions of the same distribution, later on sys.path
 
     def __str__(self) -> str:
         return f"backend '{self.name}' ({self.value}, from {self.distribution} {self.version})"
 
 
 def list_backends() -> list[BackendInfo]:
-    """Return every declared backend, by name, without importing any. A name that two distributions claim is listed twice."""
+    """Return all declared backends, sorted by name, without importing any. A name that is declared twice is listed twice."""
     infos = [info for dist, hidden in _installed() for info in _declared(dist, hidden)]
     return sorted(_with_rivals(infos), key=lambda info: (info.name, info.distribution, info.value))
 
@@ -88,11 +88,11 @@ def _loaded(name: str) -> Backend:
     return _checked(info, _imported(info))
 
 
-# Reading metadata, of which any file of any distribution may be malformed.
+# Reading metadata. Any metadata file of any distribution may be malformed.
 
 
 def _installed() -> Iterator[tuple[AnyDistribution, tuple[str, ...]]]:
-    """Return distributions as ``import`` sees them, the first on sys.path, each with the versions that it hides."""
+    """Yield the distributions that ``import`` would use, the first on sys.path, each with the versions that it hides."""
     copies: dict[str, list[AnyDistribution]] = {}
     for dist in distributions():
         copies.setdefault(_normalized(_label(dist)), []).append(dist)
@@ -116,7 +116,7 @@ def _declared(dist: AnyDistribution, hidden: tuple[str, ...]) -> Iterator[Backen
 def _read(info: BackendInfo, point: AnyEntryPoint, dist: AnyDistribution) -> BackendInfo:
     fallback = _metadata(dist, "Summary") or ""
     try:
-        module = point.module  # fails where the value has not the form of a reference
+        module = point.module  # fails where the value is not of the form module:object
     except Exception:
         return replace(info, summary=fallback, fault="expected a value of the form 'module:object'")
     try:
@@ -131,7 +131,7 @@ def _read(info: BackendInfo, point: AnyEntryPoint, dist: AnyDistribution) -> Bac
 
 
 def _with_rivals(infos: list[BackendInfo]) -> Iterator[BackendInfo]:
-    """Return the backends, with a fault for each name that is declared more than once: which one is meant is unknown."""
+    """Yield the backends, with a fault for each name that is declared more than once, and is therefore ambiguous."""
     for info in infos:
         rivals = [x for x in infos if x.name == info.name and x is not info]
         if rivals and info.name != UNREADABLE:
@@ -144,7 +144,7 @@ def _with_rivals(infos: list[BackendInfo]) -> Iterator[BackendInfo]:
 def _metadata(dist: AnyDistribution, key: str) -> str | None:
     try:
         head, _, readme = (dist.read_text("METADATA") or "").partition("\n\n")
-        # A README, which takes nearly all the time of parsing, follows the headers.
+        # The README after the headers would take nearly all of the parsing time.
         values = (message_from_string(head) if readme else dist.metadata).get_all(key)
     except Exception:
         return None
@@ -174,7 +174,7 @@ def _mentions_group(dist: AnyDistribution) -> bool:
 
 
 def _spec(module: str) -> ModuleSpec | None:
-    """Return where a module would be imported from. ``find_spec`` alone would import the parents of a dotted name."""
+    """Return the spec of a module. ``find_spec`` alone would import the parents of a dotted name."""
     top, *rest = module.split(".")
     spec = importlib.util.find_spec(top)
     for part in rest:
@@ -189,7 +189,7 @@ def _first_line(spec: ModuleSpec) -> str:
     try:
         source = read(spec.name) if read else None
         text = ast.get_docstring(ast.parse(source)) if source else None
-    except Exception:  # not Python: loading the backend will report it
+    except Exception:  # the source is not valid Python, which loading the backend will report
         return ""
     return text.strip().splitlines()[0] if text and text.strip() else ""
 
@@ -220,7 +220,7 @@ def _checked(info: BackendInfo, backend: Any) -> Backend:
 
 
 def _defects(backend: Any) -> Iterator[str]:
-    """Return what keeps an object from being a ``Backend``, the most telling defect first."""
+    """Yield the reasons why an object is not a ``Backend``, the most informative one first."""
     missing = [name for name in ("summary", "config_type", *REQUIRED_METHODS) if not hasattr(backend, name)]
     if missing:
         who = f"class {backend.__name__}" if isinstance(backend, type) else type(backend).__name__

@@ -1,8 +1,8 @@
-"""How far a rendering is from what was measured: the residuals that every rendering method minimises.
+"""The residuals between renderings and measurements, which every rendering method minimises.
 
-A ``Residual`` compares what rays render with what was measured along them; a ``Term`` adds a robust loss, a weight and the
-rays that it applies to; an ``Objective`` is a sum of terms (eq. 5). Adam takes the objective's ``loss``, Levenberg-Marquardt
-its ``residuals``, ``weights`` and robust factors, so that a change of a residual changes every method.
+A ``Residual`` compares what is rendered along rays with what was measured there; a ``Term`` adds a robust loss, a weight and
+the rays that it applies to; an ``Objective`` is a sum of terms (eq. 5). Adam uses the objective's ``loss``,
+Levenberg-Marquardt its ``residuals``, ``weights`` and robust factors, so that a change to a residual changes every method.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Residual(Protocol):
 class DepthResidual(Protocol):
     """Compares rendered with measured distances.
 
-    ``miss`` is the residual of a ray that meets nothing; None stands for the paper's, in which such a ray renders the
-    distance 0.
+    ``miss`` is the residual of a ray that meets nothing; None selects the paper's residual, in which such a ray has a
+    rendered distance of 0.
     """
 
     def __call__(
@@ -50,9 +50,9 @@ def depth_residual(
 ) -> Float[Tensor, "*p"]:
     """Return rendered minus measured distance, metres (eq. 5).
 
-    With ``miss`` (metres) it is ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``: what passes through the scene counts as if
-    it met something ``miss`` too far. The paper's ``sum_i w_i t_i - d`` leaps by the whole distance at every silhouette,
-    where its derivative is of no use to second-order steps.
+    With ``miss`` (metres) it is ``sum_i w_i (t_i - d) + (1 - sum_i w_i) miss``: the part of a ray that passes through the
+    scene counts as if it met something ``miss`` too far away. The paper's ``sum_i w_i t_i - d`` jumps by the whole distance
+    at every silhouette, where its derivative is of no use to second-order steps.
     """
     if miss is None:
         return rendering.distance - observed.distance
@@ -62,7 +62,7 @@ def depth_residual(
 TRUNCATION = 0.3
 """Largest depth difference of a sample (metres) in ``truncated_depth_residual``, where none is given."""
 SURFACE_DEPTH = 0.1
-"""Metres about the first surface in which ``first_surface_residual`` takes the mean distance."""
+"""Distance (metres) from the first surface within which ``first_surface_residual`` averages."""
 
 
 def truncated_depth_residual(
@@ -70,8 +70,8 @@ def truncated_depth_residual(
 ) -> Float[Tensor, "*p"]:
     """Return ``sum_i w_i clip(t_i - d) + (1 - sum_i w_i) miss``, metres, where clip limits to +-``miss``.
 
-    At a silhouette a part of the weight lies on a surface far behind. Here it counts no more than ``miss``, however far it
-    is; in the paper's residual it counts with its whole distance.
+    At a silhouette, part of the weight lies on a surface far behind. Here it counts with at most ``miss``, however far away
+    it is; in the paper's residual it counts with its whole distance.
     """
     limit = TRUNCATION if miss is None else miss
     off = (rendering.samples.middles - observed.distance[..., None]).clamp(-limit, limit)
@@ -83,7 +83,7 @@ def first_surface_residual(
 ) -> Float[Tensor, "*p"]:
     """Return how far the first surface lies behind the measured distance, metres; 0 for a ray that is not stopped.
 
-    The first surface is where half of a ray's weight has been met; the distance is the mean over the weight nearby.
+    The first surface is where the cumulative weight reaches half of the ray's total; its distance is the weighted mean nearby.
     """
     middles, weights = rendering.samples.middles, rendering.weights
     if middles.shape[-1] == 0:
@@ -102,14 +102,14 @@ DEPTH_RESIDUALS: dict[str, DepthResidual] = {
     "truncated": truncated_depth_residual,
     "first-surface": first_surface_residual,
 }
-"""Depth residuals by the name that the setting ``depth_residual`` takes; add your own."""
+"""Depth residuals by the names that the setting ``depth_residual`` accepts; add your own."""
 
 
 def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:
     """Return how far, on average over the ray, rendering weight lies nearer than ``distance - margin``; metres.
 
-    A sensor that measured a distance saw nothing in front of it. An error of the mean distance is content with matter on
-    both sides of the measured point, this is not.
+    A sensor that measured a distance saw nothing in front of it. The error of the mean distance can be 0 with matter on both
+    sides of the measured point; this residual cannot.
     """
     before = (distance[..., None] - margin - rendering.samples.middles).clamp(min=0)
     return (rendering.weights * before).sum(-1)
@@ -155,7 +155,7 @@ class Objective:
         return torch.cat([term.residual(rendering, observed) for term in self.terms], -1)
 
     def weights(self, observed: Observations) -> Float[Tensor, "k p c"]:
-        """Return how much each residual counts in the objective, for rays of shape (K images, rays); 0: not at all."""
+        """Return the weight of each residual in the objective, for rays of shape (K images, rays); 0 excludes it."""
         parts = []
         for term in self.terms:
             mask = term.applies(observed)
@@ -172,13 +172,13 @@ class Objective:
         return self._by_term(residuals, lambda term, part: term.robust.weight(part))
 
     def plain_loss(self, rgb: Float[Tensor, "p 3"]) -> float:
-        """Return the loss of pixels of which each is rendered in their mean colour, by the terms of colour alone."""
+        """Return the colour terms' loss of a rendering that gives every pixel the mean colour of ``rgb``."""
         terms = (term for term in self.terms if term.applies is coloured)
         return sum(term.weight * float(term.robust(rgb - rgb.mean(0)).sum(-1).mean()) for term in terms)
 
     @property
     def scales(self) -> list[float]:
-        """The residual at which outliers begin, a channel each."""
+        """The residual of each channel above which it counts as an outlier."""
         return [term.robust.scale for term in self.terms for _ in range(term.channels)]
 
     @property
@@ -194,12 +194,12 @@ class Objective:
 
 
 def coloured(observed: Observations) -> Bool[Tensor, "*p"]:
-    """Return which rays measured a colour."""
+    """Return the mask of the rays along which a colour was measured."""
     return observed.coloured
 
 
 def measured(observed: Observations) -> Bool[Tensor, "*p"]:
-    """Return which rays measured a distance."""
+    """Return the mask of the rays along which a distance was measured."""
     return observed.measured
 
 
@@ -220,7 +220,7 @@ def depth_term(
 
 
 def free_space_term(robust: Robust, weight: float) -> Term:
-    """Return the term of matter in front of what was measured, by more than the scale of ``robust`` (metres)."""
+    """Return the term for matter in front of the measured distance by more than the scale of ``robust`` (metres)."""
 
     def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
         return free_space(rendering, observed.distance, robust.scale)[..., None]
@@ -229,7 +229,7 @@ def free_space_term(robust: Robust, weight: float) -> Term:
 
 
 def opacity_term(weight: float) -> Term:
-    """Return the term of light that passes where a distance was measured: the scene must be opaque there."""
+    """Return the term for light that passes where a distance was measured: the scene must be opaque there."""
 
     def channel(rendering: Rendering, observed: Observations) -> Float[Tensor, "*p c"]:
         return (1 - rendering.opacity)[..., None]

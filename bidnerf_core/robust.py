@@ -1,8 +1,8 @@
-"""Robust losses, and the weights by which least squares minimises them.
+"""Robust losses, and the weights with which iteratively reweighted least squares minimises them.
 
-All are ``r^2 / 2`` for residuals that are small beside their scale, so that one may stand in for another without a change
-of weights; ``l1`` is the slope that ``huber`` ends in. Names and shapes are those of Barron 2019, "A general and adaptive
-robust loss function" (eqs. 7, 13 to 16), times the squared scale.
+All but ``l1`` are ``r^2 / 2`` for residuals that are small compared with their scale, so that one may replace another without
+a change of weights; ``l1`` has the slope of ``huber`` at large residuals. Names and shapes are those of Barron 2019, "A
+general and adaptive robust loss function" (eqs. 7, 13 to 16), times the squared scale.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "cauchy": lambda r, c: 1 / (1 + 0.5 * (r / c) ** 2),
     "geman-mcclure": lambda r, c: (1 + 0.25 * (r / c) ** 2) ** -2,
 }
-"""``rho'(r) / r`` of each; that of ``l1``, which has no end at 0, stops short of it."""
+"""``rho'(r) / r`` of each; that of ``l1``, which is unbounded at 0, is limited there."""
 
 
 def geman_mcclure_inlier(squared: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return how much of an inlier a squared residual is: 1 at 0, a half at ``scale`` (Geman and McClure 1985).
+    """Return the degree to which a squared residual is an inlier: 1 at 0, a half at ``scale`` (Geman and McClure 1985).
 
-    One minus it is their loss, and its square is that loss's weight in least squares.
+    One minus this is their loss, and its square is that loss's weight in least squares.
     """
     return 1 / (1 + squared / scale**2)
 

@@ -1,7 +1,8 @@
-"""Rolling shutters: the rows of an image are exposed one after the other, while the camera moves.
+"""Rolling shutters: the rows of an image are exposed one after another, while the camera moves.
 
-The motion is the right update of the camera's pose from the first row to the last (translation first, in the camera's frame), at
-a constant velocity; the pose itself is that of the middle row (Hedborg et al., Rolling shutter bundle adjustment, CVPR 2012).
+The motion is the right update of the camera's pose from the first row to the last (translation first, in the camera's frame),
+at a constant velocity; the pose itself is that of the middle row (Hedborg et al., Rolling shutter bundle adjustment, CVPR
+2012).
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from bidnerf_core.rotations import cross_matrix
 from bidnerf_core.se3 import SE3
 
 MOVE, TURN = 0.005, 0.01
-"""Usual motion of a hand-held camera while its rows are exposed, some hundredths of a second: translation along each axis as a share
-of the distance of what it sees, and rotation about each axis, radians.
+"""Typical motion of a hand-held camera while its rows are exposed (a few hundredths of a second): translation along each axis
+as a share of the distance of what it sees, and rotation about each axis in radians.
 """
 
 
@@ -36,27 +37,27 @@ class MotionPrior:
 
     @staticmethod
     def usual(distance: float) -> MotionPrior:
-        """Return the prior of a hand-held camera that sees things at a ``distance``, metres."""
+        """Return the prior of a hand-held camera that views things at a ``distance`` (metres)."""
         return MotionPrior(MOVE * distance, TURN)
 
 
 AT_REST = torch.zeros(6, dtype=torch.float64)
 """No motion."""
 STILL = MotionPrior()
-"""A camera that does not move, or whose rows are exposed at once."""
+"""The prior of a camera that does not move, or whose rows are all exposed at once."""
 
 
 def exposure_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
-    """Return the time at which each pixel was exposed, as a share of the readout, zero at the middle row: -0.5 to 0.5.
+    """Return the time at which each pixel was exposed, as a share of the readout time: -0.5 to 0.5, zero at the middle row.
 
-    Sensors are wider than high, so that the rows of an image that is higher than wide are its columns; square images count as wide.
-    Their order does not matter: the motion is reversed with it.
+    Sensors are wider than they are high, so the sensor's rows are the columns of a portrait image; square images count as
+    landscape. The direction of the readout does not matter: reversing it reverses the motion.
     """
     return _moments_along(pixels, camera, 0 if camera.height > camera.width else 1)
 
 
 def turned_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
-    """Return ``exposure_moments`` if the rows run the other way, as in a high part of a wide image."""
+    """Return ``exposure_moments`` for rows along the other axis, as in a portrait crop of a landscape image."""
     return _moments_along(pixels, camera, 1 if camera.height > camera.width else 0)
 
 
@@ -65,14 +66,14 @@ def _moments_along(pixels: Float[Tensor, "m 2"], camera: Intrinsics, axis: int) 
 
 
 def poses_of_rows(moments: Float[Tensor, "m"], motion: Float[Tensor, "6"]) -> SE3:
-    """Return T_middle_row, the pose of the camera at each moment in the frame of that at the middle row."""
+    """Return T_middle_row, the pose of the camera at each moment in the frame of the camera at the middle row."""
     return SE3.exp(moments[:, None] * motion.to(moments))
 
 
 def moved_points(
     points: Float[Tensor, "m 3"], moments: Float[Tensor, "m"], motion: Float[Tensor, "6"]
 ) -> Float[Tensor, "m 3"]:
-    """Return points in the frame of the camera at their moments, from those in its frame at the middle row."""
+    """Return points in the frame of the camera at their moments, given in the camera's frame at the middle row."""
     found = moved_array(points.double().numpy(), moments.numpy(), motion.numpy())
     return torch.from_numpy(found).to(points.dtype)
 
@@ -80,7 +81,7 @@ def moved_points(
 def moved_array(
     points: Float[np.ndarray, "m 3"], moments: Float[np.ndarray, "m"], motion: Float[np.ndarray, "6"]
 ) -> Float[np.ndarray, "m 3"]:
-    """Return ``moved_points`` of arrays: the inverse of the exponential of the motion so far, to second order."""
+    """Return ``moved_points`` for NumPy arrays, with the inverse of the exponential map to second order."""
     turning = cross_matrix(motion[3:]).T
     velocity = motion[:3] + points @ turning
     times = moments[:, None]

@@ -1,4 +1,4 @@
-"""Rotations of single poses in NumPy, in microseconds; ``SE3`` and SciPy take a millisecond for what they do in batches."""
+"""Rotations of single poses in NumPy, in microseconds; ``SE3`` and SciPy, made for batches, take a millisecond."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 SERIES_ANGLE = 1e-4
-"""Angle (radians) under which coefficients come from their series."""
+"""Angle (radians) below which coefficients come from their series."""
 WIDE_ANGLE = 2.5
-"""Angle (radians) above which the logarithm is left to SciPy: its axis is then no longer in the skew part."""
+"""Angle (radians) above which the logarithm is left to SciPy: the skew part then no longer determines the axis well."""
 
 
 def cross_matrix(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -42,7 +42,7 @@ def vector_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
 
 
 def left_jacobian(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return V(phi), which takes the translation of a tangent vector to that of its exponential (Sola et al. 2018, eq. 145)."""
+    """Return V(phi), which maps a tangent vector's translation to that of its exponential (Sola et al. 2018, eq. 145)."""
     cross, angle = cross_matrix(phi), math.sqrt(float(phi @ phi))
     if angle < SERIES_ANGLE:
         return np.eye(3) + cross / 2 + cross @ cross / 6

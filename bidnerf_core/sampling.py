@@ -18,9 +18,9 @@ from bidnerf_core.waiting import may_wait
 
 @dataclass(frozen=True)
 class Stratified:
-    """``count`` intervals of [near, far]; with jitter, their borders move at random within half an interval.
+    """``count`` intervals of [near, far]; with jitter, their borders are shifted randomly by up to half an interval.
 
-    They are equal in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
+    They are equally long in the coordinate of ``SceneBounds.spacing`` or, without bounds, in distance.
     """
 
     count: int
@@ -47,13 +47,13 @@ class Stratified:
 
 @dataclass(frozen=True, eq=False)
 class AroundDepth:
-    """``count`` equal intervals within ``reach`` metres of the distance that was measured along each ray.
+    """``count`` equal intervals within ``reach`` metres of the distance measured along each ray.
 
-    With a nearly correct pose they hold all the matter that the ray meets, with a wrong one they are empty. Rays without a
-    measurement (distance 0) are sampled by ``otherwise``.
+    With a nearly correct pose they contain all the matter that the ray meets; with a wrong one they are empty. Rays without
+    a measurement (distance 0) are sampled by ``otherwise``.
     """
 
-    distance: Float[Tensor, "*r"]  # metres along the rays that are to be sampled
+    distance: Float[Tensor, "*r"]  # metres along the rays to be sampled
     reach: float
     count: int
     otherwise: RaySampler
@@ -97,14 +97,14 @@ OfRays = TypeVar("OfRays", Rays, RaySamples)
 
 
 def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
-    """Return the rays, or the samples of the rays, with these numbers."""
+    """Return the rays, or the samples of the rays, at these (flattened) indices."""
     leading = (of.near if isinstance(of, Rays) else of.starts[..., 0]).dim()
     parts = (getattr(of, field.name) for field in fields(of))
     return type(of)(*(part.reshape(-1, *part.shape[leading:]).index_select(0, index) for part in parts))
 
 
 def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:
-    """Return the samples ``yes`` for some rays and ``no`` for the others, padded to a common number a ray."""
+    """Return the samples ``yes`` for the rays of ``which`` and ``no`` for the others, padded to a common number per ray."""
     width = max(yes.starts.shape[-1], no.starts.shape[-1])
 
     def filled(part: Tensor) -> Tensor:
@@ -118,8 +118,8 @@ def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySa
 class Importance:
     """Hierarchical sampling (Mildenhall et al. 2020, section 5.2): more intervals where ``field`` has its weight.
 
-    The field's own valid intervals are cut at ``count`` more places; what its sampler leaves out, as an occupancy grid does,
-    stays out. No gradient flows through the choice of places.
+    The field's own valid intervals are cut at ``count`` more places; what its sampler skips, as an occupancy grid does,
+    remains skipped. No gradient flows through the choice of places.
     """
 
     field: RadianceField
@@ -136,21 +136,21 @@ class Importance:
 
 
 EVEN_SHARE = 0.25
-"""Fraction of the borders that ``Concentrated`` spreads evenly, so that matter which the guide does not know of is found."""
+"""Fraction of the borders that ``Concentrated`` spreads evenly, so that matter which the guide lacks is found."""
 TAIL = 0.005
 """Fraction of a ray's weight, at either end, that ``Concentrated`` leaves to evenly spread intervals."""
 LARGEST_THICKNESS = 0.5
-"""Largest optical thickness of an interval for which ``Concentrated`` takes its guide's word. A coarse guide has one density
-for a cell in which only a part is dense; what lies behind the other part must be found as well."""
+"""Optical thickness to which ``Concentrated`` limits the guide's intervals. A coarse guide has one density for a cell of
+which only a part is dense; what lies behind the other part must be found as well."""
 
 
 @dataclass(frozen=True)
 class Concentrated:
     """At most ``count`` intervals of each ray, short where the field ``guide`` has its weight and long elsewhere.
 
-    Three quarters of the borders divide the weight that the guide gives to the ray's own valid intervals into equal parts, the
-    others their length. Each interval is as long as what it replaces. A ray with ``count`` intervals or fewer keeps them. No
-    gradient flows through the choice.
+    Three quarters of the borders divide the guide's weight over its own valid intervals into equal parts; the others divide
+    their length. Each interval is as long as what it replaces. A ray with ``count`` intervals or fewer keeps them. No gradient
+    flows through the choice.
     """
 
     guide: RadianceField
@@ -186,7 +186,7 @@ def _parts(samples: RaySamples) -> tuple[Tensor, Tensor, Tensor]:
 def concentrated(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> RaySamples:
-    """Return ``count`` intervals in place of ``samples``, short where these have ``weights``, see ``Concentrated``."""
+    """Return ``count`` intervals in place of ``samples``, short where ``weights`` are large, see ``Concentrated``."""
     length = torch.where(samples.valid, samples.ends - samples.starts, 0)
     laid = pad(length.cumsum(-1), (1, 0))  # borders of the intervals, laid end to end
     border = _borders(weights, length, laid, count, jitter)
@@ -196,7 +196,7 @@ def concentrated(
     )
     at = samples.starts.gather(-1, owner) + (middle - laid.gather(-1, owner))
     starts, ends = at - half, at + half
-    # Rounding, and intervals that reach over a gap, must not make two of them overlap.
+    # Neither rounding nor an interval that spans a gap may make two of them overlap.
     between = (ends[..., :-1] + starts[..., 1:]) / 2
     starts = torch.cat([starts[..., :1], torch.maximum(starts[..., 1:], between)], dim=-1)
     ends = torch.cat([torch.minimum(ends[..., :-1], between), ends[..., -1:]], dim=-1)
@@ -207,7 +207,7 @@ def _borders(
     weights: Float[Tensor, "*r s"], length: Float[Tensor, "*r s"], laid: Float[Tensor, "*r b"], count: int,
     jitter: Generator | None,
 ) -> Float[Tensor, "*r n"]:  # fmt: skip
-    """Return the ``count + 1`` borders in the coordinate of the intervals laid end to end: equal weight, and equal length."""
+    """Return ``count + 1`` borders, by equal weight and by equal length, in the coordinate of the concatenated intervals."""
     blurred = max_pool1d(weights.reshape(-1, 1, weights.shape[-1]), 3, stride=1, padding=1).view_as(weights)
     mass = torch.where(length > 0, blurred, 0) + 1e-5 * length / laid[..., -1:].clamp(min=1e-30)
     cdf = pad(mass.cumsum(-1) / mass.sum(-1, keepdim=True).clamp(min=1e-30), (1, 0))
@@ -219,7 +219,7 @@ def _borders(
 
 
 def _levels(count: int, like: Float[Tensor, "*r b"], jitter: Generator | None) -> Float[Tensor, "*r n"]:
-    """Return ``count`` numbers from 0 to 1 at equal steps; with jitter, those between move at random within half a step."""
+    """Return ``count`` numbers from 0 to 1 in equal steps; with jitter, the inner ones are shifted by up to half a step."""
     levels = torch.linspace(0, 1, count, dtype=like.dtype, device=like.device).repeat(*like.shape[:-1], 1)
     if jitter is not None and count > 2:
         shift = torch.rand((*like.shape[:-1], count - 2), generator=jitter, device=jitter.device) - 0.5
@@ -242,7 +242,7 @@ def inverse_transform(
 ) -> tuple[Float[Tensor, "*r n"], Int[Tensor, "*r n"]]:
     """Return ``count`` distances distributed as ``weights`` (piecewise constant over the intervals), by inverting their CDF.
 
-    They come in ascending order, with the interval in which each lies. A ray without weight has them in its first interval.
+    They are in ascending order, each with the index of its interval. On a ray without weight, all are in its first interval.
     """
     cdf = torch.cumsum(weights, dim=-1)
     cdf = cdf / cdf[..., -1:].clamp(min=torch.finfo(cdf.dtype).tiny)
@@ -262,7 +262,7 @@ def inverse_transform(
 
 
 def _gathered(samples: RaySamples) -> RaySamples:
-    """Return the samples with valid intervals first, and without the overlaps that rounding makes."""
+    """Return the samples with valid intervals first, and without overlaps from rounding."""
     starts, ends, valid = _parts(samples)
     # Sorting costs more than all the rest; most samplers return the valid intervals first.
     if not (may_wait(valid.device) and bool((valid[..., 1:] <= valid[..., :-1]).all())):

@@ -1,4 +1,4 @@
-"""Frozen dataclasses to what JSON holds, and back with every mistake named."""
+"""Conversion of frozen dataclasses to JSON values, and back with an error that names every mistake."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from bidnerf_core.errors import InputError, spelling_hint
 
 _T = TypeVar("_T")
 
-LARGEST_NUMBER = sys.float_info.max  # JSON knows NaN, 1e999 and integers that no float holds
-LARGEST_INTEGER = 2**63 - 1  # what tensors and files hold
+LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
+LARGEST_INTEGER = 2**63 - 1  # that tensors and files can hold
 
 
 def to_plain(value: Any, where: str = "") -> Any:
@@ -36,8 +36,8 @@ def to_plain(value: Any, where: str = "") -> Any:
 def from_plain(kind: type[_T], value: Any, where: str) -> _T:
     """Return an instance of the dataclass ``kind``; missing keys take their defaults. Errors begin with ``where``.
 
-    Raises ``InputError`` for a key that ``kind`` does not have, for one that it lacks, for a value of another type than
-    declared, and for values that ``kind`` itself refuses.
+    Raises ``InputError`` for an unknown key, for a required one that is missing, for a value of a type other than the declared
+    one, and for values that ``kind`` itself rejects.
     """
     if not isinstance(value, dict):
         raise InputError(
@@ -106,7 +106,7 @@ def _kinds_of_items(origin: type, arguments: tuple[Any, ...], count: int) -> tup
 def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
     for kind in sorted(
         kinds, key=lambda kind: type(value) is not kind
-    ):  # an exact fit goes first: 1 is an int
+    ):  # an exact match comes first: 1 is an int
         try:
             return converted(kind, value, where)
         except InputError:

@@ -1,8 +1,8 @@
-"""Settings as frozen dataclasses, with the range of each beside its field, and the flat names by which users set them.
+"""Settings as frozen dataclasses, with the range of each next to its field, and the flat names by which users set them.
 
 A method's settings are composed of small groups that several methods share (`Annotated` fields of nested dataclasses). On
-the command line and in JSON all of them have flat names, ``{"rays": 512, "depth_weight": 3}``: a name occurs once in a
-method, whatever group it stands in.
+the command line and in JSON all of them have flat names, ``{"rays": 512, "depth_weight": 3}``: a name is unique within a
+method, whatever group it belongs to.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ class Above(Range):
 
 
 def _written(limit: float) -> str:
-    """Return a limit as a message shows it: 1 and 1.0 alike, since ``Annotated`` takes equal ranges for the same one."""
+    """Return a limit as messages show it, the same for 1 and 1.0: ``Annotated`` does not distinguish equal ranges."""
     return f"{int(limit) if float(limit).is_integer() else limit:,}"
 
 
-# Compared and hashed by identity, since the command line's parser hashes it and a table has no hash.
+# Compared and hashed by identity, since the command line's parser hashes it and a table is not hashable.
 @dataclass(frozen=True, eq=False)
 class OneOf:
     """The names that a setting accepts: the keys of a table, which users may extend."""
@@ -99,7 +99,7 @@ class Settings:
 
 @functools.cache
 def _allowed(kind: Any) -> dict[str, tuple[Range | OneOf, bool]]:
-    """Return what is allowed for each field of ``kind`` that limits its values, and whether None is allowed besides."""
+    """Return the allowed values of each field of ``kind`` that has limits, and whether None is allowed as well."""
     found: dict[str, tuple[Range | OneOf, bool]] = {}
     for name, hint in typing.get_type_hints(kind, include_extras=True).items():
         optional = type(None) in typing.get_args(hint)
@@ -134,8 +134,8 @@ def from_flat(
 ) -> S:
     """Return the settings ``base``, or the defaults of that class, with ``values`` (by flat name) in place of its own.
 
-    ``renamed`` maps names of earlier versions to today's. Raises ``InputError``, which begins with ``where``, for an
-    unknown name, a value of another type than declared, and a value out of range.
+    ``renamed`` maps names of earlier versions to present ones. Raises ``InputError``, whose message begins with ``where``,
+    for an unknown name, a value of a type other than the declared one, and a value out of range.
     """
     default: S = base() if isinstance(base, type) else base
     known = to_flat(default)
@@ -148,7 +148,7 @@ def from_flat(
 
 
 def _with_values(default: S, flat: dict[str, Any], where: str) -> S:
-    """Return the settings ``default`` with the values of ``flat``, in whatever group each of them is declared."""
+    """Return the settings ``default`` with the values of ``flat``, whichever group declares each of them."""
     kind: Any = type(default)
     hints, values = typing.get_type_hints(kind), dict[str, Any]()
     for field in dataclasses.fields(kind):

@@ -1,7 +1,7 @@
-"""Storage of maps: a folder of JSON and safetensors, which cannot run code when it is read.
+"""Storage of maps: a folder of JSON and safetensors, which cannot run code when they are read.
 
 ``map.json`` describes the map and names the files of its tensors. Files are written under new names first and
-``map.json`` is replaced last, in one stroke: whenever the writing stops, the folder holds one whole map.
+``map.json`` is replaced atomically at the end: whenever writing stops, the folder holds one complete map.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ PARTS = (
     r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
 )
 OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
-"""Names of files that a save may leave behind; other files in the folder are never removed."""
+"""Names of the files that saving may leave behind; other files in the folder are never removed."""
 
 
 LandmarkSource = Literal["photos", "rendered images"]
@@ -58,18 +58,18 @@ class MapInfo:
     config: dict[str, Any]
     bounds: SceneBounds
     step: int  # training steps done
-    complete: bool  # whether training came to its end
+    complete: bool  # whether training has finished
     data: str = ""  # name of the dataset's folder
     seconds: float = 0.0  # of training
     cameras: tuple[StoredCamera, ...] = ()
     pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
-    distances: bool = True  # False if the images, from one place, do not show how far things are
-    sparse_depth: int = 0  # pixels of the training images that had their depth from structure from motion
+    distances: bool = True  # False if all images are from one place, so that they do not determine distances
+    sparse_depth: int = 0  # number of training pixels whose depth came from structure from motion
     weights: str = ""  # file names
-    training: str | None = None  # what resuming needs; dropped when training is complete
+    training: str | None = None  # state that resuming needs; dropped when training is complete
     surface: str | None = None  # baked from these weights
     landmarks: str | None = None
-    landmark_source: LandmarkSource | None = None  # what they were built from, where that is recorded
+    landmark_source: LandmarkSource | None = None  # the images they were built from, where that is recorded
     capture: str | None = None  # record of the photos that gave the landmarks
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
@@ -92,18 +92,18 @@ class Map:
 
     @property
     def has_distances(self) -> bool:
-        """Whether the training images showed how far things are."""
+        """Whether the training images determine distances."""
         return self.info.distances
 
     @property
     def colour_noise(self) -> float | None:
-        """Root mean square error of the field's colours on its own training images, in [0, 1]."""
+        """Root mean square error of the field's colours (in [0, 1]) on its own training images."""
         return self.info.colour_noise
 
     def to(self, device: torch.device | str) -> Map:
         """Return the map with its field, surface and landmarks on ``device``; what is not there yet is copied.
 
-        Of what is done with landmarks, only the comparison of descriptors takes place there, see ``LandmarkMap.to``.
+        Of all computations with landmarks, only descriptors are compared there, see ``LandmarkMap.to``.
         """
         return on_device(self, device)
 
@@ -122,18 +122,18 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
 
 
 def _outline(backend: Backend, info: MapInfo, where: str) -> RadianceField | None:
-    """Return the field with the shapes of its tensors only, or None where its backend needs real ones to build it."""
+    """Return the field with only the shapes of its tensors, or None where its backend needs real tensors to build it."""
     try:
         with torch.device("meta"):
             return build_field(backend, info, where)[0]
     except InputError:
         raise
-    except Exception:  # whatever a backend does with the numbers that it does not get
+    except Exception:  # a backend may do anything with the values that it lacks
         return None
 
 
 def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
-    """Write a map, and remove the files of an earlier one once the new one is complete."""
+    """Write a map, and remove the files of an earlier one once the new one is completely written."""
     name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
     training = None if info.complete else f"training-{name}"
     info = replace(
@@ -153,7 +153,7 @@ def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
 
 
 def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
-    """Add a surface that was baked from map ``of`` to it, in place of the one that it had.
+    """Add the surface that was baked from map ``of`` to it, replacing an earlier one.
 
     Raises ``InputError`` where another training has replaced that map meanwhile.
     """
@@ -164,17 +164,17 @@ def save_landmarks(
     folder: Path, of: MapInfo, landmarks: LandmarkMap, colour_noise: float | None = None,
     source: LandmarkSource = "photos",
 ) -> MapInfo:  # fmt: skip
-    """Add landmarks to map ``of``, in place of those that it had, and how well the field renders its training images.
+    """Add landmarks to map ``of``, replacing earlier ones, and the error with which the field renders its training images.
 
-    ``source`` says which images the landmarks were built from. Raises ``InputError`` where another training has replaced
-    that map meanwhile.
+    ``source`` is the kind of images that the landmarks were built from. Raises ``InputError`` where another training has
+    replaced that map meanwhile.
     """
     content = tensors_to_bytes(landmark_tensors(landmarks))
     return _save_part(folder, of, "landmarks", content, colour_noise=colour_noise, landmark_source=source)
 
 
 def save_capture(folder: Path, of: MapInfo, capture: CaptureReport) -> MapInfo:
-    """Add the record of its photos to map ``of``, in place of the one that it had.
+    """Add the record of its photos to map ``of``, replacing an earlier one.
 
     Raises ``InputError`` where another training has replaced that map meanwhile.
     """
@@ -210,7 +210,7 @@ def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
 
 
 def load_info(folder: Path) -> MapInfo:
-    """Return the checked content of ``map.json``. Raises ``InputError`` where it describes no map of this version."""
+    """Return the content of ``map.json``, checked. Raises ``InputError`` where it does not describe a map of this version."""
     path = folder / DESCRIPTION
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "no such folder"
@@ -238,16 +238,16 @@ def load_info(folder: Path) -> MapInfo:
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
-    """Return the map in ``folder``, on ``device``, its field built by its backend and frozen.
+    """Return the map in ``folder``, on ``device``, with its field built by its backend and frozen.
 
-    ``baked`` says whether to read the surface and the landmarks. Raises ``InputError`` where the folder is no map, or a
-    damaged one.
+    ``baked`` determines whether the surface and the landmarks are read. Raises ``InputError`` where the folder is not a map,
+    or a damaged one.
     """
     folder = Path(folder)
     info, tensors, surface, landmarks = _read(folder, baked)
     backend, where = load_backend(info.backend, str(folder)), str(folder / DESCRIPTION)
     outline = _outline(backend, info, where)
-    if outline is not None:  # before memory is taken for a field of any size that map.json describes
+    if outline is not None:  # before memory is allocated for a field, of whatever size map.json describes
         tensors = checked_weights(outline, tensors, folder / info.weights)
     field, _ = build_field(backend, info, where)
     if outline is None:
@@ -271,7 +271,7 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
 def _read(
     folder: Path, baked: bool
 ) -> tuple[MapInfo, dict[str, Tensor], SurfaceMap | None, LandmarkMap | None]:
-    """Return parts that belong together, even while a training replaces them."""
+    """Return parts that belong to the same map, even while a training replaces them."""
     info = load_info(folder)
     while True:
         try:
@@ -286,7 +286,7 @@ def _read(
 
 
 def _sweep(folder: Path) -> None:
-    """Remove files of earlier and of interrupted saves, which ``map.json`` does not name."""
+    """Remove the files of earlier and of interrupted saves that ``map.json`` does not name."""
     try:
         found = json.loads((folder / DESCRIPTION).read_bytes())
         kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks", "capture")}
@@ -296,5 +296,5 @@ def _sweep(folder: Path) -> None:
         return
     for file in list(folder.iterdir()):
         if OURS.fullmatch(file.name) and file.name not in kept:
-            with contextlib.suppress(OSError):  # it is only in the way
+            with contextlib.suppress(OSError):  # a left-over file does no harm
                 file.unlink()

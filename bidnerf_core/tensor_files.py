@@ -1,4 +1,4 @@
-"""Files of named tensors: reading them, and checking them against what they are for."""
+"""Files of named tensors: reading them, and checking them against their intended use."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from bidnerf_core.files import open_binary
 Part = TypeVar("Part")
 EXPECTED_FILE = "a safetensors file"
 LARGEST_HEADER = 16 * 2**20
-"""Bytes; a tensor takes about a hundred of them."""
+"""Bytes; the header takes about a hundred for each tensor."""
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Return the tensors of a file. Raises ``InputError`` where it is none, or has not the length that its header says."""
+    """Return the tensors of a file. Raises ``InputError`` if it is not such a file, or if its length contradicts its header."""
     if not os.path.lexists(path):
         raise InputError(f"{path}: no such file, but map.json names it; the map is incomplete")
     try:
@@ -39,7 +39,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def _check_length(path: Path, file: BinaryIO) -> None:
-    """Compare the length of a file with what its header says, before memory is taken for the tensors."""
+    """Compare the length of a file with its header, before memory is allocated for the tensors."""
     size = os.fstat(file.fileno()).st_size
     length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
     if not length <= min(size - 8, LARGEST_HEADER):
@@ -58,7 +58,7 @@ def _check_length(path: Path, file: BinaryIO) -> None:
 
 
 def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) -> Part:
-    """Return what ``make`` makes of the tensors in a file. Raises ``InputError`` where it refuses them."""
+    """Return what ``make`` returns for the tensors of a file. Raises ``InputError`` where it rejects them."""
     tensors = read_tensors(path)
     try:
         return make(tensors)
@@ -68,9 +68,9 @@ def load_part(path: Path, make: Callable[[dict[str, Tensor]], Part], what: str) 
 
 
 def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """Return the tensors that a field takes from a file, brought up to date where an earlier version stored them.
+    """Return a field's tensors from a file, upgraded where an earlier version stored them, after checking them.
 
-    Their names, shapes and values are compared with the field's own: torch's own message would run over many lines.
+    Their names, shapes and values are checked against the field here, since torch's own message would take many lines.
     """
     if isinstance(field, UpgradingField):
         tensors = field.upgraded_state(tensors)

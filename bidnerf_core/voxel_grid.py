@@ -1,7 +1,7 @@
-"""Voxel grids: cubic cells over a box, and the look-up of a value for the cell that holds a point.
+"""Voxel grids: cubic cells that cover a box, and the look-up of a value for the cell that holds a point.
 
-A grid is geometry only; the values of its cells are tensors of its shape, which whoever needs them stores. All look-ups go
-through ``VoxelGrid.at``.
+A grid is only geometry; the values of its cells are tensors of its shape, which the classes that use it store. All look-ups
+go through ``VoxelGrid.at``.
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ class VoxelGrid:
 
     @staticmethod
     def cube(bounds: SceneBounds, resolution: int) -> VoxelGrid:
-        """Return the grid of the modelled cube, ``resolution`` cells wide: the cube around the box's centre that has the
-        box's longest side or, where the scene is contracted, the cube that all space is drawn into.
+        """Return the grid of the modelled cube, ``resolution`` cells wide.
+
+        This is the cube around the box's centre with the box's longest side or, where the scene is contracted, the cube into
+        which all space is contracted.
         """
         if bounds.contracted:
             return VoxelGrid((-1.0, -1.0, -1.0), 2 / resolution, (resolution,) * 3, bounds)
@@ -66,9 +68,9 @@ class VoxelGrid:
         return x, y, z
 
     def numbers(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
-        """Return the number of the cell that holds each point (metres, world), or of the one nearest to it on the border.
+        """Return the index of the cell that holds each point (metres, world), or of the nearest border cell.
 
-        Points that are not finite have the number of some cell.
+        Points that are not finite get the index of an arbitrary cell.
         """
         points, rate = self._own(points.detach()), 1 / self.cell
         x, y, z = (
@@ -78,9 +80,9 @@ class VoxelGrid:
         return (x * self.shape[1] + y) * self.shape[2] + z
 
     def at(self, values: Shaped[Tensor, "x y z"], points: Float[Tensor, "*p 3"]) -> Shaped[Tensor, "*p"]:
-        """Return the value of the cell that holds each point (metres, world), or of the one nearest to it on the border."""
+        """Return the value of the cell that holds each point (metres, world), or of the nearest border cell."""
         numbers = self.numbers(points)
-        # On a CPU several times faster than indexing by square brackets.
+        # On a CPU this is several times faster than indexing with square brackets.
         return values.view(-1).index_select(0, numbers.reshape(-1)).view(numbers.shape)
 
     def contains(self, points: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
@@ -93,7 +95,7 @@ class VoxelGrid:
         return x & y & z
 
     def _own(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
-        """Return points of the world in the coordinates of the grid."""
+        """Convert points (metres, world) to the coordinates of the grid."""
         return points if self.contracted is None else self.contracted.normalized(points)
 
     def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
@@ -112,5 +114,5 @@ class OccupancyMask(nn.Module):
         self.register_buffer("cells", torch.ones(grid.shape, dtype=torch.bool))
 
     def holds(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
-        """Return whether there may be matter at ``positions`` (metres, world); outside the grid, its border decides."""
+        """Return whether there may be matter at ``positions`` (metres, world); outside the grid, border cells decide."""
         return self.grid.at(self.cells, positions)

@@ -1,8 +1,8 @@
-"""Whether code may let the host wait for the device.
+"""Control over whether code may let the host wait for the device.
 
-On a GPU, each number that the host reads from a tensor, and each size that depends on values, makes it wait until the device
-has done all its work. Leaving out what need not be computed is worth that in training and where whole images are rendered, but
-not in the steps of a localization, which are short. There, code computes more than it needs, in shapes that are known.
+On a GPU, each number that the host reads from a tensor, and each size that depends on values, makes the host wait until the
+device has done all its work. Skipping needless computation is worth that wait in training and where whole images are
+rendered, but not in the steps of a localization, which are short. There, code computes more than it needs, in known shapes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _allowed: ContextVar[bool] = ContextVar("waiting_allowed", default=True)
 
 @contextmanager
 def without_waiting() -> Iterator[None]:
-    """Have ``may_wait`` say no for all devices but the CPU, in this thread."""
+    """Make ``may_wait`` return False for all devices but the CPU, in this thread."""
     token = _allowed.set(False)
     try:
         yield
@@ -27,5 +27,5 @@ def without_waiting() -> Iterator[None]:
 
 
 def may_wait(device: torch.device) -> bool:
-    """Return whether code may read from tensors on ``device``; on the CPU always, since there is nothing to wait for."""
+    """Return whether code may read from tensors on ``device``; always True on the CPU, where there is nothing to wait for."""
     return device.type == "cpu" or _allowed.get()

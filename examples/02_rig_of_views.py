@@ -2,7 +2,7 @@
 
     python examples/02_rig_of_views.py [--backend hashgrid] [--steps 200]
 
-The rays are shared out among the images, so a step costs the same; the pose that is found is the last camera's.
+The rays are divided among the images, so a step costs the same; the pose found is that of the last camera.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""Localize with a backend that is chosen by name among whatever is installed; a stored map remembers its own.
+"""Localize with a backend chosen by name among those installed; a stored map records its own.
 
     python examples/03_backend_by_name.py [vanilla] [--steps 200]
 
-Nothing here knows any backend: a plugin's name works as well, and a name that is not installed ends in one line.
+Nothing here depends on a particular backend: a plugin's name works as well, and an unknown name ends with a one-line error.
 """
 
 import argparse
@@ -27,7 +27,7 @@ parser.add_argument("--steps", type=int, default=200)
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 given = parser.parse_args()
 
-for info in list_backends():  # reads metadata, imports none of them
+for info in list_backends():  # reads only metadata, without importing any
     print(f"{info.name}: {info.fault or info.summary} ({info.distribution} {info.version})")
 try:
     backend = load_backend(given.backend)

@@ -2,8 +2,8 @@
 
     python examples/04_register_your_own.py [--steps 300]
 
-A backend is found through an entry point, which is a line of metadata that `pip install` writes. Here a throw-away
-distribution is laid out as pip would leave it, so that nothing has to be installed; plugins/bidnerf-template is a real one.
+A backend is found through an entry point, a line of metadata that `pip install` writes. Here a throw-away distribution is
+laid out as pip would install it, so that nothing has to be installed; plugins/bidnerf-template is a real one.
 """
 
 import argparse
@@ -71,7 +71,7 @@ backend = BallsBackend()
 
 
 def register(folder: Path) -> None:
-    """What `pip install` leaves of a distribution whose pyproject.toml declares an entry point."""
+    """Write what `pip install` would, for a distribution whose pyproject.toml declares an entry point."""
     info = folder / "soft_balls-0.1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: soft-balls\nVersion: 0.1\n")

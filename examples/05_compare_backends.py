@@ -1,10 +1,10 @@
-"""Every installed backend on one scene: the same starts, success, steps, time, memory, as a table and a picture.
+"""Compare all installed backends on one scene, from the same starts: success, steps, time, memory, as a table and a picture.
 
     python examples/05_compare_backends.py [--out compare-out] [--steps 300] [--trials 4]
     python examples/05_compare_backends.py --data DATA --maps MAP MAP ...
 
-Without maps, each backend is trained for a little while on a scene in closed form, which is written to --out as a dataset.
-`bidnerf compare` is the same comparison for maps that you have.
+Without maps, each backend is trained briefly on a scene in closed form, which is written to --out as a dataset.
+`bidnerf compare` makes the same comparison for maps that you have.
 """
 
 import argparse
@@ -29,14 +29,14 @@ if given.maps and given.data is None:
 
 
 def bidnerf(*words: object) -> None:
-    """One command of the command line."""
+    """Run one command of the command line."""
     status = main([str(word) for word in words])
     if status:
         sys.exit(status)
 
 
 def trained() -> list[Path]:
-    """A map of each backend that is installed and sound."""
+    """Return a map of each backend that is installed and not broken."""
     scene, camera = demo_object(), Intrinsics(fx=90.0, fy=90.0, cx=32.0, cy=32.0, width=64, height=64)
     seen, unseen = orbit(radius=3.5, count=40), orbit(radius=3.5, count=8, elevation=(15, 50), seed=1)
     splits = {"train": views(scene, camera, seen), "test": views(scene, camera, unseen)}

@@ -1,9 +1,9 @@
-"""A depth residual of your own: one function, which first-order and second-order methods then use by its name.
+"""Add a depth residual of your own: one function, which first-order and second-order methods then use by name.
 
     python examples/06_change_a_residual.py [--descent 120]
 
-Sensors that measure depth by triangulation or by time of flight often err by a share of the distance. The difference of
-logarithms is that share, whatever the distance: 0.05 is five per cent. A scene in closed form stands in for a map.
+Sensors that measure depth by triangulation or by time of flight often err in proportion to the distance. The difference of
+logarithms is that relative error, whatever the distance: 0.05 is five per cent. A scene in closed form stands in for a map.
 """
 
 import argparse

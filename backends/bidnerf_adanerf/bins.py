@@ -1,4 +1,4 @@
-"""Bins, which are equal parts of a ray's segment in the scene's box, and the choice of a few of them."""
+"""Bins, the equal parts of a ray's segment in the scene's box, and the selection of a few of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bidnerf_core.sampling import Stratified
 
 @dataclass(frozen=True)
 class Bins:
-    """All bins of each ray, as dense training shades them: a ``RaySampler``.
+    """A ``RaySampler`` that returns all bins of each ray, as dense training needs them.
 
     A ray's bins depend on the box alone. They are cut off where the ray's own [near, far] is narrower, and do not reach
     beyond the box where it is wider.
@@ -33,7 +33,7 @@ class Bins:
 
     @torch.no_grad()
     def through(self, rays: Rays) -> Rays:
-        """Return the rays with the whole of their segment in the box."""
+        """Return the rays limited to the box alone, whatever their own [near, far]."""
         return self.bounds.rays(rays.origins.detach(), rays.directions.detach())
 
 
@@ -61,7 +61,7 @@ class Sparse:
 
 
 def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
-    """Return the oracle's scores of the bins of rays, as logits; differentiable in the oracle's parameters."""
+    """Return the oracle's score for each bin of each ray, as logits; differentiable in the oracle's parameters."""
     shape = rays.near.shape
     whole = bins.through(rays)
     spacing = bins.bounds.spacing(whole)
@@ -73,7 +73,10 @@ def ray_logits(oracle: Oracle, bins: Bins, rays: Rays) -> Float[Tensor, "*r n"]:
 
 
 def chosen(samples: RaySamples, scores: Float[Tensor, "*r n"], threshold: float, most: int) -> RaySamples:
-    """Return each ray's best ``most`` samples above ``threshold``, and its best one in any case if that is valid."""
+    """Return the at most ``most`` samples of each ray that score highest above ``threshold``.
+
+    The best sample of a ray is kept even below the threshold, provided that it is valid.
+    """
     count = scores.shape[-1]
     best, index = scores.topk(min(most, count), dim=-1)
     taken: Bool[Tensor, "*r k"] = best > threshold

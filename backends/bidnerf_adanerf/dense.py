@@ -14,7 +14,7 @@ from bidnerf_core.rendering import Rendering
 from bidnerf_core.voxel_grid import OccupancyMask
 
 PROBED = 1 / 16
-"""Fraction of the bins without room for matter that are shaded all the same, so that the field learns that they are empty."""
+"""Fraction of the bins known to be empty that are shaded nevertheless, so that the field learns that they are empty."""
 
 
 def dense_samples(
@@ -34,10 +34,10 @@ def dense_samples(
 
 
 def soft_student(scores: Float[Tensor, "r n"], threshold: float) -> Float[Tensor, "r n"]:
-    """Return the weights of bins in the soft phase: 1 above the threshold, as afterwards, and in proportion to the score below.
+    """Return the weights of bins in the soft phase: 1 above the threshold, as afterwards, and proportional to the score below.
 
-    In the paper the weight is the score itself. Where scores are middling, density then has to be too large, and stays so
-    when those bins later count fully: on Lego the dense rendering lost 1 dB in this phase.
+    In the paper the weight is the score itself. Where scores are intermediate, the density is then driven too high, and it
+    stays too high once those bins count fully: on Lego the dense rendering lost 1 dB in this phase.
     """
     return (scores / max(threshold, 1e-6)).clamp(max=1)
 
@@ -51,7 +51,7 @@ def render_softly(
     """Render with each bin's opacity multiplied by its score (Kurz et al. 2022, section 3)."""
     absorbed = torch.where(samples.valid, values.density * (samples.ends - samples.starts), 0)
     alpha = -torch.expm1(-absorbed) * scores
-    passed = torch.log1p(-alpha * (1 - 1e-6))  # its logarithm; the factor keeps it finite
+    passed = torch.log1p(-alpha * (1 - 1e-6))  # logarithm of the transmittance; the factor keeps it finite
     weights = alpha * torch.exp(torch.cumsum(passed, dim=-1) - passed)
     opacity = weights.sum(-1)
     rgb = (weights[..., None] * values.rgb).sum(-2) + (1 - opacity)[..., None] * background
@@ -59,6 +59,6 @@ def render_softly(
 
 
 def opacity(values: FieldValues, samples: RaySamples, which: Bool[Tensor, "r n"]) -> Float[Tensor, ""]:
-    """Return the mean of ``1 - exp(-sigma dt)`` over some of the bins, without scores."""
+    """Return the mean of ``1 - exp(-sigma dt)`` over the bins ``which``, without scores."""
     absorbed = (values.density * (samples.ends - samples.starts))[which]
     return -torch.expm1(-absorbed).sum() / which.sum().clamp(min=1)

@@ -15,7 +15,7 @@ from bidnerf_adanerf.networks import Oracle, ShadingNetwork
 from bidnerf_core.field import FieldValues, SceneBounds
 
 SHARPNESS = 30.0
-"""Density, per side of the scene, at a raw density of about 1: networks with small outputs can represent surfaces."""
+"""Density per side of the scene at a raw density of about 1, so that networks with small outputs can represent surfaces."""
 THINNESS = 1.0
 """Shift of raw density that makes an untrained field nearly transparent."""
 
@@ -51,7 +51,7 @@ class AdaNerfField(nn.Module):
         return DenseField(self)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Return the values at positions that are scaled to the cube [-1, 1], so that the unit of length has no effect."""
+        """Return the values; positions are scaled to the cube [-1, 1], so that the unit of length has no effect."""
         shape = positions.shape[:-1]
         points = self.bounds.normalized(positions.reshape(-1, 3))
         raw, rgb = self.shading(points, directions.reshape(-1, 3))
@@ -61,7 +61,7 @@ class AdaNerfField(nn.Module):
 
 @dataclass(frozen=True)
 class DenseField:
-    """The field with all bins shaded, without the oracle: the rendering that the sparse one is to reproduce."""
+    """The field with all bins shaded, without the oracle: its rendering is what the sparse field is to reproduce."""
 
     sparse: AdaNerfField
 

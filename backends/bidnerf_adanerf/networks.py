@@ -11,19 +11,19 @@ from torch.nn import functional
 
 
 def encoded_width(frequencies: int) -> int:
-    """Return how many numbers encode a point."""
+    """Return the length of a point's encoding."""
     return 3 * (1 + 2 * frequencies)
 
 
 def encode(points: Float[Tensor, "*p 3"], frequencies: int) -> Float[Tensor, "*p f"]:
-    """Return ``(p, sin(2^k pi p), cos(2^k pi p))`` for k below ``frequencies`` (Mildenhall et al. 2020, eq. 4), p in [-1, 1]."""
+    """Return ``(p, sin(2^k pi p), cos(2^k pi p))`` for k < ``frequencies`` and p in [-1, 1] (Mildenhall et al. 2020, eq. 4)."""
     octaves = torch.arange(frequencies, dtype=points.dtype, device=points.device)
     angles = (points[..., None, :] * (torch.pi * 2**octaves)[:, None]).flatten(-2)
     return torch.cat([points, angles.sin(), angles.cos()], dim=-1)
 
 
 def trunk(inputs: int, width: int, layers: int) -> nn.Sequential:
-    """Return ``layers`` hidden layers with rectifiers."""
+    """Return ``layers`` hidden layers, each followed by a ReLU."""
     widths = [inputs, *[width] * layers]
     pairs = pairwise(widths)
     return nn.Sequential(*(m for a, b in pairs for m in (nn.Linear(a, b), nn.ReLU(inplace=True))))
@@ -55,7 +55,7 @@ class ShadingNetwork(nn.Module):
 class Oracle(nn.Module):
     """The sampling network: scores all bins of a ray in one evaluation, from the ray alone.
 
-    Its input are points at equal steps along the ray's segment in the scene, from where it enters to where it leaves. Rays
+    Its inputs are points evenly spaced along the ray's segment in the scene, from where it enters to where it leaves. Rays
     that see the same part of the scene thus have similar inputs, whether their camera is outside or inside.
     """
 
@@ -70,9 +70,9 @@ class Oracle(nn.Module):
         nn.init.constant_(self.scores.bias, FULL)
 
     def forward(self, points: Float[Tensor, "r k 3"]) -> Float[Tensor, "r n"]:
-        """Return the logits of the scores of rays that pass these points of the cube [-1, 1], at ``places`` of their segment."""
+        """Return the logits of the scores of rays, given their points (in the cube [-1, 1]) at ``places`` of their segment."""
         return self.scores(self.trunk(encode(points, self.frequencies).flatten(1)))
 
 
 FULL = 3.0
-"""Logit of the scores before training: high enough for all bins to count, low enough for a gradient."""
+"""Logit of the scores before training: high enough for all bins to count, low enough for the gradient not to vanish."""

@@ -1,4 +1,4 @@
-"""Training of an AdaNeRF: with all bins, then with ever fewer of them, then with those that are left."""
+"""Training of an AdaNeRF: with all bins, then with ever fewer of them, then only with those that the oracle keeps."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from bidnerf_core.training import Report, StepOutcome, Supervision, TrainingBatc
 from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 
 PROBE = 4096
-"""Number of rays from which the mean number of samples of a ray is estimated."""
+"""Number of rays from which the mean number of samples per ray is estimated."""
 
 
 class Phase(Enum):
-    """What a step does; each phase continues from the one before."""
+    """The phases of training; each continues from the one before."""
 
     DENSE = "all bins are shaded and count; the oracle learns which of them matter"
     SOFT = "all bins are shaded and weighted by their scores, which are made sparse"
@@ -42,7 +42,7 @@ def phase_at(step: int, config: AdaNerfConfig) -> Phase:
 
 
 def sparsity(step: int, config: AdaNerfConfig) -> float:
-    """Return the weight of the mean score in the loss: 0 before the soft phase, then growing until that is half over."""
+    """Return the weight of the mean score in the loss: 0 before the soft phase, then growing until that phase is half over."""
     begin, length = config.dense_part * config.steps, config.soft_part * config.steps
     return config.sparsity_weight * min(1.0, max(0.0, (step - begin) / max(1.0, length / 2)))
 
@@ -73,7 +73,7 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
 
 
 def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int) -> OccupancyMask:
-    """Return where the training views leave room for matter. It serves training only and is not saved."""
+    """Return the cells that may hold matter according to the training views; used in training only and not saved."""
     room = OccupancyMask(VoxelGrid.cube(bounds, resolution))
     room.cells.copy_(occupied_voxels(views, room.grid))
     return room
@@ -83,7 +83,7 @@ def dense_step(
     field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, room: OccupancyMask | None,
     config: AdaNerfConfig, step: int, generator: Generator,
 ) -> StepOutcome:  # fmt: skip
-    """Return the loss with all bins shaded, which count in full or, in the soft phase, according to their scores."""
+    """Return the loss with all bins shaded; they count in full or, in the soft phase, according to their scores."""
     samples, empty = dense_samples(field, batch.rays, room, generator)
     values = query_samples(field, batch.rays, samples)
     logits = ray_logits(field.oracle, field.bins, batch.rays)
@@ -103,7 +103,7 @@ def dense_step(
 def sparse_step(
     field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, generator: Generator
 ) -> StepOutcome:
-    """Return the loss of rendering as in localization: the oracle, which is not trained any more, chooses the samples."""
+    """Return the loss of rendering as in localization, with samples chosen by the oracle, which is no longer trained."""
     rendering = render(field, batch.rays, batch.background, generator)
     loss, mse = supervision.loss(rendering, batch)
     return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))

@@ -1,14 +1,14 @@
 """Multiresolution hash encoding (Mueller et al. 2022, "Instant Neural Graphics Primitives", section 3).
 
-Pure torch, laid out for the cores of a CPU, and for a GPU with all levels in few operations:
+Pure torch, laid out for the cores of a CPU; on a GPU, all levels take few operations:
 
 * arrays are (corner, point), so that all arithmetic runs along contiguous points;
-* a pair of features is read and accumulated as one complex number: one memory access a corner (a "unit" below);
+* a pair of features is read and accumulated as one complex number (a "unit" below): one memory access per corner;
 * the points go through a level in chunks whose temporaries stay in the cache, and so does the table of the level;
 * levels are computed on several threads at once, because torch gathers and scatters on one; on a GPU, where launching
-  an operation takes longer than many a level, those of a kind are computed together (``LevelGroup``);
+  an operation often takes longer than computing a level, levels of the same kind are computed together (``LevelGroup``);
 * the backward pass is written by hand: gradients to a table are scattered to recomputed corner indices, and the
-  derivative by position is kept from the forward pass, where the corner values are at hand anyway.
+  derivative with respect to position is kept from the forward pass, where the corner values are at hand anyway.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from bidnerf_hashgrid.threads import concurrently, slices, threads_for
 
 CPU_CHUNK = 32768
 GPU_CHUNK = 2**22
-"""Number of points times levels that are computed at once: a quarter of a gigabyte for the features of their corners."""
+"""Number of points times levels computed at once: a quarter of a gigabyte for the features of their corners."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class HashEncodingConfig(Settings):
     """Hyperparameters of table 1 of the paper: L, F, log2 T, N_min and N_max.
 
     The interpolation ``smooth`` passes the position in a cell through 3t^2 - 2t^3 (appendix A), so that the derivative
-    of the encoding by position is continuous.
+    of the encoding with respect to position is continuous.
     """
 
     levels: Annotated[int, Range(1, 64)] = 16  # number of levels of resolution
@@ -58,7 +58,7 @@ class HashEncodingConfig(Settings):
 
 
 def _weights(fraction: Float[Tensor, "3 k m"], smooth: bool, unit: int) -> Float[Tensor, "3 w"]:
-    """Return the weight of the upper vertex by axis (the fraction, or its smoothstep), repeated within a unit."""
+    """Return the weight of the upper vertex along each axis (the fraction, or its smoothstep), repeated within a unit."""
     return _repeat(fraction * fraction * (3 - 2 * fraction) if smooth else fraction, unit).flatten(1)
 
 
@@ -89,7 +89,7 @@ def _interpolate(corners: Float[Tensor, "2 2 2 w"], weights: Float[Tensor, "3 w"
 def _interpolate_with_slopes(
     corners: Float[Tensor, "2 2 2 w"], weights: Float[Tensor, "3 w"]
 ) -> tuple[Float[Tensor, " w"], list[Float[Tensor, " w"]]]:
-    """Return the interpolated value and its derivatives by the weights of x, y and z."""
+    """Return the interpolated value and its derivatives with respect to the weights of x, y and z."""
     x, y, z = weights.unbind()
     slopes: list[Tensor] = []
     for weight in (z, y, x):
@@ -110,7 +110,7 @@ def _spread(gradient: Float[Tensor, " w"], weights: Float[Tensor, "3 w"]) -> Flo
 
 
 def _chunks(points: Float[Tensor, "3 n"], group: LevelGroup) -> list[slice]:
-    """Return the parts of the points whose temporaries stay in the cache of a CPU, or are a small part of a GPU's memory."""
+    """Return slices of the points, so short that their temporaries fit in a CPU's cache or take little of a GPU's memory."""
     size = CPU_CHUNK if points.device.type == "cpu" else max(1, GPU_CHUNK // len(group))
     return slices(points.shape[1], size)
 
@@ -123,7 +123,7 @@ def _encode_group(
     values: Float[Tensor, "k c w"],
     slopes: Float[Tensor, "k c 3 w"] | None,
 ) -> None:
-    """Write the features of levels to ``values``, and their derivatives by position in cells to ``slopes``."""
+    """Write the levels' features to ``values``, and their derivatives with respect to position (in cells) to ``slopes``."""
     unit, count = _unit(table.shape[1]), len(group)
     columns = _as_units(table, unit).unbind(1)
     for chunk in _chunks(points, group):
@@ -150,7 +150,7 @@ def _add_position_gradient(
     group: LevelGroup,
     total: Float[Tensor, "3 w"],
 ) -> None:
-    """Add the gradient of levels' features, carried back to the points, to ``total``."""
+    """Backpropagate the gradient of the levels' features to the points, and add the result to ``total``."""
     if len(group) == 1:
         for slope, row in zip(slopes[0], gradient[0], strict=True):
             total.addcmul_(slope, row, value=group.levels[0].resolution)
@@ -166,7 +166,7 @@ def _add_table_gradient(
     smooth: bool,
     table: Float[Tensor, "t f"],
 ) -> None:
-    """Add the gradient of levels' features, carried back to their entries, to ``table``."""
+    """Backpropagate the gradient of the levels' features to the table's entries, and add the result to ``table``."""
     unit = _unit(table.shape[1])
     for chunk in _chunks(points, group):
         wide = slice(chunk.start * unit, chunk.stop * unit)
@@ -184,8 +184,10 @@ def _laid_end_to_end(tables: Sequence[Float[Tensor, "_ f"]]) -> Float[Tensor, "t
 
 
 class _Encode(torch.autograd.Function):
-    """All active levels at once. Inside, each unit of each level is a contiguous row; a level writing into the
-    columns of the result by itself costs more than one transposition at the end.
+    """The encoding by all active levels at once.
+
+    Internally, each unit of each level is a contiguous row: one transposition at the end costs less than each level writing
+    into the columns of the result.
     """
 
     @staticmethod
@@ -259,7 +261,7 @@ class HashEncoding(nn.Module):
         self.levels = make_levels(
             config.levels, 2**config.log2_table_size, config.base_resolution, config.finest_resolution
         )
-        # One table per level: an inactive level has no gradient at all and so costs the optimizer nothing.
+        # One table per level: an inactive level then has no gradient at all and costs the optimizer nothing.
         self.tables = nn.ParameterList(
             nn.Parameter(torch.empty(level.entries, config.features).uniform_(-1e-4, 1e-4))
             for level in self.levels

@@ -35,7 +35,7 @@ class FieldConfig(Settings):
     geometry_features: Count = 15
     # cells of the occupancy grid along the longest side of the scene
     grid_resolution: Annotated[int, Range(2, 1024)] = 128
-    # largest number of intervals along a ray; with 0, all those in occupied cells
+    # maximum number of intervals along a ray; with 0, all those in occupied cells
     samples_per_ray: Annotated[int, Range(0)] = 32
     coarse_levels: Annotated[int, Range(0)] = 4  # levels of the encoding that the coarse field keeps
 
@@ -66,8 +66,8 @@ class HashGridField(nn.Module):
             nn.Linear(config.width, 3),
             nn.Sigmoid(),
         )
-        # Most rays of a contracted scene have their samples concentrated by the density of whole cells, of which shorter steps
-        # would tell nothing more.
+        # In a contracted scene, the samples of most rays are concentrated by the density of whole cells, about which shorter
+        # steps would give no more information.
         single = bounds.contracted and config.samples_per_ray > 0
         self.occupancy = OccupancyGrid(bounds, config.grid_resolution, steps_per_cell=1 if single else 2)
         self.coarse_sampler = OccupancyGrid(bounds, config.grid_resolution // 2)
@@ -81,8 +81,10 @@ class HashGridField(nn.Module):
         return CoarseField(self), self
 
     def upgraded_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a stored state with today's names. The occupancy grid was the sampler, and it observed no densities,
-        which only contracted scenes need: there were none.
+        """Return a stored state with the present names.
+
+        In earlier versions the occupancy grid was called ``sampler``, and it observed no densities: only contracted scenes
+        need them, which did not exist then.
         """
         old = "sampler."
         state = {f"occupancy.{k.removeprefix(old)}" if k.startswith(old) else k: v for k, v in state.items()}
@@ -112,7 +114,7 @@ class HashGridField(nn.Module):
 
 
 def _scaled(encoding: HashEncodingConfig, factor: int) -> HashEncodingConfig:
-    """Return an encoding with a finest level ``factor`` times as fine: the box is a part of a contracted cube."""
+    """Return an encoding whose finest level is ``factor`` times as fine, since the box is only part of a contracted cube."""
     return replace(encoding, finest_resolution=factor * encoding.finest_resolution)
 
 
@@ -121,16 +123,17 @@ def _hidden(widths: Sequence[int]) -> list[nn.Module]:
 
 
 def limited(grid: OccupancyGrid, count: int) -> RaySampler:
-    """Return a sampler of at most ``count`` intervals a ray, concentrated where the grid has observed density, or of all of them.
+    """Return a sampler of at most ``count`` intervals per ray, concentrated where the grid has observed density.
 
-    All are sampled with a count of 0, and by a grid that has observed nothing, as in maps that earlier versions stored.
+    With a count of 0, or where the grid has observed nothing, as in maps that earlier versions stored, it is the grid
+    itself, which samples all occupied cells.
     """
     return Concentrated(GridDensity(grid), count) if count and grid.observed else grid
 
 
 @dataclass(frozen=True)
 class CoarseField:
-    """A hash-grid field with its coarse encoding levels only: blurred, cheaper, with gradients of wider range."""
+    """A hash-grid field with its coarse encoding levels only: blurred and cheaper, with gradients that reach farther."""
 
     fine: HashGridField
 

@@ -16,12 +16,12 @@ from bidnerf_hashgrid.threads import slices
 # The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.
 PRIMES = (1, 2654435761 - 2**32, 805459861)
 MOST_ENTRIES = 2**23
-"""Entries of the tables that are laid end to end, which copies them: some tens of megabytes. An int32 could address 2^31."""
+"""Limit of the entries of concatenated tables: concatenation copies some tens of megabytes. An int32 could address 2^31."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """A grid of vertices, whose features are in a table of ``entries``."""
+    """A grid of vertices, whose features are stored in a table of ``entries``."""
 
     resolution: int  # cells along a side
     entries: int
@@ -30,7 +30,7 @@ class Level:
 
 
 def make_levels(count: int, table_size: int, base: float, finest: float) -> tuple[Level, ...]:
-    """Return ``count`` levels with resolutions by eqs. 2 and 3; one whose vertices fit in the table is stored without a hash."""
+    """Return ``count`` levels with resolutions by eqs. 2 and 3; levels whose vertices fit into the table are not hashed."""
     growth = math.log(finest / base) / max(count - 1, 1)
     levels = []
     for index in range(count):
@@ -45,7 +45,7 @@ def make_levels(count: int, table_size: int, base: float, finest: float) -> tupl
 
 @dataclass(frozen=True)
 class LevelGroup:
-    """Adjacent levels that are computed together, their tables laid end to end: all of them hashed, or none."""
+    """Adjacent levels that are computed together, with their tables concatenated: all of them hashed, or none."""
 
     levels: tuple[Level, ...]
     first: int  # number of the first among all levels
@@ -66,7 +66,7 @@ class LevelGroup:
         return constant(tuple(level.resolution for level in self.levels), like)
 
     def vertices(self, points: Float[Tensor, "3 m"]) -> tuple[Int[Tensor, "3 2 k m"], Float[Tensor, "3 k m"]]:
-        """Return the terms of the lower and upper vertex of each axis in a corner's index, and the position in the cell."""
+        """Return each axis's terms of the corner indices, for its lower and upper vertex, and the position in the cell."""
         scaled = points[:, None] * self.resolutions(points)[:, None]
         lower = scaled.to(torch.int32).clamp_(min=0)
         # A coordinate of exactly 1 belongs to the last cell, whose upper vertices exist.
@@ -80,7 +80,7 @@ class LevelGroup:
         if self.levels[0].hashed:
             terms.bitwise_and_(self.entries[0] - 1)
         if len(self) > 1:
-            # Where each table begins is above all bits of a hash, so that the terms of the other axes leave it as it is.
+            # A table's offset lies above all bits of a hash, so that the terms of the other axes leave it unchanged.
             terms[0] += constant(self._offsets, lower)[:, None]
         return terms, scaled.sub_(lower)
 
@@ -97,13 +97,13 @@ class LevelGroup:
 
 @lru_cache(maxsize=64)
 def one_by_one(levels: tuple[Level, ...]) -> list[LevelGroup]:
-    """Return each level as a group of its own: its table stays in the cache of a core."""
+    """Return each level as a group of its own, so that its table stays in the cache of a core."""
     return [LevelGroup((level,), number) for number, level in enumerate(levels)]
 
 
 @lru_cache(maxsize=64)
 def together(levels: tuple[Level, ...]) -> list[LevelGroup]:
-    """Return as few groups as possible: on a GPU, each operation takes a launch, however few points it has."""
+    """Return as few groups as possible: on a GPU, each operation costs a launch, however few points it has."""
     groups = []
     dense = sum(not level.hashed for level in levels)  # the coarse ones, which come first
     for first, kind in ((0, levels[:dense]), (dense, levels[dense:])):

@@ -1,9 +1,8 @@
 """The two networks of a field (Mueller et al. 2022, section 5.4), evaluated and differentiated in chunks of points on a CPU.
 
-The hidden units of a whole batch are tens of megabytes. In chunks they are computed, rectified and differentiated while they are
-in the cache, and the large blocks of memory that the system would hand out and take back in each step are not needed. Chunks run
-on several threads. The gradients of the weights are summed in the order of the chunks, so that they do not depend on the number
-of threads.
+The hidden units of a whole batch take tens of megabytes. In chunks they are computed, rectified and differentiated while they
+are in the cache, and no large blocks of memory need to be allocated and freed in each step. Chunks run on several threads. The
+gradients of the weights are summed in the order of the chunks, so that they do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ NETWORK_CHUNK = 4096
 """Number of points whose hidden units stay in the cache of a core."""
 
 Layers = list[tuple[Tensor, Tensor]]
-"""Weight (out in) and bias (out) of linear layers with rectifiers between them."""
+"""Weights (out in) and biases (out) of linear layers with ReLUs between them."""
 
 
 class _Networks(NamedTuple):
-    """The layers of both networks, or the gradients of these."""
+    """The layers of both networks, or their gradients."""
 
     geometry: Layers
     colour: Layers
 
 
 class _Chunk(NamedTuple):
-    """What both networks computed for m points: the inputs of their layers, and their results."""
+    """The activations of both networks for m points: the inputs of their layers, and their results."""
 
     geometry: list[Tensor]
     colour: list[Tensor]
@@ -45,9 +44,9 @@ class _Chunk(NamedTuple):
 def log_density_and_rgb(
     geometry: nn.Sequential, colour: nn.Sequential, encoded: Float[Tensor, "n e"], harmonics: Float[Tensor, "n h"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:  # fmt: skip
-    """Return the first output of ``geometry``, and ``colour`` of its other outputs and of ``harmonics``.
+    """Return the first output of ``geometry``, and the output of ``colour`` for its other outputs and ``harmonics``.
 
-    Both are linear layers with rectifiers between them, ``colour`` with a sigmoid at its end. On a CPU, the results cannot be
+    Both networks are linear layers with ReLUs between them; ``colour`` ends with a sigmoid. On a CPU, the results cannot be
     differentiated twice.
     """
     if encoded.device.type != "cpu":
@@ -77,7 +76,7 @@ def _forward(x: Float[Tensor, "m i"], layers: Layers) -> tuple[list[Tensor], Flo
 def _backward(
     gradient: Float[Tensor, "m o"], inputs: list[Tensor], layers: Layers, to_layers: Layers | None
 ) -> Float[Tensor, "m i"]:
-    """Return the gradient to the first input, and write those to the layers."""
+    """Return the gradient with respect to the first input, and write those of the layers to ``to_layers``."""
     for k in reversed(range(len(layers))):
         if to_layers is not None:
             torch.mm(gradient.t(), inputs[k], out=to_layers[k][0])
@@ -101,10 +100,10 @@ def _differentiate(
     networks: _Networks,
     to_networks: _Networks | None,
 ) -> tuple[Float[Tensor, "m e"], Float[Tensor, "m h"]]:
-    """Return the gradients to the encoding and to the harmonics, and write those to the layers."""
+    """Return the gradients with respect to the encoding and the harmonics, and write those of the layers to ``to_networks``."""
     to_logits = to_rgb * (chunk.rgb * (1 - chunk.rgb))
     gradient = _backward(to_logits, chunk.colour, networks.colour, to_networks and to_networks.colour)
-    passed = len(networks.geometry[-1][1]) - 1  # features that go from one network to the other
+    passed = len(networks.geometry[-1][1]) - 1  # features passed from one network to the other
     to_features = torch.cat([to_log_density[:, None], gradient[:, :passed]], dim=-1)
     to_encoded = _backward(
         to_features, chunk.geometry, networks.geometry, to_networks and to_networks.geometry
@@ -148,7 +147,7 @@ class _Evaluate(torch.autograd.Function):
         to_encoded = torch.empty_like(encoded) if wants_encoded else None
         to_harmonics = encoded.new_empty(len(encoded), width) if wants_harmonics else None
         sizes = [part.numel() for part in flat]
-        # Gradients to all layers, a row a chunk.
+        # Gradients of all layers, one row per chunk.
         sums = encoded.new_empty(len(chunks), sum(sizes)) if any(wanted) else None
 
         def differentiate(number: int) -> None:

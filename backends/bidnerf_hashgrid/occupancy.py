@@ -1,4 +1,4 @@
-"""Occupancy grid: where a field has visible matter, and a sampler of these places only."""
+"""The occupancy grid, which records where a field has visible matter and samples only there."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ BLOCK = 8
 """Steps along a ray that are skipped together where no occupied cell is near."""
 
 MOST = 96
-"""Largest number of samples of a ray where the host must not wait to count them: the nearest ones, in occupied cells."""
+"""Maximum number of samples per ray where the host must not wait to count them; the nearest ones in occupied cells are kept."""
 
 
 class OccupancyGrid(nn.Module):
     """A cube of cells around the scene, and a ``RaySampler`` of equal steps within its occupied cells.
 
     A cell is occupied while some training ray has weight in it: matter that no ray sees, such as the inside of a solid, is
-    not sampled. ``peak`` is the largest rendering weight observed in a cell; it fades with each step that visits the cell,
-    and a cell that no ray visits keeps it. Occupied cells are those whose peak is above a threshold and, while surfaces may
+    not sampled. ``peak`` is the largest rendering weight observed in a cell; it decays with each step in which a ray visits
+    the cell and otherwise stays the same. Occupied cells are those whose peak is above a threshold and, while surfaces may
     still move, their neighbours.
     """
 
     peak: Float[Tensor, "n n n"]
-    density: Float[Tensor, "n n n"]  # per metre: the largest seen lately in each cell
+    density: Float[Tensor, "n n n"]  # per metre: the largest observed recently in each cell
     samples_per_ray: Float[Tensor, ""]  # running mean over training rays
     occupied: Bool[Tensor, "n n n"]
     near_occupied: Bool[Tensor, "n n n"]
@@ -50,7 +50,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("samples_per_ray", torch.full((), float(resolution)))
         self.register_buffer("occupied", torch.ones(shape, dtype=torch.bool))
         self.register_buffer("near_occupied", torch.ones(shape, dtype=torch.bool), persistent=False)
-        # A contracted scene is too large for equal steps from the beginning.
+        # A contracted scene is too large for equal steps, even at the beginning.
         self.observed = bounds.contracted
         self.register_load_state_dict_post_hook(lambda module, _: module._loaded())
 
@@ -68,14 +68,14 @@ class OccupancyGrid(nn.Module):
         density: Float[Tensor, "p"],
         fade: float,
     ) -> None:
-        """Update peaks and densities by the rendering weights and densities at one batch's samples, ``positions`` (metres, world)."""
+        """Update peaks and densities with the rendering weights and densities of a batch at ``positions`` (metres, world)."""
         self.observed = True
         cells = self.grid.numbers(positions)
         for known, values in ((self.peak, weights), (self.density, density)):
             flat = known.view(-1)
             flat.index_copy_(
                 0, cells, flat.index_select(0, cells) * fade
-            )  # once, however often it is visited
+            )  # once per step, however many samples lie in the cell
             flat.scatter_reduce_(0, cells, values.to(known), "amax")
 
     @torch.no_grad()
@@ -119,7 +119,7 @@ class OccupancyGrid(nn.Module):
     ) -> RaySamples:
         """Return the first ``MOST`` intervals of each ray in occupied cells, without waiting for the device."""
         box = self.grid.rays(rays.origins, rays.directions)
-        # Steps are counted from ``near``, as everywhere; those before the grid are left out. Contracted space begins there.
+        # Steps are counted from ``near``, as everywhere, and those before the grid are skipped; contracted space has none.
         skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
         count = math.ceil(2 * self.bounds.side / self.step) + 1  # a cube's diagonal is shorter
         steps = torch.arange(count, dtype=near.dtype, device=near.device)
@@ -138,7 +138,7 @@ class OccupancyGrid(nn.Module):
     def _occupied_at(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
         """Return whether positions (metres, world) are within the grid, in an occupied cell."""
         grid = self.grid
-        if grid.contracted is not None:  # once, and not in each look-up
+        if grid.contracted is not None:  # contract once, not in each look-up
             positions = grid.contracted.normalized(positions)
             grid = replace(grid, contracted=None)
         return grid.at(self.occupied, positions) & grid.contains(positions)
@@ -146,7 +146,7 @@ class OccupancyGrid(nn.Module):
     def _busy_blocks(
         self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the ray and the start of each run of ``BLOCK`` steps that passes near an occupied cell, in order."""
+        """Return the ray and the start of each block of ``BLOCK`` steps that passes near an occupied cell, in order."""
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
         starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
@@ -156,7 +156,7 @@ class OccupancyGrid(nn.Module):
         return ray, starts.view(-1).index_select(0, ray * count + block)
 
     def _padded(self, place: Tensor, ray: Tensor, near: Tensor, far: Tensor) -> RaySamples:
-        """Return the samples, gathered at the front of their ray's row; all rows are as long as the longest."""
+        """Return the samples, packed at the front of their ray's row; rows are padded to the length of the longest."""
         counts = torch.bincount(ray, minlength=len(near))
         width = int(counts.amax()) if len(near) else 0
         valid = torch.arange(width, device=ray.device) < counts[:, None]
@@ -166,14 +166,14 @@ class OccupancyGrid(nn.Module):
     def _intervals(
         self, middles: Tensor, valid: Tensor, counts: Tensor, near: Tensor, far: Tensor
     ) -> RaySamples:
-        """Return intervals of a step about ``middles`` (r s), of which the first ``counts`` (r) are valid, within the rays."""
+        """Return intervals one step long around ``middles`` (r s), clipped to the rays; the first ``counts`` (r) are valid."""
         number = torch.arange(middles.shape[-1], device=middles.device)
         half = self.step / 2
         starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
         ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)
         if (
             self.bounds.contracted
-        ):  # the rest of a step at the far end is short in the coordinate, but long in metres
+        ):  # the remainder of a step at the far end is short in the coordinate, but long in metres
             rest = (number == counts[:, None] - 1) & (far[:, None] - ends < self.step)
             ends = torch.where(rest, far[:, None], ends)
         return RaySamples(starts, ends, valid)
@@ -206,7 +206,7 @@ def _at(
 ) -> Float[Tensor, "b s 3"]:
     """Return the positions at distances along the rays, or along those with the given numbers.
 
-    In memory, the positions of an axis are side by side: sums over rows of three numbers take ten times as long.
+    In memory, the positions along an axis are contiguous: sums over rows of three numbers take ten times as long.
     """
     origins, directions = (part.t().contiguous() for part in (rays.origins, rays.directions))
     if ray is not None:

@@ -24,19 +24,19 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
     steps: Count = 1600  # steps of the optimizer
-    samples_per_step: Count = 65536  # approximate number of samples a step, which decides the number of rays
+    samples_per_step: Count = 65536  # approximate number of samples per step, which sets the number of rays
     learning_rate: Positive = 1e-2  # learning rate of the tables; the networks have a quarter of it
     # steps from one update of the coarse field to the next; 0: it is not trained
     coarse_every: Annotated[int, Range(0)] = 4
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
-    rays_at_most: Count = 16384  # largest number of rays a step
+    rays_at_most: Count = 16384  # maximum number of rays per step
     prune_from: Annotated[int, Range(0)] = 200  # first step at which empty cells are left out
     prune_every: Count = 16  # steps from one update of the occupied cells to the next
     prune_fade: Annotated[float, Range(0, 1)] = 0.95  # factor on a cell's weight when rays visit it
     prune_threshold: NotNegative = 0.01  # rendering weight up to which a cell is empty
     # fraction of the steps in which neighbours of occupied cells are sampled too
     grow_until: NotNegative = 0.6
-    carve: bool = True  # begin with the cells that the views' depth and silhouettes leave
+    carve: bool = True  # begin with the cells that the views' depth and silhouettes do not show to be empty
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,8 +53,8 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
 def pruning(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
     """Return the config with slower pruning where the scene is contracted.
 
-    There a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a cell that is left out
-    too early is rarely found again.
+    There, a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a cell that is
+    pruned too early is rarely found again.
     """
     if not bounds.contracted:
         return config
@@ -98,10 +98,10 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
 def _update(
     grid: OccupancyGrid, batch: TrainingBatch, rendering: Rendering, step: int, config: HashGridConfig
 ) -> None:
-    """Update the occupancy grid by one step's rendering."""
+    """Update the occupancy grid with one step's rendering."""
     samples, density = rendering.samples, rendering.density
     assert density is not None  # it comes from ``render``
-    # The weights that steps of the grid would have: samples are longer or shorter, as they are concentrated.
+    # Weights as if samples were one step of the grid long: concentrated samples are longer or shorter.
     place = grid.bounds.spacing(batch.rays).place
     weights = (
         rendering.weights.detach() * grid.step / (place(samples.ends) - place(samples.starts)).clamp(min=1e-9)

@@ -1,4 +1,4 @@
-"""Threads for work that torch itself does on one core: gathers from a table and scatters into it."""
+"""Threads for what torch itself does on one core: gathering from a table and scattering into it."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from threading import Barrier, Lock
 
 import torch
 
-THREADED = 4096  # points from which on several threads work
+THREADED = 4096  # number of points from which several threads are worthwhile
 
 _pools: dict[int, ThreadPoolExecutor] = {}  # by number of threads
 _opening = Lock()
 
 
 def threads_for(points: int, device: torch.device) -> int:
-    """Return how many threads work on so many points: one on a GPU, and where there is not work enough for a second."""
+    """Return how many threads to use for ``points`` points: one on a GPU, and where there is too little work for more."""
     worth = device.type == "cpu" and points >= THREADED
     return torch.get_num_threads() if worth else 1
 
 
 def slices(count: int, size: int) -> list[slice]:
-    """Return slices of up to ``size`` items that cover ``count`` of them: the parts of work that tasks share."""
+    """Return slices of up to ``size`` items that cover ``count`` items: the parts of the work that tasks share."""
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
 
 def concurrently(tasks: Iterable[Callable[[], None]], threads: int) -> None:
-    """Run independent tasks of torch, none of which records gradients, on CPU threads, each of which uses one core.
+    """Run independent tasks on CPU threads, each of which uses one core; no task may record gradients.
 
-    The operators release Python's global lock while they compute. Whatever a task raises is raised here.
+    Torch's operators release Python's global interpreter lock while they compute. Whatever a task raises is raised here.
     """
     if threads < 2:
         for task in tasks:
             task()
         return
-    inference = torch.is_inference_mode_enabled()  # by thread, as is the recording of gradients
+    inference = torch.is_inference_mode_enabled()  # per thread, as is the recording of gradients
     for done in [_pool(threads).submit(_run, task, inference) for task in tasks]:
         done.result()
 
@@ -53,9 +53,9 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def _opened(threads: int) -> ThreadPoolExecutor:
-    """Return a pool whose threads all run, each limited to one core.
+    """Return a pool whose threads are all running, each limited to one core.
 
-    ``torch.set_num_threads`` holds for the thread that calls it and for those which begin later, so that it is set back.
+    ``torch.set_num_threads`` affects the calling thread and all that start later, so the usual number is restored.
     """
     usual, all_run = torch.get_num_threads(), Barrier(threads + 1)
 
@@ -72,7 +72,7 @@ def _opened(threads: int) -> ThreadPoolExecutor:
 
 
 def _forget() -> None:
-    """Leave out the pools of the parent process: a forked process does not have their threads."""
+    """Forget the pools of the parent process, whose threads a forked process does not have."""
     global _opening
     _pools.clear()
     _opening = Lock()

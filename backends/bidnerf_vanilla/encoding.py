@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def encoded_width(frequencies: int, include_input: bool) -> int:
-    """Return how many numbers encode a point."""
+    """Return the length of a point's encoding."""
     return 3 * (2 * frequencies + include_input)
 
 
@@ -17,8 +17,8 @@ def positional_encoding(
 ) -> Float[Tensor, "p f"]:
     """Return ``(p, sin(2^0 pi p), cos(2^0 pi p), ..., sin(2^(L-1) pi p), cos(2^(L-1) pi p))`` (eq. 4).
 
-    Coordinates are in [-1, 1], one period of the lowest frequency. Of each frequency come the three sines, then the three
-    cosines. ``p`` itself comes first, or is left out.
+    Coordinates are in [-1, 1], one period of the lowest frequency. For each frequency, the three sines come before the
+    three cosines. ``p`` itself comes first if ``include_input`` is set.
     """
     octaves = torch.arange(frequencies, dtype=points.dtype, device=points.device)
     angles = points[:, None, :] * (torch.pi * 2**octaves)[:, None]

@@ -1,4 +1,4 @@
-"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, the second sampled where the first has found matter."""
+"""The radiance field of NeRF (Mildenhall et al. 2020): two networks, the second sampled where the first finds matter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 
 SHARPNESS = 30.0
-"""Density, per side of the scene, at a raw density of about 1: networks with small outputs can represent surfaces."""
+"""Density per side of the scene at a raw density of about 1, so that networks with small outputs can represent surfaces."""
 THINNESS = 1.0
 """Shift of raw density that makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF)."""
 
@@ -41,7 +41,7 @@ class Level(nn.Module):
         self.network = NerfNetwork(config)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Return the values at positions that are scaled to the cube [-1, 1], so that the unit of length has no effect."""
+        """Return the values; positions are scaled to the cube [-1, 1], so that the unit of length has no effect."""
         shape = positions.shape[:-1]
         points = self.bounds.normalized(positions.reshape(-1, 3))
         raw, rgb = self.network(points, directions.reshape(-1, 3))
@@ -50,7 +50,7 @@ class Level(nn.Module):
 
 
 class VanillaField(nn.Module):
-    """The fine level, with the coarse one in ``levels``. The fine sampler is hierarchical (section 5.2): it uses the coarse level."""
+    """The fine level, with the coarse one in ``levels``; its sampler is hierarchical and uses the coarse one (section 5.2)."""
 
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
         super().__init__()

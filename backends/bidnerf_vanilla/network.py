@@ -24,7 +24,7 @@ class NetworkConfig(Settings):
     # octaves of sines and cosines of the position; the first period is the scene's longest side
     position_frequencies: Annotated[int, Range(0, 64)] = 8
     direction_frequencies: Annotated[int, Range(0, 64)] = 2  # octaves of sines and cosines of the direction
-    include_input: bool = True  # feed positions and directions themselves in, beside their sines
+    include_input: bool = True  # feed in positions and directions themselves, besides their sines
 
 
 class NerfNetwork(nn.Module):
@@ -45,7 +45,7 @@ class NerfNetwork(nn.Module):
         self.colour = nn.Linear(max(1, config.width // 2), 3)
 
     def _is_fed(self, number: int) -> bool:
-        """Return whether a layer takes the encoded position besides the previous layer's output."""
+        """Return whether a layer takes the encoded position as well as the previous layer's output."""
         return number == self.config.skip > 0
 
     def forward(

@@ -19,7 +19,7 @@ from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionC
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
 PROBE = 4096
-"""Number of rays from which the mean number of samples of a ray is estimated."""
+"""Number of rays from which the mean number of samples per ray is estimated."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class VanillaConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes about forty minutes on a small CPU."""
 
     steps: Count = 20000  # steps of the optimizer
-    # approximate number of samples of the fine network a step, which decides the number of rays
+    # approximate number of samples of the fine network per step, which determines the number of rays
     samples_per_step: Count = 4096
-    rays_at_most: Count = 4096  # largest number of rays a step
+    rays_at_most: Count = 4096  # maximum number of rays per step
     learning_rate: Positive = 3e-3  # initial learning rate
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
     carve: bool = True  # skip the cells that the views' depth and silhouettes show to be empty
@@ -65,7 +65,7 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
 def step_outcome(
     field: VanillaField, supervision: Supervision, batch: TrainingBatch, generator: Generator
 ) -> StepOutcome:
-    """Return the loss of both levels (eq. 6), and the colour error and the samples of the fine one."""
+    """Return the loss of both levels (eq. 6), and the colour error and the number of samples per ray of the fine one."""
     coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
     rough, _ = supervision.loss(coarse, batch)
     loss, mse = supervision.loss(fine, batch)
@@ -74,7 +74,7 @@ def step_outcome(
 
 @torch.no_grad()
 def _rays_per_step(field: VanillaField, supervision: Supervision, config: VanillaConfig) -> int:
-    """Return the number of rays of a step: the fewer samples a ray takes, the more rays."""
+    """Return the number of rays per step: the fewer samples a ray takes, the more rays."""
     rays = supervision.draw(PROBE, Generator().manual_seed(config.seed)).rays
     coarse = field.coarse.sampler(rays).valid
     samples = float(coarse.sum() + config.fine_samples * coarse.any(-1).sum()) / PROBE

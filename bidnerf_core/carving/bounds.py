@@ -1,4 +1,4 @@
-"""Estimation of a scene's box and of its near and far distance: from depth, from silhouettes, or from the cameras alone."""
+"""Estimation of a scene's box and its near and far distances, from depth, silhouettes, landmarks or the cameras alone."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
 
 OUTLIERS = 1e-3  # fraction of the measured points, at either end of each axis, that may be wrong
-POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements that are used: in all, and at least of each view
+POINTS, POINTS_OF_VIEW = 400_000, 500  # measurements to use: in all, and at least from each view
 SPARSE_MARGIN = 0.1  # of the box's size, at each end, where only a few points were measured
 FAR_MARGIN = 1.1  # a camera may be a little farther away than any of the views
 LEAST_NEAR = 0.01  # of far, where cameras are inside the box and nothing was measured
 LEAST_SPREAD = 0.01  # mean squared sine of the angles between optical axes and their mean: about 6 degrees
 INWARD = 0.8  # fraction of the cameras that must see the point that all of them look at
-FAR_BEYOND = 2.0  # times the farthest that is known of, where there is matter beyond the box
+FAR_BEYOND = 2.0  # times the largest known distance, where there is matter beyond the box
 LEAST_LANDMARKS = 50  # sightings of landmarks in all views, for a box around them
 LANDMARKS_BEYOND = 0.05  # fraction of the landmarks, at either end of each axis, that may lie beyond the box
-LANDMARKS_NEARER = 0.01  # fraction of the landmarks that is disregarded where the nearest one is sought
+LANDMARKS_NEARER = 0.01  # fraction of the landmarks that is disregarded when the nearest one is determined
 ROOM = 4.0  # assumed range of a hand-held camera's view, in multiples of the extent of its positions
 
-ONE_PLACE = 1.0  # extent (scene units) that is assumed of the positions where all of them are the same
+ONE_PLACE = 1.0  # extent (scene units) assumed for the positions where all of them coincide
 
 
 def estimate_bounds(
@@ -35,13 +35,14 @@ def estimate_bounds(
 ) -> SceneBounds:
     """Return the box that holds what ``views`` (poses in the world) show, and its range of distances from their cameras.
 
-    With depth (dense in half of the views, or any where there are no silhouettes) the box holds the middle 99.8 % of the
+    With depth (dense in half of the views, or any if there are no silhouettes) the box holds the middle 99.8 % of the
     measured points along each axis. With silhouettes (alpha) it is that of the visual hull. With colour only, it holds the
     middle 90 % of the landmarks that the views see. Without landmarks it is a guess: for cameras that look inward, a cube
     around the point they look at, as large as what an image shows there; for others (a room), the box of the cameras and of
     what they see within ``ROOM`` times the extent of their positions. Unless half of the views have dense depth or
-    silhouettes, there may be matter beyond the box, and the scene is contracted. Images from exactly one place show no
-    scale, and ``ONE_PLACE`` stands for it. Raises ``InputError`` where there are no views.
+    silhouettes, there may be matter beyond the box, and the scene is contracted. Images from exactly one place do not
+    determine a scale; the extent of their positions is then taken to be ``ONE_PLACE``. Raises ``InputError`` where there are
+    no views.
     """
     if not views:
         raise InputError("scene bounds: no views to estimate them from")
@@ -97,7 +98,7 @@ def _landmark_points(view: View) -> Float[Tensor, "n 3"]:
 
 
 def _measured_box(views: Sequence[View], margin: float) -> tuple[AxisBox, float]:
-    """Return the box of the measured points, and half the least distance of one from its camera; both without outliers."""
+    """Return the box of the measured points, and half the smallest distance from a camera to a point; both without outliers."""
     share = max(POINTS_OF_VIEW, POINTS // len(views))
     parts = [measured_points(view, share) for view in views]
     points, distances = torch.cat([p for p, _ in parts]), torch.cat([d for _, d in parts])

@@ -22,7 +22,7 @@ def grown(
 ) -> AxisBox:
     """Return the box with a margin of ``share`` of its size at each end, and of ``at_least`` metres where that is more.
 
-    A flat box gets some thickness.
+    A flat box is given some thickness.
     """
     size = upper - lower
     margin = torch.maximum(size * share, size.amax() * 0.01).clamp(min=at_least)

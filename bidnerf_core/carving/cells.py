@@ -1,4 +1,4 @@
-"""Carving: cells of a box are emptied where views see through them. A cell is judged by the sphere around it."""
+"""Carving: cells of a box are emptied where views see through them. A cell is represented by the sphere around it."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.voxel_grid import VoxelGrid
 
 BLOCK = 8
-"""Cells along the side of a block. A block that a view does not see costs that view next to nothing."""
+"""Cells along the side of a block. A block that a view does not see costs next to nothing to process for that view."""
 BLOCKS_AT_ONCE = 128
 """Blocks that are processed together: few enough to stay in the cache."""
 SENSOR_TOLERANCE = 0.05
-"""Relative error of depth that training allows for: sensors err by a few per cent, and an emptied cell is lost."""
+"""Relative depth error that training allows for: sensors err by a few per cent, and an emptied cell is never filled again."""
 
 
 def occupied_voxels(
     views: Sequence[View], grid: VoxelGrid, tolerance: float = SENSOR_TOLERANCE
 ) -> Bool[Tensor, "x y z"]:
-    """Return which cells of ``grid`` may hold matter, see ``occupied_cells``. Contracted cells are not judged: they may."""
+    """Return which cells of ``grid`` may hold matter, see ``occupied_cells``. Contracted cells always may."""
     if grid.contracted is not None:
         return _within_contraction(views, grid, grid.contracted, tolerance)
     return occupied_cells(views, grid.lower, grid.upper, grid.shape, tolerance)
@@ -36,7 +36,7 @@ def occupied_voxels(
 def _within_contraction(
     views: Sequence[View], grid: VoxelGrid, bounds: SceneBounds, tolerance: float
 ) -> Bool[Tensor, "x y z"]:
-    """Judge the inner half of a grid of contracted space, which is the cube around the box. Its shape is divisible by 4."""
+    """Carve the inner half of a grid of contracted space, the cube around the box. The grid's shape is divisible by 4."""
     held = torch.ones(grid.shape, dtype=torch.bool)
     inner = VoxelGrid.cube(replace(bounds, contracted=False), grid.shape[0] // 2)
     quarter = grid.shape[0] // 4
@@ -70,13 +70,13 @@ def occupied_cells(
         for rows in (seen & undecided).nonzero()[:, 0].split(BLOCKS_AT_ONCE):
             points = (firsts[:, rows, None] + within[:, None, :]).flatten(1)
             freed = space.frees(points, grid.cell_radius).unflatten(0, (-1, BLOCK**3))
-            votes[rows] = (votes[rows] + freed).clamp(max=needed)  # a byte is soon full
+            votes[rows] = (votes[rows] + freed).clamp(max=needed)  # a byte would overflow with many views
             undecided[rows] = (votes[rows] < needed).any(dim=1)
     return grid.assembled(votes < needed)
 
 
 class _Blocks:
-    """The cells of a box in blocks of equally many, which together may reach beyond it."""
+    """The cells of a box, in blocks of equal numbers of cells; the blocks may reach beyond the box."""
 
     def __init__(self, lower: Corner, upper: Corner, shape: tuple[int, int, int]) -> None:
         self.shape = shape
@@ -88,7 +88,7 @@ class _Blocks:
         self.block_radius = self.cell_radius * BLOCK
 
     def middles(self, T_world_camera: SE3) -> tuple[Float[Tensor, "3 b"], Float[Tensor, "3 c"]]:
-        """Return the centre of each block's first cell and the offsets of its cells from there (metres, camera frame)."""
+        """Return the centre of each block's first cell, and the offsets of a block's cells from it (metres, camera frame)."""
         T_camera_world = T_world_camera.to(torch.float64).inverse()  # the world's origin may be far away
         first = T_camera_world.apply(self.lower + self.size / 2)[:, None]
         step = T_camera_world.rotation * self.size
@@ -96,7 +96,7 @@ class _Blocks:
         return (first + step @ (self.blocks * BLOCK).double()).float(), within.float()
 
     def assembled(self, values: Bool[Tensor, "b c"]) -> Bool[Tensor, "nx ny nz"]:
-        """Return the blocks' values as one array, cut off where the box ends."""
+        """Return the blocks' values as one array, cropped to the box."""
         whole = values.reshape(*self.counts, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5)
         nx, ny, nz = self.shape
         return whole.reshape([count * BLOCK for count in self.counts])[:nx, :ny, :nz].contiguous()

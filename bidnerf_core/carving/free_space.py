@@ -1,6 +1,6 @@
-"""The free space of a view: how far each of its pixels sees no matter, and which spheres lie wholly within that space.
+"""The free space of a view: how far each of its pixels sees no matter, and which spheres lie entirely within that space.
 
-In doubt space counts as occupied: where nothing was measured, and wherever a neighbouring pixel sees less far.
+In doubt, space counts as occupied: where nothing was measured, and wherever a neighbouring pixel sees less far.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame, View
 
 LONGEST_SIDE = 400
-"""Images are shrunk (by whole factors) to at most this many pixels: cells are coarse, and time is bounded."""
+"""Images are shrunk (by whole factors) to at most this many pixels a side: cells are coarse, and this bounds the time."""
 
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """The depth up to which a view is free. Level k holds the least such depth (planar z) within k pixels of each pixel."""
+    """The depth up to which a view is free. Level k holds the smallest such depth (planar z) within k pixels of each pixel."""
 
     intrinsics: Intrinsics  # of the shrunken image
     levels: Float[Tensor, "k h w"]  # metres; 0: unknown
-    reach: float  # metres: the largest depth of all
+    reach: float  # metres: the largest free depth of any pixel
     edges: Float[
         Tensor, "4 3"
-    ]  # inward normals of planes through the camera's centre that hold all of the view
+    ]  # inward normals of planes through the camera's centre that enclose all of the view
 
     @staticmethod
     def seen_by(view: View, tolerance: float = 0.02, footprint: int = 8) -> FreeSpace:
@@ -42,12 +42,12 @@ class FreeSpace:
         return FreeSpace(camera, torch.stack(levels), free.amax().item(), _edges(view.frame.intrinsics))
 
     def may_free(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
-        """Return whether the view sees any of the sphere around each point (camera frame) before its farthest depth."""
+        """Return whether the view sees any part of the sphere around each point (camera frame) within its free depth."""
         in_sight = (self.edges @ points > -radius).all(dim=0)
         return in_sight & (points[2] > -radius) & (points[2] - radius < self.reach)
 
     def frees(self, points: Float[Tensor, "3 n"], radius: float) -> Bool[Tensor, "n"]:
-        """Return whether all of the sphere of ``radius`` metres around each point (camera frame, metres) is free."""
+        """Return whether the whole sphere of ``radius`` metres around each point (camera frame, metres) is free."""
         deepest = points[2] + radius
         columns, rows, pixels = self._footprint(points, radius)
         count, height, width = self.levels.shape
@@ -55,7 +55,7 @@ class FreeSpace:
         known &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
         place = (
             pixels * height + rows
-        ) * width + columns  # whole floats, exact: there are less than 2^24 of them
+        ) * width + columns  # integers in floats are exact, since there are fewer than 2^24 of them
         least = self.levels.flatten()[torch.where(known, place, 0).long()]
         return known & (deepest < least)
 
@@ -65,18 +65,18 @@ class FreeSpace:
         inverse = 1 / points[2]
         x, y = points[0] * inverse, points[1] * inverse
         squared = x * x + y * y  # of the tangent of the angle to the axis
-        slope = radius * inverse  # tangent of the sphere's angular radius, next line
+        slope = radius * inverse  # becomes the tangent of the sphere's angular radius in the next line
         slope = slope * (1 + squared - slope * slope).rsqrt()
         product = squared.sqrt() * slope
         wide = (
             slope * (1 + squared) / (1 - product)
         )  # tan(a + b) - tan(a): the far side of the sphere's image
         pixels = (wide * max(camera.fx, camera.fy)).ceil()
-        pixels = torch.where(product < 1, pixels, torch.inf)  # and where it is NaN
+        pixels = torch.where(product < 1, pixels, torch.inf)  # also where it is NaN
         if not camera.distortion:
             return (x * camera.fx + camera.cx).floor(), (y * camera.fy + camera.cy).floor(), pixels
         u, v = camera.project(points.T).floor().unbind(-1)
-        # Distortion stretches a little; beyond the image its polynomial may fold back into the image.
+        # Distortion enlarges the footprint a little; outside the image, its polynomial may fold back into the image.
         return u, v, torch.where((self.edges @ points > 0).all(dim=0), (pixels * 1.25).ceil(), torch.inf)
 
 
@@ -85,13 +85,13 @@ def _free_depth(frame: Frame, tolerance: float) -> Float[Tensor, "h w"]:
     free = torch.zeros(frame.rgb.shape[:2])
     if frame.depth is not None:
         free = frame.depth.float() * (1 - tolerance)
-    if frame.alpha is not None:  # a pixel on an edge shows two depths and measures one
+    if frame.alpha is not None:  # a pixel on an edge covers two depths but has one measurement
         free = torch.where(frame.alpha >= 1, free, torch.where(frame.alpha <= 0, torch.inf, 0.0))
     return free
 
 
 def _shrunk(free: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "h2 w2"]:
-    """Return the least value of each block of pixels; a block that reaches beyond the edge is unknown."""
+    """Return the smallest value of each block of pixels; a block that reaches beyond the edge is unknown."""
     height, width = free.shape
     padded = functional.pad(free, (0, -width % factor, 0, -height % factor))
     return -functional.max_pool2d(-padded[None], factor)[0]
@@ -103,7 +103,7 @@ def _shrunk_camera(camera: Intrinsics, factor: int, free: Float[Tensor, "h w"]) 
 
 
 def _edges(camera: Intrinsics) -> Float[Tensor, "4 3"]:
-    """Return the planes through the smallest upright rectangle at z = 1 that holds the image's (distorted) border."""
+    """Return the inward normals of the planes through the axis-aligned bounding box, at z = 1, of the (distorted) border."""
     w, h = camera.width, camera.height
     along = torch.linspace(0, 1, 33, dtype=torch.float64)
     still = torch.zeros_like(along)

@@ -1,4 +1,4 @@
-"""The box of the visual hull: of what silhouettes, seen from many sides, leave room for."""
+"""The box of the visual hull: the space that is consistent with silhouettes seen from many sides."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from bidnerf_core.carving.cells import occupied_cells
 from bidnerf_core.frames import View
 
 HULL = (64, 64, 64)
-CARVING_ROUNDS = 3  # each in the box that the one before found
+CARVING_ROUNDS = 3  # each within the box that the previous one found
 HULL_WITNESSES = (0.5, 0.25, 0.1, 0.0)
-"""Thresholds on how many views see something at a cell, as fractions of the largest such number. Cells below are periphery:
-so few views see them that hardly any could have emptied them."""
+"""Thresholds on the number of views that see something at a cell, as fractions of the largest such number. Cells below it are
+periphery, which so few views see that hardly any could have emptied it."""
 EXPLAINED = 0.999  # fraction of the pixels with matter whose rays must meet the box
 RAYS_OF_VIEW = 500
 
 
 def has_outline(view: View) -> bool:
-    """Return whether the image shows background: alpha that is 1 everywhere carries no information."""
+    """Return whether the image shows background; alpha that is 1 everywhere carries no information."""
     return view.frame.alpha is not None and bool((view.frame.alpha <= 0).any())
 
 
 def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     """Return the box of the cells that no two views see through and at which many views see something.
 
-    The threshold on their number is the largest of ``HULL_WITNESSES`` for which the box still explains the silhouettes.
+    The threshold on that number is the largest of ``HULL_WITNESSES`` for which the box still explains the silhouettes.
     """
     origins, directions = _rays_to_matter(views)
     for _ in range(CARVING_ROUNDS):
@@ -48,7 +48,7 @@ def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
 
 
 def _rays_to_matter(views: Sequence[View]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return origins and directions (world) of the rays of a sample of the pixels whose alpha is over a half."""
+    """Return the origins and directions (world) of rays through a sample of the pixels whose alpha is over a half."""
     origins, directions = [], []
     for view in views:
         assert view.frame.alpha is not None  # it has an outline

@@ -1,4 +1,4 @@
-"""The command line: ``bidnerf COMMAND ...``, one file per command."""
+"""The command line ``bidnerf COMMAND ...``, with one module per command."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COMMANDS = {
 }
 
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
-"""Exit status; the last two are 128 and the number of the signal, as shells have it."""
+"""Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name = " ".join(["bidnerf", *[word for word in given[:1] if word in COMMANDS]])
     try:
         status = _guarded(name, given)
-        sys.stdout.flush()  # here, where a full disk can still be reported
+        sys.stdout.flush()  # flush here, where a full disk can still be reported
     except BrokenPipeError:
         _discard(sys.stdout)
         return READER_GONE
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _guarded(name: str, given: list[str]) -> int:
-    """Run a command; a user's mistake ends in one line instead of a traceback."""
+    """Run a command and return its exit status; a user's mistake is reported in one line instead of a traceback."""
     try:
         with _warnings_as_lines(name):
             return _dispatch(given)
@@ -59,7 +59,7 @@ def _guarded(name: str, given: list[str]) -> int:
         return _failed(name, "interrupted", INTERRUPTED)
     except BrokenPipeError:
         raise
-    except OSError as error:  # a full disk, a folder that may not be written
+    except OSError as error:  # a full disk, a folder without write permission
         where = f"{error.filename}: " if error.filename else ""
         return _failed(name, f"{where}{error.strerror or error}", BAD_INPUT)
     except InputError as error:
@@ -67,7 +67,7 @@ def _guarded(name: str, given: list[str]) -> int:
     except RuntimeError as error:
         if (
             type(error).__name__ != "OutOfMemoryError"
-        ):  # of torch, which is not imported here, so that --help is quick
+        ):  # an error of torch, which is not imported here, so that --help is quick
             raise
         return _failed(name, f"the GPU's memory is full, try --device cpu ({error})", BAD_INPUT)
 
@@ -92,7 +92,7 @@ def _dispatch(given: list[str]) -> int:
 
 @contextlib.contextmanager
 def _warnings_as_lines(name: str) -> Iterator[None]:
-    """Print each ``InputWarning`` as a line on stderr, without the place in the code that Python would name."""
+    """Print each ``InputWarning`` as one line on stderr, without the source line that Python would print."""
     with warnings.catch_warnings():
         others = warnings.showwarning
 
@@ -108,7 +108,7 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
 
 
 def _failed(name: str, message: str, status: int, more: str = "") -> int:
-    """Print why a command failed, or a warning, on one line, and return ``status``; a closed stderr does not change it."""
+    """Print why a command failed, or a warning, on one line, and return ``status``, even if stderr is closed."""
     with contextlib.suppress(OSError):
         print(f"{name}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
         print(more, end=more and "\n", file=sys.stderr, flush=True)
@@ -116,14 +116,14 @@ def _failed(name: str, message: str, status: int, more: str = "") -> int:
 
 
 def _open_streams() -> None:
-    """Replace streams that the shell closed (``>&-``), for which Python has None, by ones that discard everything."""
+    """Replace streams that the shell closed (``>&-``), which are None in Python, by ones that discard everything."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
 
 
 def _discard(stream: TextIO) -> None:
-    """Discard what is left in a stream's buffer, which would fail once more when Python ends."""
+    """Discard what is left in a stream's buffer, since flushing it when Python exits would fail again."""
     with contextlib.suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())

@@ -1,4 +1,4 @@
-"""Whether images show another scene than that of the map, by what became of all of them."""
+"""The suspicion that images show a scene other than that of the map, from the outcomes of all of them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ RECOGNISED = {
 }  # fmt: skip
 """Outcomes of images that show the scene."""
 SEVERAL = 3
-"""Least number of images that all have to be rejected for the map to be doubted."""
+"""Minimum number of images, all of them rejected, at which the user is asked whether the map is the right one."""
 
 
 def question_about_scene(answers: Collection[Localization]) -> str:
-    """Return a question to add to a summary if several images were all rejected, and none as one that shows the scene."""
+    """Return a question to append to a summary: empty unless there are several images and none was recognised."""
     if len(answers) < SEVERAL or any(map(_shows_scene, answers)):
         return ""
     return "; do they show the scene of this map?"
 
 
 def _shows_scene(answer: Localization) -> bool:
-    """Whether an image was recognised; one that is ambiguous was, if far more landmarks agree with its pose than by chance."""
+    """Return whether an image was recognised. An ambiguous one counts if far more landmarks fit its pose than by chance."""
     found = answer.diagnostics
     if answer.outcome is Outcome.AMBIGUOUS and isinstance(found, LandmarkDiagnostics):
         return found.inliers >= LandmarkThresholds().above_chance * found.chance

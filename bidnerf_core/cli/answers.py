@@ -1,4 +1,4 @@
-"""Where ``bidnerf localize`` puts its answers: stdout, a file of poses, and pictures."""
+"""The output of ``bidnerf localize``: stdout, a file of poses, and pictures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bidnerf_core.storage import Map
 
 TRANSFORMS = "transforms.json"
 WRITERS = {ending: write for ending, write in POSE_WRITERS.items() if ending != ".json"}
-"""Files of poses alone, by the ending of their names; ``.json`` is the list of what ``--json`` prints."""
+"""Writers of files that hold only accepted poses, by the ending of the name; ``.json`` lists what ``--json`` prints."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +57,14 @@ class Answer:
 
 @dataclass(frozen=True)
 class OutputSpec:
-    """The arguments that say what to do with answers."""
+    """The arguments for the output of answers."""
 
     out: Path | None = None
     draw: Path | None = None
     json: bool = False
 
     def prepare(self) -> None:
-        """Make the folder of pictures. Raises before any work where a name or a folder is of no use."""
+        """Make the folder of pictures. Raises, before any work is done, where a name or a folder cannot be used."""
         if self.out is not None:
             self._check_out(self.out)
         if self.draw is not None:
@@ -113,7 +113,7 @@ class Answers:
             write_file(file, bytes(iio.imwrite("<bytes>", picture, extension=".png")))
 
     def fail(self, name: str, method: str, error: InputError) -> None:
-        """Report a query that could not be localized; with ``--json``, as an object of the same keys as well."""
+        """Report a query that could not be localized; with ``--json``, also as an object with the usual keys."""
         self.failures += 1
         say(f"{name}: {error}")
         failure = {
@@ -126,9 +126,9 @@ class Answers:
             print_json(failure)
 
     def finish(self) -> None:
-        """Write the file of poses, and say how many of several queries converged.
+        """Write the file of poses, and print how many of several queries converged.
 
-        Raises ``InputError`` where no pose was accepted that a file of poses alone could hold, or a query failed.
+        Raises ``InputError`` if a file of accepted poses would be empty, or if a query failed.
         """
         accepted = [answer.posed for answer in self._given if answer.found.converged]
         if self._total > 1:
@@ -160,7 +160,7 @@ def _ending(path: Path) -> str:
 
 
 def show_in_full(answer: Answer) -> None:
-    """Print an answer in some lines: its errors where the truth is known, its uncertainty, the matrix."""
+    """Print an answer in several lines: its errors where the truth is known, its uncertainty, the matrix."""
     found = answer.found
     show(f"{answer.query.name}: {_verdict(found)} ({found.reason})")
     if answer.error is not None:
@@ -178,12 +178,12 @@ def show_in_full(answer: Answer) -> None:
 
 
 def _verdict(found: Localization) -> str:
-    """Return whether an answer is accepted; the outcome is what the page of troubleshooting explains."""
+    """Return the verdict in words; the troubleshooting page of the documentation explains each outcome."""
     return "converged" if found.converged else f"NOT converged: {found.outcome.value}"
 
 
 def show_in_short(answer: Answer) -> None:
-    """Print an answer in a line."""
+    """Print an answer in one line."""
     found, error = answer.found, answer.error
     known = "" if error is None else f"error {_shown(error)}; "
     took = f"{amount(found.steps, 'step')}, {found.seconds:.2f} s"
@@ -195,6 +195,6 @@ def _shown(error: PoseError) -> str:
 
 
 def _deviation(covariance: Tensor) -> str:
-    """Return one standard deviation by the method's own estimate."""
+    """Return the standard deviations of position and rotation, according to the method, as text."""
     translation, rotation = (float(part.sum().clamp(min=0).sqrt()) for part in covariance.diagonal().split(3))
     return f"{translation:.4f} m, {math.degrees(rotation):.3f} deg (one standard deviation)"

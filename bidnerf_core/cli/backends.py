@@ -29,13 +29,13 @@ def backends(json: Annotated[Flag, option(None, "print a JSON list", "")] = Fals
 
 
 def _summary(info: BackendInfo) -> str:
-    """Return what the module's docstring or the metadata says or, without these, what the backend itself says when imported."""
+    """Return the summary from the module's docstring or the metadata or, without these, from the imported backend itself."""
     if info.summary or info.fault:
         return info.summary
     try:
         return load_backend(info.name).summary
     except BackendError:
-        return ""  # loading it for use will report the fault
+        return ""  # the fault is reported when the backend is loaded for use
 
 
 def _row(info: BackendInfo) -> dict[str, str | None]:

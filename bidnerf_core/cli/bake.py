@@ -96,13 +96,14 @@ def bake_map(
     folder: Path, views: Sequence[View], config: BakeConfig, rendered_landmarks: bool = False,
     tracked: TrackedViews | None = None, device: torch.device | str = "cpu",
 ) -> None:  # fmt: skip
-    """Bake the surface and the landmarks of the map in ``folder``; ``tracked`` if the views' keypoints were tracked already.
+    """Bake the surface and the landmarks of the map in ``folder``.
 
-    Views with measured depth take the place of rendered ones for the surface, and all ``views`` give landmarks. Without
-    views, landmarks come from images that the field renders, unless the map has landmarks of photos, which are kept where
-    ``rendered_landmarks`` does not ask for others. Images are rendered on ``device``.
+    For the surface, views with measured depth replace rendered ones; landmarks are built from all ``views``. ``tracked`` holds
+    the views' keypoints if they were tracked already. Without views, landmarks are built from images that the field renders,
+    unless the map has landmarks of photos: these are kept unless ``rendered_landmarks`` is set. Images are rendered on
+    ``device``.
     """
-    stored = load_map(folder, device, baked=False)  # its parts may be damaged, and are to be replaced
+    stored = load_map(folder, device, baked=False)  # its baked parts may be damaged, and are replaced anyway
     places = [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     cameras = cameras_of(stored.info) or places
     if not cameras:
@@ -113,7 +114,7 @@ def bake_map(
     if not views and not rendered_landmarks and _has_photo_landmarks(folder, stored.info):
         say(f"{folder}: the landmarks of its photos are kept; --rendered-landmarks replaces them")
         return
-    # Photos alone show how well the field renders; against its own images it has no error.
+    # Only photos show how well the field renders; against its own images it has no error.
     noise = colour_noise(stored.field, stored.bounds, views) if views else stored.colour_noise
     source: LandmarkSource = "photos" if views else "rendered images"
     images = views or rendered_views(stored.field, stored.bounds, cameras)
@@ -138,7 +139,7 @@ def _bake_surface(
     began = time.monotonic()
     measured = [view for view in views if view.frame.has_depth]
     if not any(view.frame.has_dense_depth for view in measured):
-        measured = []  # a few points are no surface
+        measured = []  # a few points do not make a surface
     cameras = [] if measured else cameras
     with counted("baking", "views") as report:
         surface = bake(stored.field, stored.bounds, cameras, measured, config, report)
@@ -155,16 +156,16 @@ def _bake_landmarks(
     folder: Path, stored: Map, views: Sequence[View], noise: float | None, source: LandmarkSource,
     tracked: TrackedViews | None,
 ) -> None:  # fmt: skip
-    """Build landmarks of the views, and record what photos are fit for.
+    """Build landmarks from the views and, if these are photos, store the record of their capture.
 
-    A scene without texture has no landmarks, and the surface alone then serves.
+    A scene without texture has no landmarks; localization then relies on the surface alone.
     """
     began = time.monotonic()
     if tracked is None:
         with counted("landmarks", "steps") as report:
             tracked = tracked_views(views, progress=report)
     if source == "photos" and not stored.info.distances:
-        tracked = tracked.at_distance(stored.bounds.side / 2)  # they still tell directions
+        tracked = tracked.at_distance(stored.bounds.side / 2)  # the directions are still informative
     trial = HeldOutTrial()
     try:
         landmarks = tried_landmarks(tracked, views, report=say)
@@ -172,8 +173,8 @@ def _bake_landmarks(
         say(f"{folder}: no landmarks: {error}")
     else:
         trial = landmarks.trial
-        # New poses are compared with others of the source of the given ones. Where training kept those, all but some wrong ones,
-        # they have no errors to speak of.
+        # New poses are compared with others from the source of the given ones. If training kept those, except for some wrong
+        # ones, their errors are negligible.
         by_source = update_scatter([camera.update for camera in stored.info.cameras])
         landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)
         save_landmarks(folder, stored.info, landmarks, noise, source)
@@ -188,7 +189,7 @@ def _bake_landmarks(
 def _record_capture(
     folder: Path, info: MapInfo, tracked: TrackedViews, views: Sequence[View], trial: HeldOutTrial
 ) -> None:
-    """Store what the photos are fit for, and summarise it."""
+    """Store the record of the capture, and print a summary of it."""
     capture = surveyed(tracked, views, trial=trial)
     save_capture(folder, info, capture)
     for line in summary(capture):

@@ -1,4 +1,4 @@
-"""The options that give the cameras of images which have none in their format."""
+"""The options for the cameras of images whose format has none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bidnerf_core.datasets import DepthRegistration
 from bidnerf_core.depth_sensor import DEPTH_SENSORS
 
 NO = "no"
-"""The value of ``--register-depth`` that takes depth as it is."""
+"""The value of ``--register-depth`` for which depth is used as it is."""
 
 one_camera = tyro.conf.create_mutex_group(
     required=False,
@@ -57,5 +57,5 @@ DepthSensorName = Annotated[str, option("NAME", "what measured the depth: " + ",
 
 
 def depth_registration(given: str | None) -> DepthRegistration | None:
-    """Return what ``--register-depth`` says."""
+    """Return the depth registration that ``--register-depth`` selects."""
     return None if given is None else False if given == NO else Path(given)

@@ -1,4 +1,4 @@
-"""Parsing, messages, and output folders, which several commands share."""
+"""Parsing, messages, and output folders, shared by several commands."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from bidnerf_core.datasets import Dataset
     from bidnerf_core.frames import View
 else:
-    Dataset = View = Any  # their modules import torch, which commands such as 'backends' do without
+    Dataset = View = Any  # their modules import torch, which commands such as 'backends' do not need
 
 _T = TypeVar("_T")
 
@@ -42,14 +42,14 @@ LARGEST_SEED = 2**31 - 1
 
 
 class _Progress(Console):
-    """A console that falls silent when its reader goes away, so that work goes on."""
+    """A console that becomes silent when its reader goes away, so that work continues."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
 
 
 console = _Progress(stderr=True, highlight=False, soft_wrap=True)
-"""Where all goes that is not the result: progress, remarks, errors."""
+"""The console for everything but the result: progress, remarks, errors."""
 
 
 class UsageError(InputError):
@@ -59,7 +59,7 @@ class UsageError(InputError):
 
 
 def option(metavar: str | None, help: str, default: str | None = None) -> Any:
-    """Describe an option for the help page; ``default`` says in words what a value such as None stands for."""
+    """Describe an option for the help page; ``default`` explains in words a default value such as None."""
     hint = None if default is None else default and f"(default: {default})"
     return tyro.conf.arg(metavar=metavar, help=help, help_behavior_hint=hint)
 
@@ -77,7 +77,7 @@ Names: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAct
 def parse(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
     """Call ``function`` with the parsed arguments; wrong usage ends the program with status 2.
 
-    ``--help`` shows the options but for settings that are marked ``EXPERT``, and ``--help-all`` shows all of them.
+    ``--help`` shows all options except settings that are marked ``EXPERT``, and ``--help-all`` shows those as well.
     """
     if "--help-all" in arguments:
         return _show_help(command, function, 0)
@@ -88,7 +88,7 @@ def parse(command: str, function: Callable[..., _T], arguments: list[str]) -> _T
 
 def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
     odd = any(printable(word) != word for word in arguments)
-    # The parser repeats the arguments in its messages, and may colour them; words that could control the terminal must not.
+    # The parser repeats the arguments in its messages, which may be coloured, but must not let them control the terminal.
     with contextlib.redirect_stderr(PrintableStream(sys.stderr)) if odd else contextlib.nullcontext():
         return tyro.cli(
             function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,)
@@ -107,7 +107,7 @@ def _show_help(command: str, function: Callable[..., _T], hidden: int) -> _T:
 
 
 def _of_finite_settings(function: Callable[..., _T]) -> Callable[..., _T]:
-    """Return the function with a check that its settings are finite, which a training would fail on hours later."""
+    """Return the function with a check that its settings are finite: training would otherwise fail hours later."""
 
     @functools.wraps(function)
     def checked(*arguments: Any, **options: Any) -> _T:
@@ -139,7 +139,7 @@ def show(line: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print one line of strict JSON, whole or not at all."""
+    """Print one line of strict JSON, completely or not at all."""
     sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
 
 
@@ -152,13 +152,13 @@ def print_table(table: Table) -> None:
     ]
     with (
         screen.capture() as drawn
-    ):  # written below, since rich handles a reader that goes away in its own way
+    ):  # written below, since rich has its own way of handling a reader that goes away
         screen.print(Segments(parts), end="")
     sys.stdout.write(drawn.get())
 
 
 def require(what: str, value: float, least: float, most: float = math.inf) -> None:
-    """Check a number of the command line. Raises ``UsageError`` where it is not in the range."""
+    """Check a number from the command line. Raises ``UsageError`` where it is out of range."""
     if not least <= value <= most:
         expected = f"{least} or more" if most == math.inf else f"{least} to {most}"
         raise UsageError(f"{what} is {value}, expected {expected}")
@@ -172,7 +172,7 @@ def require_different(what: str, names: Sequence[str]) -> None:
 
 
 def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None) -> list[View]:
-    """Read views of a split, and show the progress where they are many. Raises ``InputError`` for an empty split."""
+    """Read views of a split, with a progress display if they are many. Raises ``InputError`` for an empty split."""
     total = len(dataset.frame_names(split)) if names is None else len(names)
     if total == 0:
         raise InputError(f"{dataset.path}: split {split!r} has no frames")
@@ -189,15 +189,15 @@ def read_views(dataset: Dataset, split: str, names: Sequence[str] | None = None)
 
 
 class FolderInUse(InputError):
-    """Another process writes into the folder."""
+    """Another process is writing into the folder."""
 
 
 @contextlib.contextmanager
 def output_folder(out: Path, overwrite: bool) -> Iterator[None]:
     """Create a folder, and check before hours of work that it can be written and that no other process writes into it.
 
-    A folder that is not empty is refused unless ``overwrite`` is set. If the work fails before anything is in the folder, it
-    is removed again, with the parents that were made for it. Raises ``InputError``.
+    A folder that is not empty is rejected unless ``overwrite`` is set. If the work fails before anything is in the folder, the
+    folder is removed again, with the parents that were created for it. Raises ``InputError``.
     """
     _check_free(out, overwrite)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
@@ -206,7 +206,7 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[None]:
         with locked(out):
             _check_free(out, overwrite)  # another process may have finished meanwhile
             yield
-    except FolderInUse:  # the folder is the other's to remove
+    except FolderInUse:  # the folder belongs to the other process
         raise
     except BaseException:
         with contextlib.suppress(OSError):  # not empty, or never made
@@ -217,9 +217,9 @@ def output_folder(out: Path, overwrite: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a lock on a folder, which the system releases even where the process is killed.
+    """Hold a lock on a folder, which the system releases even if the process is killed.
 
-    Raises ``FolderInUse`` where another process holds it. File systems without locks, and Windows, do without.
+    Raises ``FolderInUse`` where another process holds it. On Windows, and on file systems without locks, nothing is locked.
     """
     if sys.platform == "win32":
         yield
@@ -247,7 +247,7 @@ def _check_free(out: Path, overwrite: bool) -> None:
 
 
 def _is_leftover(file: Path) -> bool:
-    """Return whether a process that was killed left the file behind before there was a whole map."""
+    """Return whether the file was left behind by a process that was killed before the map was complete."""
     from bidnerf_core.storage import DESCRIPTION, OURS
 
     of_map = OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
@@ -268,7 +268,7 @@ def _make_writable(out: Path) -> None:
 
 @contextlib.contextmanager
 def wrong_usage() -> Iterator[None]:
-    """Turn an ``InputError`` into a ``UsageError``: the arguments are wrong, whatever the files hold."""
+    """Turn an ``InputError`` into a ``UsageError``, where the arguments are wrong whatever the files contain."""
     try:
         yield
     except InputError as error:
@@ -276,7 +276,7 @@ def wrong_usage() -> Iterator[None]:
 
 
 def value_of(option: str, arguments: Sequence[str]) -> str | None:
-    """Return the value of an option, on which the parser itself depends; the last one counts, as for the parser."""
+    """Return the value of an option on which the parser itself depends; the last occurrence counts, as for the parser."""
     found = None
     for place, argument in enumerate(arguments):
         if argument.startswith(option + "="):

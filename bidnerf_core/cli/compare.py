@@ -152,7 +152,7 @@ def _write(found: Comparison, out: Path) -> None:
     try:
         comparison_figure([out / "compare.png", out / "compare.svg"], found)
         say(f"look at {out / 'compare.png'}")
-    except InputError as error:  # matplotlib is an extra
+    except InputError as error:  # matplotlib is optional
         say(str(error))
 
 
@@ -203,4 +203,4 @@ LINES: dict[str, Callable[[MapRow], str]] = {
     "samples a ray": lambda row: f"{row.samples_per_ray:.1f}",
     "map, MiB": lambda row: f"{row.map_bytes / 2**20:.1f}",
 }
-"""The lines of the table by name; each map has a column."""
+"""The rows of the table, by name; each map has a column."""

@@ -50,13 +50,13 @@ from bidnerf_core.training import TrainingStopped
 PHOTO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 TRAINING_VIEWS, RADIUS = 60, 3.5
 START_ERROR = (0.55, 13.0)  # scene units (the object fills a 2x2x2 cube) and degrees
-DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # quicker than the defaults, for small images
+DESCENT = {"rays": 768, "max_steps": 150, "decay_steps": 60}  # faster than the defaults, for small images
 ANIMATED = 14  # frames of the animation
 
 
 @dataclass(frozen=True, eq=False)
 class DemoTrial:
-    """An unseen frame, a start that is far off, and what two methods find: one without the start, one from it."""
+    """An unseen frame, a start that is far off, and the answers of two methods: one without the start, one from it."""
 
     view: View
     start: SE3
@@ -65,7 +65,7 @@ class DemoTrial:
 
     @property
     def trace(self) -> PoseError:
-        """Errors of the start and after each step from it."""
+        """The errors at the start and after each step from it."""
         return self.off(self.from_start.poses)
 
     def off(self, poses: SE3) -> PoseError:
@@ -159,13 +159,13 @@ def _draw(stored: Map, trials: Sequence[DemoTrial], out: Path) -> None:
     try:
         convergence_plot(out / "convergence.png", {t.view.frame.name: t.trace for t in trials})
         drawn.append("convergence.png")
-    except InputError as error:  # matplotlib is an extra
+    except InputError as error:  # matplotlib is optional
         say(str(error))
     show(f"look at {', '.join(str(out / name) for name in drawn)}")
 
 
 def _overlay(painter: Painter, trial: DemoTrial) -> UInt8[np.ndarray, "H W 3"]:
-    """Return two rows: what is found without a start, and from one."""
+    """Return two rows of pictures: the pose found without a start, and that found from one."""
     auto, bid = trial.without_start.T_world_camera, trial.from_start.T_world_camera
     rows = (
         painter.row(painter.observed, "observed", auto, "found by auto, no start"),
@@ -175,5 +175,5 @@ def _overlay(painter: Painter, trial: DemoTrial) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _moments(steps: int) -> list[int]:
-    """Return the steps to show, close together at the beginning, where most happens."""
+    """Return the steps to show, which are close together at the beginning, where most happens."""
     return sorted({round(steps * (i / (ANIMATED - 1)) ** 2) for i in range(ANIMATED)})

@@ -1,4 +1,4 @@
-"""What a command says about the depth of an image whose sensor was named."""
+"""The remark that commands print on the depth of an image whose sensor was named."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from bidnerf_core.localization import AutoConfig
 
 
 def depth_remark(frame: Frame, settings: Any) -> str | None:
-    """Return a line that compares the noise estimated from a depth image with that of its sensor.
+    """Return one line that compares the noise estimated from a depth image with that of its sensor.
 
-    None where the settings name no sensor, and where the image does not tell its noise.
+    Returns None where the settings name no sensor, and where the noise cannot be estimated from the image.
     """
     sensor = settings.depth_sensor if isinstance(settings, AutoConfig) else AutoConfig.depth_sensor
     if sensor == AutoConfig.depth_sensor or frame.depth is None or not frame.has_depth:

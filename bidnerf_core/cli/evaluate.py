@@ -109,7 +109,7 @@ def run(arguments: list[str]) -> None:
     ) -> None:
         """Localize many frames from perturbed starts, or from none, and write one JSON line per trial.
 
-        Finished trials are kept whatever happens: the same command goes on where it stopped. 'bidnerf report' makes tables
+        Finished trials are kept whatever happens: the same command resumes where it stopped. 'bidnerf report' makes tables
         and figures of the results.
         """
         _check(trials, seed, images, angle, workers, shards, shard)
@@ -153,7 +153,7 @@ def _evaluate(trials: list[Trial], out: Path, workers: int | None, dask: str | N
 
 
 def _note_unchecked(trials: list[Trial], file: ResultsFile, out: Path) -> None:
-    """Say how many results cannot be compared with the present images, because an earlier version wrote them."""
+    """Print how many results cannot be checked against the present images, because an earlier version wrote them."""
     known = [file.results.get(key_of(trial)) for trial in trials]
     count = sum(result is not None and result.inputs is None for result in known)
     if count:
@@ -178,7 +178,7 @@ def _run(todo: list[Trial], file: ResultsFile, executor: Executor, without_motio
 def _executor(
     workers: int | None, dask: str | None, trials: int, on_cpu: bool
 ) -> Iterator[tuple[Executor, int, str]]:
-    """Yield an executor, the number of trials to give it at once, and its description."""
+    """Yield an executor, the number of trials to run on it at once, and its description."""
     if dask is not None:
         if workers is not None:
             raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
@@ -203,7 +203,7 @@ def cores() -> int:
 
 
 def _sizes(given: tuple[str, ...]) -> tuple[Size, ...] | None:
-    """Return sizes from numbers as 0.5 or 0.2:10; none where none was given."""
+    """Return sizes from words such as 0.5 or 0.2:10; None where none was given."""
     try:
         return tuple(tuple(float(number) for number in size.split(":")) for size in given) or None
     except ValueError as error:
@@ -211,7 +211,7 @@ def _sizes(given: tuple[str, ...]) -> tuple[Size, ...] | None:
 
 
 def _faults(given: Names) -> tuple[str, ...]:
-    """Return the faults to try; images as they are where none is given."""
+    """Return the faults to try; without any given, only images as they are."""
     with wrong_usage():
         return expand_faults(word for group in given for word in group) or (NO_FAULT,)
 

@@ -1,4 +1,4 @@
-"""``bidnerf track --follow``: frames that come one by one, from a folder that is watched or as JSON lines on stdin."""
+"""``bidnerf track --follow``: frames that arrive one by one, in a watched folder or as JSON lines on stdin."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from bidnerf_core.serialization import LARGEST_NUMBER
 
 STDIN = "-"
 POLL = 0.05
-"""Seconds between two looks into a watched folder."""
+"""Seconds between two checks of a watched folder."""
 STEADY = 2
-"""The number of looks for which a file's size has to stay the same before it is read: others may be writing it."""
+"""Number of checks for which a file's size has to stay the same before it is read, since it may still be being written."""
 KEYS = {"image", "depth", "time", "depth_unit"}
 
 
@@ -32,13 +32,13 @@ class FrameRequest:
     image: Path
     depth: Path | None = None
     time: float | None = None  # seconds
-    depth_unit: float | None = None  # metres a step
+    depth_unit: float | None = None  # metres per step
 
     @staticmethod
     def parse(line: str) -> FrameRequest:
-        """Return the request of a line ``{"image": path, "depth": path, "time": s}``, of which only the image is required.
+        """Return the request in a line ``{"image": path, "depth": path, "time": s}``, of which only the image is required.
 
-        Raises ``InputError`` for what is not such an object.
+        Raises ``InputError`` for anything that is not such an object.
         """
         expected = 'expected {"image": path, "depth": path, "time": seconds}'
         try:
@@ -58,20 +58,20 @@ class FrameRequest:
         )  # fmt: skip
 
     def read(self, camera: GivenCamera, background: Background) -> Frame:
-        """Read the image and its depth. Raises ``InputError`` where they are not readable or the camera is not known."""
+        """Read the image and its depth. Raises ``InputError`` if they are not readable or the camera is not known."""
         return camera.read(self.image, self.depth, self.depth_unit, background)
 
 
 def requests(source: str) -> Iterator[FrameRequest | InputError]:
-    """Yield frames as they come: lines of stdin up to its end, or the images of a folder for as long as nobody stops it.
+    """Yield frames as they arrive: lines of stdin until it ends, or the images of a folder until the program is stopped.
 
-    A line that is no request is yielded as the error to answer it with.
+    A line that is not a request is yielded as the error with which to answer it.
     """
     return _lines() if source == STDIN else _arriving(Path(source))
 
 
 def _lines() -> Iterator[FrameRequest | InputError]:
-    for line in iter(sys.stdin.readline, ""):  # iterating over stdin itself would wait for a whole block
+    for line in iter(sys.stdin.readline, ""):  # iterating over stdin itself would wait for a full buffer
         if not line.strip():
             continue
         try:
@@ -81,7 +81,7 @@ def _lines() -> Iterator[FrameRequest | InputError]:
 
 
 def _arriving(folder: Path) -> Iterator[FrameRequest]:
-    """Yield the images of a folder in the natural order of their names, and those that come later as they come."""
+    """Yield the images of a folder in the natural order of their names, and later ones as they arrive."""
     if not folder.is_dir():
         raise InputError(
             f"{folder}: no such folder, expected one that images come into, or {STDIN} for stdin"
@@ -93,14 +93,14 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
         for photo in waiting:
             depth = next((file for file in depths if file.name.startswith(f"{photo.stem}.")), None)
             if not all(_is_steady(file, sizes) for file in (photo, depth) if file is not None):
-                break  # the order is that of the names
+                break  # later names have to wait, to keep the order of names
             given.add(photo)
             yield FrameRequest(photo, depth)
         clocks.sleep(POLL)
 
 
 def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
-    """Return whether the size of a file has stayed the same for some looks."""
+    """Return whether the size of a file has stayed the same for ``STEADY`` checks."""
     try:
         size = file.stat().st_size
     except OSError:

@@ -1,4 +1,4 @@
-"""Help pages: wrapped to the terminal, grouped as the settings are, and without what only experts need."""
+"""Help pages: wrapped to the terminal, grouped like the settings, and without options that only experts need."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _T = TypeVar("_T")
 
 
 def without_expert_settings(function: Callable[..., _T]) -> tuple[Callable[..., _T], int]:
-    """Return a function for whose options a help page is short, and the number of the options that it leaves out.
+    """Return a function without the options for experts, for a short help page, and the number of options left out.
 
-    Settings are the parameters whose default is a dataclass. The parser removes what it is to hide, so this function is
-    for the page alone: arguments are parsed with ``function`` itself.
+    Settings are the parameters whose default is a dataclass. The parser removes hidden options altogether, so the returned
+    function is only for the page: arguments are parsed with ``function`` itself.
     """
     signature, hints, left_out = inspect.signature(function), dict(function.__annotations__), 0
     parameters = dict(signature.parameters)
@@ -44,7 +44,7 @@ def without_expert_settings(function: Callable[..., _T]) -> tuple[Callable[..., 
 
 
 def _short(settings: Any) -> tuple[Any, int]:
-    """Return the same settings as an instance of a type that hides those for experts, and the number of these."""
+    """Return the same settings as an instance of a type that hides those for experts, and the number of hidden settings."""
     kind, hidden = type(settings), 0
     hints = typing.get_type_hints(kind, include_extras=True)
     notes, values = dict[str, Any](), dict[str, Any]()
@@ -66,23 +66,23 @@ def _short(settings: Any) -> tuple[Any, int]:
 
 
 class Page(io.StringIO):
-    """A help page as the parser prints it, which leaves running text and usage on one long line each."""
+    """A help page as printed by the parser, in which running text and usage are one long line each."""
 
-    def isatty(self) -> bool:  # what decides on colours
+    def isatty(self) -> bool:  # determines whether the page has colours
         return sys.__stdout__ is not None and sys.__stdout__.isatty()
 
     @property
-    def encoding(self) -> str:  # type: ignore[override]  # what decides on the lines of boxes
+    def encoding(self) -> str:  # type: ignore[override]  # determines the characters of boxes
         return getattr(sys.__stdout__, "encoding", None) or "ascii"
 
     def wrapped(self, width: int) -> str:
-        """Return the page with lines of ``width`` characters at most, and short headings."""
+        """Return the page with lines of at most ``width`` characters, and short headings."""
         lines = [_quoted(_headed(line.rstrip())) for line in self.getvalue().splitlines()]
         return "".join(f"{_wrapped(line, width)}\n" for line in lines)
 
 
 def _headed(line: str) -> str:
-    """Return the head of a box without the names of the outer groups: ``config.by-colour.steps options``."""
+    """Return the heading of a box without the names of outer groups: ``steps`` for ``config.by-colour.steps options``."""
     found = re.search(r"\bconfig\.([\w-]+\.)*(?=[\w-]+ options )", line)
     if found is None:
         return line
@@ -91,7 +91,7 @@ def _headed(line: str) -> str:
 
 
 def _quoted(line: str) -> str:
-    """Return a line with plain quotes in place of the double backticks of docstrings, and boxes as wide as before."""
+    """Return a line with plain quotes instead of the double backticks of docstrings, padded to keep the boxes' width."""
     cells = re.split(r"([│|])", line)
     return "".join(cell.replace("``", "'") + " " * cell.count("``") for cell in cells).rstrip()
 

@@ -50,7 +50,7 @@ def info(
 
 
 def _draw(folder: Path, stored: Map, capture: CaptureReport | None, out: Path) -> None:
-    """Draw the capture from above. Raises ``InputError`` where the map has no record of it."""
+    """Draw the capture from above. Raises ``InputError`` if the map has no record of it."""
     if capture is None:
         raise InputError(
             f"{folder}: has no record of its photos to draw; 'bidnerf bake MAP --data DATA' makes one"
@@ -63,7 +63,7 @@ def _draw(folder: Path, stored: Map, capture: CaptureReport | None, out: Path) -
 
 
 def describe(folder: Path, stored: Map) -> dict[str, Any]:
-    """Return what ``bidnerf info`` shows of the map in ``folder``, beside the record of its photos."""
+    """Return what ``bidnerf info`` shows of the map in ``folder``, except the record of its photos."""
     info = stored.info
     parameters = sum(p.numel() for p in stored.field.parameters())  # type: ignore[attr-defined]
     return {
@@ -95,7 +95,7 @@ def _surface_facts(surface: SurfaceMap) -> dict[str, Any]:
 
 
 def _lines(facts: dict[str, Any], stored: Map) -> dict[str, str]:
-    """Return what a reader wants to know first of a map and its ``describe``, by the name of the part."""
+    """Return the most important facts about a map, one line for each of its parts; ``facts`` are from ``describe``."""
     info = stored.info
     photos = amount(len(info.cameras), "image") if info.cameras else "cameras not recorded"
     state = "complete" if info.complete else "not complete; 'bidnerf train --resume' goes on with it"

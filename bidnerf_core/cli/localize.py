@@ -123,11 +123,11 @@ def run(arguments: list[str]) -> None:
     ) -> None:
         """Find the poses of photos, or of frames of a dataset, in a map.
 
-        QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; where that has
-        no focal length, method auto begins with that of the map's images.
-        Frames of a dataset that are named by --frame are taken as a rig: their relative poses come from the dataset, and the
-        pose found is that of the last one's camera. Poses are camera to world, OpenCV axes (x right, y down, z forward); so
-        are points, unless a .npz has T_camera_sensor beside them.
+        QUERY is image files, folders of photos, or a dataset. A photo's camera comes from its EXIF unless it is given; if EXIF
+        has no focal length, method auto begins with that of the map's images.
+        Frames of a dataset that are named by --frame form a rig: their relative poses come from the dataset, and the
+        pose found is that of the last one's camera. Poses are camera to world with OpenCV axes (x right, y down, z forward).
+        Points have the camera's axes, unless a .npz holds T_camera_sensor as well.
         """
         require("--seed", seed, 0, LARGEST_SEED)
         if frame and not any(frame):
@@ -167,7 +167,7 @@ def _depth_points(path: Path, stored: Map, choice: SparseChoice) -> DepthPoints:
 
 
 def _assumed_cameras(landmarks: LandmarkMap | None, config: Any) -> tuple[Intrinsics, ...]:
-    """Return the cameras of a map's images if photos without a focal length may be localized: landmarks tell it."""
+    """Return the cameras of a map's images if photos without a focal length can be localized, which takes landmarks."""
     if landmarks is None or not (isinstance(config, AutoConfig) and config.landmarks):
         return ()
     return landmarks.cameras
@@ -176,7 +176,7 @@ def _assumed_cameras(landmarks: LandmarkMap | None, config: Any) -> tuple[Intrin
 def _localize(
     source: QuerySource, localizer: Localizer, begin: StartSpec, seed: int, answers: Answers
 ) -> None:  # fmt: skip
-    """Localize each query. One that fails does not stop the others, unless there is no other."""
+    """Localize each query. A failure does not stop the others; the error of a single query is raised."""
     total = len(source.names)
     without_depth = list[str]()
     with counted("localizing", "images", total) as report:

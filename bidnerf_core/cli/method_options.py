@@ -15,7 +15,7 @@ Preset: TypeAlias = Annotated[
 
 
 def chosen_settings(arguments: Sequence[str], usual: str) -> Any:
-    """Return the settings of the method that ``--method`` names: its defaults, or those that ``--preset`` names."""
+    """Return the settings of the method that ``--method`` names: its defaults, or those of the ``--preset``."""
     with wrong_usage():
         method = find_method(value_of("--method", arguments) or usual)
         return method.settings(value_of("--preset", arguments))

@@ -1,4 +1,4 @@
-"""Pictures of a localization: the photo beside the map as it is rendered from the pose found."""
+"""Pictures of a localization: the photo next to the map as rendered from the pose found."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bidnerf_core.rendering import render_image
 from bidnerf_core.se3 import SE3
 
 PICTURE_SIDE = 240
-"""Pixels of the longer side; larger photos are reduced, since rendering takes time for each pixel."""
+"""Maximum pixels on the longer side; larger photos are reduced, since each rendered pixel takes time."""
 
 
 class Painter:
@@ -34,11 +34,11 @@ class Painter:
         return render_image(self._map.field, self._camera, T_world_camera, self._map.bounds).rgb
 
     def blended(self, T_world_camera: SE3) -> UInt8[np.ndarray, "h w 3"]:
-        """Return photo and rendering on top of each other, with the edges of each."""
+        """Return the photo blended with the rendering, with the edges of each."""
         return blend(self.observed, self.rendered(T_world_camera))
 
     def overlay(self, start: SE3 | None, found: SE3) -> UInt8[np.ndarray, "H W 3"]:
-        """Return the photo, the rendering and both blended; below, the same for the start where there is one."""
+        """Return the photo and renderings as one picture: ``figures.overlay`` if there is a start, otherwise ``row``."""
         if start is not None:
             return overlay(self.observed, self.rendered(start), self.rendered(found))
         return self.row(self.observed, "observed", found, "rendered at the pose found")
@@ -46,7 +46,7 @@ class Painter:
     def row(
         self, left: Float[Tensor, "h w 3"], left_caption: str, found: SE3, caption: str
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """Return an image, the rendering at the pose found, and this blended with the photo, side by side."""
+        """Return an image, the rendering at the pose found, and its blend with the photo, side by side."""
         rendered = self.rendered(found)
         tiles: Sequence[tuple[object, str]] = (
             (left, left_caption),

@@ -32,14 +32,14 @@ from bidnerf_core.training import Progress as TrainingProgress
 from bidnerf_core.training import TrainingState
 
 CHECKPOINT_SECONDS = 60.0
-LINE_EVERY = 10.0  # seconds, where stderr is no terminal
+LINE_EVERY = 10.0  # seconds, where stderr is not a terminal
 
 
 Bar = TypeVar("Bar", bound="StoppableBar")
 
 
 class StoppableBar:
-    """A context that shows a bar and handles Ctrl-C by ``_interrupt``; both are restored at its end."""
+    """A context that shows a progress bar and handles Ctrl-C with ``_interrupt``; both end with the context."""
 
     _bar: Progress
 
@@ -59,7 +59,7 @@ class StoppableBar:
 
 
 class StoredTraining(StoppableBar):
-    """The ``Report`` of a training that keeps its map in a folder.
+    """The ``Report`` of a training whose map is stored in a folder.
 
     As a context manager, it makes Ctrl-C stop training after the current step.
     """
@@ -84,10 +84,10 @@ class StoredTraining(StoppableBar):
         return self._resumed
 
     def step(self, progress: TrainingProgress) -> None:
-        self._resumed = None  # it is as large as the field and its optimizer
+        self._resumed = None  # free it: it is as large as the field and its optimizer
         self._step, self.total = progress.step, progress.total
         numbers = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
-        if not math.isnan(progress.samples_per_ray):  # not every recipe tells
+        if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
             numbers += f"  {progress.samples_per_ray:.1f} samples a ray"
         self._bar.update(self._task, completed=progress.step, total=progress.total, numbers=numbers)
         now = time.monotonic()
@@ -97,7 +97,7 @@ class StoredTraining(StoppableBar):
             done = progress.step - self._first_step
             left = (now - self._began) / max(1, done) * (progress.total - progress.step)
             say(f"step {progress.step}/{progress.total}  {numbers}  {left:.0f} s left")
-        if self.stopping and not self._announced:  # not in the signal's handler, which may interrupt a print
+        if self.stopping and not self._announced:  # not in the signal handler, which may interrupt a print
             self._announced = True
             say("stopping after this step (Ctrl-C again: at once, back to the last checkpoint)")
 
@@ -118,17 +118,17 @@ class StoredTraining(StoppableBar):
             self.save(TrainingState(self._step, field.state_dict(), {}))
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        if self.stopping:  # asked twice: at once, back to the last checkpoint
+        if self.stopping:  # second Ctrl-C: stop at once, which loses the steps since the last checkpoint
             raise KeyboardInterrupt
         self.stopping = True
 
 
 @contextmanager
 def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable[[int, int], None]]:
-    """Show how many of ``unit`` are done, their rate and the time left: a bar on a terminal, else a line now and then.
+    """Show how many of ``unit`` are done, their rate and the time left: a bar on a terminal, else occasional lines.
 
-    Yields a function of the number done and of the total. For a total of 1, a terminal shows how long it has taken, and
-    nothing else is shown. A call with 0 done begins anew.
+    Yields a function of the number done and the total. For a total of 1, a terminal shows only the elapsed time, and other
+    outputs show nothing. A call with 0 done restarts the clock.
     """
     columns: tuple[ProgressColumn, ...] = (
         TextColumn(what), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit),
@@ -160,7 +160,7 @@ def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable
 
 @contextmanager
 def timed(what: str) -> Iterator[None]:
-    """Print how long the work inside took."""
+    """Print how long the work in the context took."""
     began = time.monotonic()
     yield
     say(f"{what}: {time.monotonic() - began:.1f} s")

@@ -1,4 +1,4 @@
-"""What ``bidnerf localize`` is asked: photos of the user's own, or frames of a dataset."""
+"""The queries of ``bidnerf localize``: the user's own photos, or frames of a dataset."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from bidnerf_core.photos import DEPTH_STEM, photos_in
 from bidnerf_core.se3 import SE3
 
 NAMED = 5
-"""How many of many files a message names."""
+"""Maximum number of files that a message names."""
 
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An image, or several with known relative poses, of which the last one's pose is sought."""
+    """An image, or several with known relative poses; the pose of the last one is sought."""
 
     name: str
     views: tuple[View, ...]
@@ -57,19 +57,19 @@ class QuerySource(Protocol):
 
 @dataclass(frozen=True)
 class PhotoOptions:
-    """How photos are read."""
+    """Options for reading photos."""
 
     depth: tuple[Path, ...] = ()
     camera: Path | None = None
     focal: float | None = None  # pixels of the image file
     hfov: float | None = None  # degrees
-    depth_unit: float | None = None  # metres a step
+    depth_unit: float | None = None  # metres per step
     registration: DepthRegistration | None = None
-    assumed: tuple[Intrinsics, ...] = ()  # cameras one of which probably took photos without a focal length
+    assumed: tuple[Intrinsics, ...] = ()  # cameras of which one probably took photos without a focal length
 
     @property
     def for_photos(self) -> list[str]:
-        """The options given that datasets do not have, as they are written."""
+        """The given options that do not apply to datasets, as written on the command line."""
         values = {"--depth": self.depth or None, "--focal": self.focal, "--hfov": self.hfov,
                   "--depth-unit": self.depth_unit}  # fmt: skip
         return [option for option, value in values.items() if value is not None]
@@ -77,7 +77,7 @@ class PhotoOptions:
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Which frames of a dataset are queries."""
+    """The choice of the frames of a dataset that are queries."""
 
     split: str = "test"
     names: tuple[str, ...] = ()  # a rig; none: each frame of the split on its own
@@ -154,14 +154,14 @@ class Photos:
         return Query(name, views, depth_rays=rays, file=file)
 
     def _remark(self, name: str, text: str) -> None:
-        """Print where a camera comes from, or what was assumed; photos of which the same holds are not repeated."""
+        """Print the source of a camera, or what was assumed, unless the same was printed for an earlier photo."""
         if text not in self._remarks:
             self._remarks.add(text)
             say(f"{name}: {text}")
 
 
 class DatasetFrames:
-    """Frames of a dataset: each frame of a split with the window before it, or one rig."""
+    """Frames of a dataset as queries: each frame of a split with the window before it, or one rig."""
 
     def __init__(self, dataset: Dataset, options: FrameOptions, points: DepthPoints | None = None) -> None:
         self._dataset, self._split, self._points = dataset, options.split, points
@@ -187,7 +187,7 @@ class DatasetFrames:
         return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, file)
 
     def _with_window(self, rig: tuple[str, ...], listed: list[str], size: int) -> tuple[str, ...]:
-        if size == 1 or rig[0] not in listed:  # an unknown name is refused when it is read
+        if size == 1 or rig[0] not in listed:  # an unknown name is rejected when it is read
             return rig
         names = windowed(listed, listed.index(rig[0]), size)
         if len(names) < size:
@@ -236,7 +236,7 @@ def _dataset(
 
 
 def _photo_files(paths: Sequence[Path], depth: Sequence[Path]) -> list[Path]:
-    """Return the image files among ``paths`` and in folders among them; other files in folders are named and skipped."""
+    """Return the image files among ``paths`` and in folders among them; other files there are skipped with a message."""
     files = list[Path]()
     for path in paths:
         if not path.is_dir():
@@ -258,7 +258,7 @@ def _photo_files(paths: Sequence[Path], depth: Sequence[Path]) -> list[Path]:
 def _depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Path]:
     """Return the depth file of each photo: by name where names agree (``NAME.png``, ``NAME.depth.png``), else in order.
 
-    Raises ``UsageError`` where neither assigns every depth file.
+    Raises ``UsageError`` where depth files can be assigned in neither way.
     """
     by_stem = {photo.stem: photo for photo in photos}
     stems = [file.stem.removesuffix(DEPTH_STEM) for file in depth]

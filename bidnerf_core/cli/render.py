@@ -36,7 +36,7 @@ from bidnerf_core.frames import Frame, View
 from bidnerf_core.rendering import RenderedImage, render_image
 from bidnerf_core.storage import Map, load_map
 
-DEEPEST = 65.535  # metres in a 16-bit image of millimetres
+DEEPEST = 65.535  # metres that a 16-bit image of millimetres can hold
 
 
 def run(arguments: list[str]) -> None:
@@ -80,7 +80,7 @@ def _level(stored: Map, number: int, folder: Path) -> RadianceField:
 
 
 def _check_file_names(names: Sequence[str]) -> None:
-    """Raise ``InputError`` where the colour image of a frame would have the name of another's depth image."""
+    """Raise ``InputError`` where one frame's colour image would have the same name as another's depth image."""
     for name in {f"{name}.depth" for name in names} & set(names):
         raise InputError(
             f"frame {name!r} would have the file of the depth of {name.removesuffix('.depth')!r}; render them"
@@ -119,7 +119,7 @@ def _as_png(pixels: np.ndarray) -> bytes:
 
 
 def _scores(image: RenderedImage, frame: Frame) -> tuple[float, float | None, torch.Tensor]:
-    """Return PSNR, the median absolute depth error where depth was measured, and the errors themselves."""
+    """Return the PSNR, the median absolute depth error (None without measured depth), and the depth errors themselves."""
     quality = float(psnr(image.rgb, frame.rgb, 1.0))
     if frame.depth is None or not frame.has_depth:
         return quality, None, torch.zeros(0)

@@ -11,7 +11,7 @@ import tyro
 from bidnerf_core.cli.common import UsageError, console, option, output_folder, parse, print_table, show
 from bidnerf_core.errors import InputError
 
-if TYPE_CHECKING:  # the rest is imported when a report is made: help pages do without it
+if TYPE_CHECKING:  # the rest is imported when a report is made, since help pages do not need it
     from bidnerf_core.evaluation.groups import Group
     from bidnerf_core.evaluation.page import Figure
 
@@ -19,7 +19,7 @@ FAULT_CAPTION = (
     "Trials by fault of the images and its size, with Wilson's 95 % intervals: right (within 5 degrees and 0.05 units), "
     "converged by the method's own judgement, and converged but wrong."
 )
-LENGTH_OF_HEAD = 4096  # bytes of a page in which the mark of a report stands
+LENGTH_OF_HEAD = 4096  # bytes at the beginning of a page that contain the mark of a report
 CriterionName = Literal["10%", "5deg 0.05", "1deg 0.02"]
 
 
@@ -61,7 +61,7 @@ def report(
     require_matplotlib()
     runs = [(path.name, read_runs(path)) for path in results]
     with output_folder(out, overwrite=True), console.status("drawing"):
-        if not (out / "index.html").exists():  # so that an interrupted report is known as one
+        if not (out / "index.html").exists():  # so that an interrupted report is recognised as one
             write_file(out / "index.html", UNFINISHED.encode())
         text = page(title, groups, draw_figures(groups, out, chosen), runs, chosen)
         write_file(out / "index.html", text.encode())
@@ -70,7 +70,7 @@ def report(
 
 
 def _criterion(asked: str | None, groups: Sequence[Group]) -> str:
-    """Return the criterion to show where one is shown. Raises ``UsageError`` for one that no trial can be judged by."""
+    """Return the criterion to show where only one is shown. Raises ``UsageError`` for one that applies to no trial."""
     from bidnerf_core.evaluation.summary import applies, usual_criterion
 
     if asked is None:
@@ -84,7 +84,7 @@ def _criterion(asked: str | None, groups: Sequence[Group]) -> str:
 
 
 def _check_ours(out: Path) -> None:
-    """Raise ``InputError`` where ``out`` holds something else than a report, which a newer report may replace."""
+    """Raise ``InputError`` where ``out`` holds anything but a report, which a newer report may replace."""
     from bidnerf_core.evaluation.page import MARK
     from bidnerf_core.files import is_temporary, open_binary
 

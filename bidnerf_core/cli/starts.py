@@ -1,4 +1,4 @@
-"""The start of ``bidnerf localize``: a pose of a file, the true pose moved, or none."""
+"""The start of ``bidnerf localize``: a pose from a file, the perturbed true pose, or none."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXPECTED_POSE = 'expected {"T_world_camera": 4x4 rows}'
 
 @dataclass(frozen=True)
 class StartSpec:
-    """A start as the arguments give it: one of the two, or none."""
+    """A start as given by the arguments: one of the two, or none."""
 
     fixed: SE3 | None = None  # T_world_camera
     perturb: tuple[float, float] | None = None  # metres, degrees
@@ -38,7 +38,7 @@ class StartSpec:
         return self.fixed is not None or self.perturb is not None
 
     def pose(self, truth: SE3 | None, seed: int) -> SE3 | None:
-        """Return T_world_camera to start from. ``seed`` draws the direction in which the true pose is moved."""
+        """Return T_world_camera to start from. ``seed`` determines the direction in which the true pose is perturbed."""
         if self.perturb is None or truth is None:
             return self.fixed
         return protocols.perturb(truth, *self.perturb, seed)
@@ -47,7 +47,8 @@ class StartSpec:
 def read_pose(path: Path) -> SE3:
     """Read a 4x4 camera-to-world matrix, alone or under "T_world_camera", as ``localize --json`` prints it.
 
-    A list of one such object is taken as that object. Raises ``InputError`` where the file holds no rigid transform by rows.
+    A list of one such object is accepted as well. Raises ``InputError`` where the file does not hold the rows of a rigid
+    transform.
     """
     content = read_file(path, "a pose file")
     try:

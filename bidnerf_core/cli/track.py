@@ -48,7 +48,7 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import load_map
 
 TRIED = 3
-"""Number of frames of which none can be read at which a sequence is given up: what is wrong concerns all of them."""
+"""Number of unreadable frames at the beginning of a sequence after which it is given up: probably none can be read."""
 
 
 def run(arguments: list[str]) -> None:
@@ -102,10 +102,10 @@ def run(arguments: list[str]) -> None:
         ] = False,
         config: TrackerConfig = TrackerConfig(),
     ) -> None:
-        """Find the poses of a sequence's frames in a map, in the order of time.
+        """Find the poses of a sequence's frames in a map, in chronological order.
 
         Each pose is predicted from those before it, refined and judged. A frame whose pose is not accepted counts as lost;
-        the following ones are searched in the whole map. Where the sequence has true poses, a table compares them.
+        the following ones are searched in the whole map. Where the sequence has true poses, a table shows the errors.
         """
         require("--every", every, 1)
         if follow and split is not None:
@@ -139,7 +139,7 @@ def run(arguments: list[str]) -> None:
                         background=stored.bounds.background, register_depth=registration,
                     )  # fmt: skip
                     _track(frames if split is None else _of_split(frames, split), step, every)
-        finally:  # Ctrl-C included: what there is, is written whole
+        finally:  # also on Ctrl-C: the frames so far are written
             seconds = clocks.perf_counter() - began
             if out is not None and path.frames:
                 path.write(out)
@@ -155,12 +155,12 @@ def run(arguments: list[str]) -> None:
 
 
 class _Step:
-    """Tracks a frame, keeps the answer, and says when the tracker is lost and when it has found its way again."""
+    """Tracks a frame, keeps the answer, and prints when the tracker gets lost and when it has recovered."""
 
     def __init__(self, tracker: Tracker, path: TrackedPath, depth: bool, video: TrackingVideo | None) -> None:
         self.tracker, self.path, self._depth, self._video = tracker, path, depth, video
         self._lost_at: int | None = None
-        self._cameras: set[str] = set()  # where those of the frames come from, as far as it was said
+        self._cameras: set[str] = set()  # the sources of frames' cameras that were printed already
 
     def __call__(
         self, frame: Frame, time: float | None, truth: SE3 | None = None, place: int | None = None
@@ -191,9 +191,9 @@ def _of_split(frames: FrameSequence, split: str) -> FileSequence:
 
 
 def _track(frames: FrameSequence, step: _Step, every: int) -> None:
-    """Track every n-th frame. One whose files cannot be read is named and left out, unless the first ones all are.
+    """Track every n-th frame. One whose files cannot be read is reported and skipped, unless the first ones all are.
 
-    Raises ``InputError`` at the end if there was one.
+    Raises ``InputError`` at the end if any could not be read.
     """
     total = -(-len(frames) // every)
     with counted("tracking", "frames", total) as report:
@@ -214,7 +214,7 @@ def _track(frames: FrameSequence, step: _Step, every: int) -> None:
 
 
 def _chosen(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:
-    """Read every n-th frame; where each has files of its own, those that cannot be read give an error."""
+    """Yield every n-th frame; where each has files of its own, an unreadable one is yielded as an error."""
     if not isinstance(frames, FileSequence):
         yield from islice(frames, 0, None, every)
         return
@@ -226,7 +226,7 @@ def _chosen(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputErr
 
 
 def _follow(source: str, step: _Step, camera: GivenCamera, background: tuple[float, float, float]) -> None:
-    """Answer each frame that comes with one JSON object on a line of its own, at once."""
+    """Answer each frame that arrives, at once, with one JSON object on a line of its own."""
     say(f"waiting for {'JSON lines on stdin' if source == STDIN else f'images in {source}'}; Ctrl-C ends")
     for request in requests(source):
         try:

@@ -1,4 +1,4 @@
-"""What ``bidnerf track`` collects: a row for each frame, the file of poses, and the summary at the end."""
+"""The results of ``bidnerf track``: a row for each frame, the file of poses, and the summary at the end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.storage import MapInfo
 
 SAME_POSE = 1e-4
-"""Difference of two poses' matrices (metres) that rounding in files may make."""
+"""Difference of two poses' matrices (metres) that rounding in files may cause."""
 BOUND = 12.59
 """The 95 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 
@@ -58,12 +58,12 @@ class TrackedPath:
         truth: SE3 | None = None,
         number: int | None = None,
     ) -> None:
-        """Keep an answer. ``number``: the place of the frame in its sequence; that after the last one by default."""
+        """Keep an answer. ``number`` is the frame's index in its sequence, by default one more than the last."""
         if number is None:
             number = self.frames[-1].posed.number + 1 if self.frames else 0
         intrinsics = found.frame_as_taken(frame).intrinsics
         posed = PosedImage(frame.name, number, intrinsics, found.T_world_camera, None, time, found.covariance)
-        # The path of each single search would make long sequences large.
+        # Keeping the intermediate poses of each frame would take much memory in long sequences.
         self.frames.append(TrackedFrame(posed, replace(found, poses=found.poses[-1:]), truth))
 
     def plain(self, tracked: TrackedFrame) -> dict[str, Any]:
@@ -78,13 +78,13 @@ class TrackedPath:
 
     @property
     def lost(self) -> list[tuple[int, int]]:
-        """The first and the last number of each run of frames without an accepted pose."""
+        """The first and the last index of each run of frames without an accepted pose."""
         return spans([not frame.found.converged for frame in self.frames])
 
     def write(self, out: Path) -> None:
-        """Write the poses in the format of the name's ending, whole or not at all.
+        """Write the poses atomically, in the format of the name's ending.
 
-        A name that ends with ``.json`` takes all frames with all that is known of them; other formats take accepted poses.
+        A ``.json`` file holds all frames with all details; files of other formats hold only accepted poses.
         """
         if _format(out) == ".json":
             rows = ",\n".join(json.dumps(self.plain(frame), allow_nan=False) for frame in self.frames)
@@ -139,7 +139,7 @@ class TrackedPath:
         return table
 
     def _is_of_training(self, frame: TrackedFrame) -> bool:
-        """Whether the map was trained on an image of this name, taken from the same place."""
+        """Return whether the map was trained on an image of this name with the same pose."""
         given = self._trained_on.get(frame.posed.name)
         if given is None or frame.truth is None:
             return False
@@ -162,7 +162,7 @@ class TrackedPath:
 
 
 def check_out(out: Path) -> None:
-    """Raise before any work where a file of poses cannot be written."""
+    """Raise, before any work is done, where a file of poses cannot be written."""
     if _format(out) is None:
         raise UsageError(f"--out is {out}, expected a name that ends with {', '.join(POSE_WRITERS)}")
     if out.is_dir() or not out.parent.is_dir():

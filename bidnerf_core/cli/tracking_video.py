@@ -1,4 +1,4 @@
-"""``bidnerf track --video``: what the camera saw beside what the map shows from the poses found."""
+"""``bidnerf track --video``: the camera's images next to the map as rendered from the poses found."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from bidnerf_core.localization.problem import SceneMap
 
 WRITTEN_SUFFIXES = (".mp4", ".mkv", ".webm")
 RATES = 1.0, 60.0
-"""Least and largest number of frames a second."""
+"""Minimum and maximum number of frames per second."""
 USUAL_RATE = 30.0
-"""Frames a second of sequences without time stamps."""
+"""Frames per second of sequences without time stamps."""
 WHITE_DEPTH = 5.0
-"""Metres of depth that are drawn white, where only depth was recorded."""
+"""Depth (metres) that is drawn white, where only depth was recorded."""
 
 
 def check_video(file: Path) -> None:
-    """Raise ``InputError`` before any work where a video cannot be written."""
+    """Raise ``InputError``, before any work is done, where a video cannot be written."""
     try:
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
@@ -42,7 +42,7 @@ def check_video(file: Path) -> None:
 
 
 class TrackingVideo:
-    """Writes a picture for each frame that is tracked, at the rate of the first two."""
+    """Writes a picture for each tracked frame, at the frame rate of the first two."""
 
     def __init__(self, file: Path, scene: SceneMap) -> None:
         self._file, self._scene = file, scene
@@ -56,7 +56,7 @@ class TrackingVideo:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Finish the file, which takes its name only then."""
+        """Finish the file, which gets its final name only then."""
         if self._writer is None and self._first is not None:
             self._writer = self._opened(self._first[0], USUAL_RATE)
         if self._writer is not None:
@@ -102,7 +102,7 @@ class TrackingVideo:
 
 
 def _observed(frame: Frame, reduced: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Return a frame's colours, or its depth in grey where no colours were recorded."""
+    """Return a frame's colours, or its depth as grey values where no colours were recorded."""
     if frame.has_colour or frame.depth is None:
         return reduced
     grey = (frame.depth.cpu() / WHITE_DEPTH).clamp(0, 1)

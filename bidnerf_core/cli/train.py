@@ -47,7 +47,7 @@ from bidnerf_core.training import TrainingStopped
 
 @dataclass(frozen=True)
 class Source:
-    """Where the views come from, as the arguments say."""
+    """The source of the views, as given by the arguments."""
 
     data: Path
     split: str
@@ -61,7 +61,7 @@ class Source:
         return open_dataset(self.data, background, camera=self.camera, register_depth=self.registration)
 
     def views(self, dataset: Dataset) -> tuple[list[View], int]:
-        """Return the views of the split, and how many pixels of them have their depth from points."""
+        """Return the views of the split, and the number of their pixels whose depth comes from points."""
         plain = read_views(dataset, self.split)
         if self.depth_points is None:
             return plain, 0
@@ -163,7 +163,10 @@ def train_map(
     background: tuple[float, float, float], checkpoint_seconds: float = CHECKPOINT_SECONDS, baked: bool = True,
     sparse_depth: int = 0, refinement: RefinementChoice = "auto", device: torch.device | str = "cpu",
 ) -> None:  # fmt: skip
-    """Train a new map on ``device`` into folder ``out``, with progress on stderr. Raises ``TrainingStopped`` on Ctrl-C, after saving."""
+    """Train a new map on ``device`` and store it in folder ``out``, with progress on stderr.
+
+    Raises ``TrainingStopped`` on Ctrl-C, after saving.
+    """
     taken = prepared(views, refinement)
     if not taken.distances:
         say(
@@ -179,9 +182,9 @@ def train_map(
 
 
 def load_interrupted(out: Path, baking: bool) -> MapInfo:
-    """Return the description of the map in ``out``, of which the training or, with ``baking``, the surface is not complete.
+    """Return the description of the map in ``out``, whose training or, with ``baking``, whose surface is incomplete.
 
-    Raises ``InputError`` where there is nothing left to do.
+    Raises ``InputError`` where nothing is left to do.
     """
     try:
         info = load_info(out)
@@ -196,7 +199,7 @@ def load_interrupted(out: Path, baking: bool) -> MapInfo:
 
 
 def _resumed_map(arguments: list[str]) -> tuple[Path, MapInfo] | None:
-    """Return the map that is to be resumed, where the arguments name one that can be read."""
+    """Return the folder and description of the map to resume, if the arguments name one that can be read."""
     out = value_of("--out", arguments)
     if "--resume" not in arguments or out is None:
         return None
@@ -207,7 +210,7 @@ def _resumed_map(arguments: list[str]) -> tuple[Path, MapInfo] | None:
 
 
 def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any, config: Any) -> None:
-    """Raise ``UsageError`` for settings that differ from those of the interrupted training, which would be ignored."""
+    """Raise ``UsageError`` for settings that differ from the interrupted training's, since they would be ignored."""
     if backend not in (None, info.backend):
         raise UsageError(f"{out}: is of backend {info.backend!r}, cannot resume it with {backend!r}")
     stored, given, usual = info.config, to_plain(config), to_plain(default)
@@ -219,7 +222,7 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
 
 
 def _check_refinement(out: Path, info: MapInfo, refinement: RefinementChoice) -> None:
-    """Raise ``UsageError`` for a choice of poses that differs from what the interrupted training did."""
+    """Raise ``UsageError`` for a choice of pose refinement that differs from that of the interrupted training."""
     if info.pose_refinement is None:  # "never", or too few keypoints for any
         return
     refined = info.pose_refinement.refined or bool(info.pose_refinement.replaced)

@@ -1,4 +1,4 @@
-"""The views that a training takes: with refined poses, and with the landmarks that they show."""
+"""The views for a training: with refined poses, and with the landmarks that they show."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedVie
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
 
 RefinementChoice = Literal["auto", "always", "never"]
-"""When to refine the given poses: ``auto`` does where they are inconsistent."""
+"""When to refine the given poses: ``auto`` refines them if they are inconsistent."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingViews:
-    """Views as training takes them, and what is known of their poses."""
+    """Views prepared for training, and what is known about their poses."""
 
     views: list[View]
-    tracked: TrackedViews | None  # their keypoints, of which ``bake_map`` makes landmarks
+    tracked: TrackedViews | None  # their keypoints, from which ``bake_map`` builds landmarks
     cameras: tuple[StoredCamera, ...]
-    refinement: PoseRefinement | None = None  # None where nothing is known of the given poses
-    distances: bool = True  # whether the views show how far things are
+    refinement: PoseRefinement | None = None  # None where nothing is known about the given poses
+    distances: bool = True  # whether the views determine distances
 
 
 def prepared(views: Sequence[View], refinement: RefinementChoice = "auto") -> TrainingViews:
-    """Refine the poses of the views where that is wanted, and find the landmarks that they show."""
+    """Refine the poses of the views if requested, and find the landmarks that they show."""
     if refinement == "never":
         tracked, seeing = located(views)
         return TrainingViews(
@@ -70,9 +70,10 @@ def prepared(views: Sequence[View], refinement: RefinementChoice = "auto") -> Tr
 
 
 def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:
-    """Track the keypoints of the views, unless all have dense depth or a silhouette: training takes distances from landmarks.
+    """Track the keypoints of the views, unless all have dense depth or a silhouette.
 
-    Return the tracks, of which ``bake_map`` makes the map's landmarks, and the views with the landmarks that each shows.
+    Return the tracks, from which ``bake_map`` builds the map's landmarks, and the views with the landmarks that each shows;
+    from these training takes distances.
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
@@ -81,7 +82,7 @@ def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:
 
 
 def _lacks_distances(view: View) -> bool:
-    """Return whether neither depth nor a silhouette tells training where the matter is."""
+    """Return whether a view has neither dense depth nor a silhouette, from which training would know where matter is."""
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
@@ -91,7 +92,7 @@ def _tracked(views: Sequence[View]) -> TrackedViews:
 
 
 def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
-    """Return the views with the landmarks that each shows, unless no view needs them for its distances."""
+    """Return the views with the landmarks that each shows, unless no view needs them for distances."""
     if not any(map(_lacks_distances, views)):
         return list(views)
     seen = tracked.seen(DEFAULT_LANDMARKS)

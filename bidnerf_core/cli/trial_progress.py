@@ -1,4 +1,4 @@
-"""Shows the progress of an evaluation on stderr and handles Ctrl-C."""
+"""Progress of an evaluation on stderr, and handling of Ctrl-C."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bidnerf_core.evaluation.trial import TrialResult
 
 
 class TrialProgress(StoppableBar):
-    """A progress bar of trials.
+    """A progress bar for trials.
 
     As a context manager, it makes Ctrl-C wait for the running trials, and a second Ctrl-C stop them.
     """
@@ -48,7 +48,7 @@ class TrialProgress(StoppableBar):
             say(f"{self.count}/{self.total} trials, {numbers}")
 
     def _left(self) -> float:
-        """Return the remaining seconds at the mean rate so far, which is too low until every worker has finished a trial."""
+        """Return the seconds left at the mean rate so far, which is too low until every worker has finished a trial."""
         each = (time.monotonic() - self._began) / self.count
         return each * (self.total - self.count)
 
@@ -60,7 +60,7 @@ class TrialProgress(StoppableBar):
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration as 50 s, 12 min or 3 h 5 min."""
+    """Return a duration in words, such as 50 s, 12 min or 3 h 5 min."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -1,4 +1,4 @@
-"""Readers of posed images and of sequences, and writers. All conventions of file formats are converted here."""
+"""Readers of posed images and of sequences, and writers. All file-format conventions are converted here."""
 
 from __future__ import annotations
 
@@ -79,14 +79,14 @@ class SequenceReader(Protocol):
 
 @runtime_checkable
 class CameraReader(Protocol):
-    """A reader whose format has no camera in its files, so that one may be given."""
+    """A reader whose format has no camera in its files, so that the user may give one."""
 
     def with_camera(self, camera: Intrinsics | Path) -> Reader: ...
 
 
 @runtime_checkable
 class DepthSensorReader(Protocol):
-    """A reader whose format may have depth that is not registered to its colour images."""
+    """A reader of a format whose depth may not be registered to its colour images."""
 
     @property
     def sensor(self) -> DepthSensor | None:
@@ -97,7 +97,7 @@ class DepthSensorReader(Protocol):
 
 
 DepthRegistration: TypeAlias = bool | DepthSensor | str | Path
-"""How depth is registered to colour images: by a sensor or a file of one, by that of the format (True), or not (False)."""
+"""The registration of depth to colour images: from a sensor or a file of one, from the format's own (True), or none (False)."""
 
 READERS: list[Reader] = [
     TransformsReader(),
@@ -120,9 +120,9 @@ def open_dataset(
 
     ``background`` ("white", "black" or an rgb triple in [0, 1]) lies behind images with an alpha channel. The default is
     white where the images have one, as is the convention of NeRF-Synthetic, and black otherwise. ``camera`` (intrinsics or
-    a file of them) is for formats without a camera of their own, such as TUM RGB-D. ``register_depth`` says whether depth is
-    moved to the colour camera, and from which sensor; by default as is usual for the format. Raises ``InputError`` where there
-    is no such folder, where no reader recognises it, and where a description is not usable.
+    a file of them) is for formats without a camera of their own, such as TUM RGB-D. ``register_depth`` determines whether
+    depth is moved to the colour camera, and from which sensor; the default depends on the format. Raises ``InputError`` where
+    there is no such folder, where no reader recognises it, and where a description is not usable.
     """
     folder = Path(path)
     if not folder.exists():
@@ -149,13 +149,13 @@ def open_sequence(
     readers: Sequence[Reader] | None = None,
     register_depth: DepthRegistration | None = None,
 ) -> FrameSequence:
-    """Open the frames of ``path`` in the order of time: a dataset, a folder of images, or a video. None is read yet.
+    """Open the frames of ``path`` in chronological order: a dataset, a folder of images, or a video. None is read yet.
 
     Images and videos have the camera ``camera`` (intrinsics or a file), ``focal`` (pixels) or ``hfov`` (degrees) as in
-    ``Frame.open``. Without them, images have that of their EXIF; those without a focal length, and videos, one of the ``assumed``
-    cameras. Datasets have their own, but for those of which ``open_dataset`` takes one. ``register_depth`` is as in
-    ``open_dataset``; depth beside images is registered where a sensor is given. Raises ``InputError`` where nothing is found,
-    where a description is not usable, and for a camera that is missing or one too many.
+    ``Frame.open``. Without them, images have that of their EXIF; images without a focal length, and videos, have one of the
+    ``assumed`` cameras. Datasets have their own cameras, except those for which ``open_dataset`` accepts one.
+    ``register_depth`` is as in ``open_dataset``; depth in a folder of images is registered if a sensor is given. Raises
+    ``InputError`` where nothing is found, where a description is not usable, and for a missing or superfluous camera.
     """
     place, given = Path(path), GivenCamera(camera, focal, hfov, assumed=tuple(assumed))
     if not place.exists():
@@ -178,9 +178,9 @@ def open_sequence(
 
 
 def given_sensor(place: Path | str, register: DepthRegistration | None) -> DepthSensor | None:
-    """Return the sensor from which depth is registered, None where it is taken as it is.
+    """Return the sensor from which depth is registered, or None where depth is used as it is.
 
-    Raises ``InputError``, which begins with ``place``, for that of a format which has none, and as ``DepthSensor.read``.
+    Raises ``InputError``, which begins with ``place``, for the format's own sensor (True), and as ``DepthSensor.read`` does.
     """
     if register is True:
         raise InputError(

@@ -1,7 +1,7 @@
 """Points of a COLMAP sparse model that the frames of a dataset observe, in metres.
 
-Images of the model and frames of the dataset are matched by name. The model has its own world and unit of length. The
-length of that unit is estimated from the positions of the training cameras, which both contain. No other pose is used.
+Images of the model and frames of the dataset are matched by name. The model has its own world and unit of length, whose
+length in metres is estimated from the positions of the training cameras, which both contain. No other pose is used.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from bidnerf_core.se3 import SE3
 
 MODEL_SPLITS = frozenset({"train", "val", "test"})
 LARGEST_MISFIT = 0.2
-"""Limit of the median distance between training cameras and the model's, relative to their spread. A larger one means
-another scene; a hand-held camera that moved by decimetres reaches 0.03."""
+"""Limit of the median distance between the training cameras and the model's, relative to their spread. A larger one means that
+the scene is another; a hand-held camera that moved by decimetres reaches 0.03."""
 OUTLIER = 3.0
 """Cameras that are off by more than this many medians are left out ..."""
-ALWAYS_FITS = 0.01  # ... but never those that are off by less than this part of the spread
+ALWAYS_FITS = 0.01  # ... but never those that are off by less than this fraction of the spread
 
 
 @dataclass(frozen=True)
 class SparseChoice:
-    """Which points of a COLMAP model are used."""
+    """The choice of the points of a COLMAP model that are used."""
 
     points_error: float = 2.0  # largest mean reprojection error of a point that is used, pixels
-    points_views: int = 2  # least number of images that observe a point that is used
+    points_views: int = 2  # minimum number of images that observe a point that is used
 
     def __post_init__(self) -> None:
         if not self.points_error > 0:
@@ -76,7 +76,7 @@ class SparsePoints:
 
     @property
     def summary(self) -> str:
-        """A line about the unit of the model."""
+        """One line about the unit of the model."""
         unit = self.unit
         checked = (
             f", places agree to {unit.misfit:.2%} of their spread" if unit.cameras > 2 else ", unchecked"
@@ -84,7 +84,7 @@ class SparsePoints:
         return f"{self.folder}: its unit is {unit.metres:.4g} m by {unit.cameras} training cameras{checked}"
 
     def seen(self, name: str, split: str) -> Float[Tensor, "n 3"]:
-        """Return the points that a frame observes (metres, camera frame); none where the model lacks the frame."""
+        """Return the points that a frame observes (metres, camera frame); none if the model lacks the frame."""
         image = self._images.find(name, split)
         if image is None:
             return torch.zeros((0, 3), dtype=torch.float64)
@@ -94,7 +94,7 @@ class SparsePoints:
         return points[points[:, 2] > 0]
 
     def rays(self, views: Sequence[View], split: str) -> Observations:
-        """Return the points that all ``views`` observe as rays in the last camera's frame, by their relative poses.
+        """Return the points that all ``views`` observe, as rays in the last camera's frame, using their relative poses.
 
         Raises ``InputError`` where they observe none.
         """
@@ -165,7 +165,7 @@ class _Names:
                 self._by_name[name].append((parts[:-1], image))
 
     def find(self, name: str, split: str) -> ModelImage | None:
-        """Return the image of a frame, or None. Folders called train, val or test separate the frames of splits.
+        """Return the image of a frame, or None. Folders named train, val or test separate the frames of splits.
 
         Raises ``InputError`` where the name is ambiguous.
         """
@@ -192,7 +192,7 @@ class _Names:
 
 
 def _kept(points: ModelPoints, choice: SparseChoice) -> Tensor:
-    """Return which points are good enough. A negative error was never computed and excludes no point."""
+    """Return the mask of the points that are good enough. A negative error was never computed and excludes no point."""
     sound = points.positions.isfinite().all(-1) & ~points.errors.isnan()
     return sound & (points.errors <= choice.points_error) & (points.tracks >= choice.points_views)
 

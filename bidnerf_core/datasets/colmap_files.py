@@ -1,7 +1,8 @@
 """The files of a COLMAP sparse model: ``cameras``, ``images`` and ``points3D``, as .bin or .txt.
 
-Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. ``rigs`` and ``frames``
-of newer versions are not needed, which still write each image's pose to ``images``. pycolmap is not used, because it hangs on a truncated ``points3D.bin``.
+Formats: https://colmap.github.io/format.html. Poses are ``cam_from_world`` with OpenCV's camera axes. The files ``rigs`` and
+``frames`` of newer versions are not needed, since these versions still write each image's pose to ``images``. pycolmap is not
+used, because it hangs on a truncated ``points3D.bin``.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ NAMES = ("images", "points3D")
 COUNT, IMAGE, POINT = struct.Struct("<Q"), struct.Struct("<I7dI"), struct.Struct("<q3d3BdQ")
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 CAMERA_RECORD = struct.Struct("<IiQQ")
-LARGEST_MODEL = 2**30  # bytes of a file of a model
-TRACK_BYTES = 8  # an image and one of its key points, 4 bytes each
+LARGEST_MODEL = 2**30  # bytes of one file of a model
+TRACK_BYTES = 8  # an image and one of its keypoints, 4 bytes each
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +102,7 @@ def read_posed_images(folder: Path) -> tuple[list[ModelImage], dict[int, Intrins
 
 
 def has_posed_images(folder: Path, suffix: str | None = None) -> bool:
-    """Whether a folder has the cameras and images of a model, as .bin or .txt where no suffix is given."""
+    """Return whether a folder has the cameras and images of a model, as .bin or .txt unless a suffix is given."""
     suffixes = (".bin", ".txt") if suffix is None else (suffix,)
     return any(
         all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")) for suffix in suffixes
@@ -130,7 +131,7 @@ def _any_model(folder: Path) -> bool:
 
 
 class _Bytes:
-    """A binary file that is parsed from its beginning."""
+    """A binary file that is parsed from its beginning to its end."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._content, self._place = path, _content(path), 0
@@ -166,10 +167,10 @@ class _Bytes:
 
 
 def _binary(path: Path, one: Callable[[_Bytes], _Item]) -> list[_Item]:
-    """Read a count, then that many items with ``one``."""
+    """Read a count, then that many items, each with ``one``."""
     file = _Bytes(path)
     (count,) = file.take(COUNT)
-    if count > file.left:  # a false count must not take memory
+    if count > file.left:  # a false count must not allocate memory
         raise InputError(
             f"{path}: says that it holds {count} entries in {file.left} bytes, expected a sound file"
         )
@@ -199,7 +200,7 @@ def _text_images(path: Path) -> list[ModelImage]:
     for number, line in lines:
         if not line or line.startswith("#"):
             continue
-        where, words = f"{path}: line {number}", line.split(maxsplit=9)  # a name may hold blanks
+        where, words = f"{path}: line {number}", line.split(maxsplit=9)  # a name may contain blanks
         if len(words) < 10:
             raise InputError(
                 f"{where} has {len(words)} entries, expected id, pose, camera and name of an image"
@@ -232,7 +233,7 @@ def _text_points(path: Path) -> list[ModelPoint]:
 
 
 def _image(where: str, name: str, camera: int, pose: Sequence[float], points: np.ndarray) -> ModelImage:
-    """Make an image of a ``pose`` that is a quaternion w x y z, then a translation."""
+    """Make an image from a ``pose``, which is a quaternion w x y z followed by a translation."""
     if not (np.isfinite(pose).all() and 0.5 < np.linalg.norm(pose[:4]) < 2):
         raise InputError(f"{where}: image {name!r} has an invalid pose, expected a unit quaternion")
     rotation = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()

@@ -1,13 +1,13 @@
 """Folders of a COLMAP project: ``images`` and a sparse model, with no other file.
 
 The model is in ``sparse/0``, ``sparse`` or the folder itself, as .bin or .txt (``cameras`` and ``images``; ``points3D`` is not
-read). Images are in ``images``, or in the folder itself, under the names that the model has. Every eighth registered image in
-the natural order of the names (the first, the ninth ...) is held out as "test" and the others are "train", as is usual for
+read). Images are in ``images``, or in the folder itself, under the names in the model. Every eighth registered image in the
+natural order of the names (the first, the ninth ...) is held out as "test" and the others are "train", as is usual for
 captures.
 
 The world is that of the model, whose unit of length is arbitrary: poses and maps are in it, not in metres. Images are used as
-they are stored, as COLMAP does, and its pixel centres are at +0.5 like ours. An image that was resized after the
-reconstruction has its camera scaled. COLMAP records no times: a sequence is in the order of the names.
+they are stored, as in COLMAP, whose pixel centres are at +0.5 like ours. The camera of an image that was resized after the
+reconstruction is scaled. COLMAP records no times: a sequence is in the order of the names.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from bidnerf_core.photos import natural_order
 from bidnerf_core.se3 import SE3
 
 MODELS = ("sparse/0", "sparse", ".")
-"""Where a model may be, in this order; of several models COLMAP writes the first one to ``sparse/0``."""
+"""Possible places of a model, in order of preference; COLMAP writes the first of several models to ``sparse/0``."""
 IMAGES = ("images", ".")
 
 
@@ -72,7 +72,7 @@ class ColmapReader:
 
     def _open(self, path: Path, background: Background | None) -> ColmapDataset:
         model = _model_of(path)
-        assert model is not None  # recognises saw to it
+        assert model is not None  # recognises ensures it
         return ColmapDataset(Splits(path, hold_out(_frames(path, model))), background)
 
 

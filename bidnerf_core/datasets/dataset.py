@@ -1,4 +1,4 @@
-"""The interface of a dataset, and how all readers name its frames."""
+"""The interface of a dataset, and the naming of frames that all readers share."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ ReadingProgress: TypeAlias = Callable[[int, int], None]
 class Dataset(Protocol):
     """Posed images in splits. Poses are ``T_world_camera`` with OpenCV axes, float64; depth is planar z in metres.
 
-    A frame's name is the stem of its image file. Where several files of a split share a stem, the names begin with as few
-    folders as it takes to make them different ("left_0001", "right_0001"); the bare stem is then refused as ambiguous.
+    A frame's name is the stem of its image file. Where several files of a split share a stem, the names are prefixed with as
+    few folders as make them unique ("left_0001", "right_0001"); the bare stem is then rejected as ambiguous.
     """
 
     @property
@@ -62,13 +62,13 @@ def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], 
 
 
 def unique_names(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """Name each path (folders, then stem) by its stem, after as many folders as it takes to make the name unique."""
+    """Return a name for each path (folders, then stem): its stem, prefixed with as few folders as make it unique."""
     names = [path[-1] for path in paths]
     for depth in range(2, max(map(len, paths), default=0) + 1):
         count = Counter(names)
         names = ["_".join(p[-depth:]) if count[n] > 1 else n for n, p in zip(names, paths, strict=True)]
     name, times = Counter(names).most_common(1)[0] if names else ("", 0)
-    if times > 1:  # a/b.png beside a_b.png
+    if times > 1:  # such as a/b.png and a_b.png
         raise InputError(f"{times} images would be called {name!r}, expected names that differ")
     return names
 

@@ -1,4 +1,4 @@
-"""Registration of depth to colour: a depth image as the colour camera beside the depth camera would see it."""
+"""Registration of depth to colour: a depth image as seen from the colour camera next to the depth camera."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from bidnerf_core.records import read_record
 from bidnerf_core.se3 import SE3
 
 ENOUGH_REGISTERED = 1000
-"""The number of measured pixels from which on some must fall into the colour image."""
+"""Number of measured pixels above which at least one must fall into the colour image."""
 EXTRINSICS = "T_colour_depth"
-"""The key of the 4x4 matrix (metres, OpenCV axes) beside the intrinsics in a file of a depth sensor."""
+"""The key, in a depth sensor's file, of the 4x4 matrix (metres, OpenCV axes) that accompanies the intrinsics."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthSensor:
-    """A depth camera beside a colour camera whose images its depth is to be registered to."""
+    """A depth camera next to a colour camera, to whose images its depth is registered."""
 
     camera: Intrinsics
     T_colour_depth: SE3  # metres, OpenCV axes
@@ -50,11 +50,11 @@ class DepthSensor:
     def registered(
         self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str
     ) -> Float[Tensor, "h w"]:
-        """Return planar z (metres) in the colour camera; ``file`` opens the message of errors.
+        """Return planar z (metres) in the colour camera; error messages begin with ``file``.
 
-        Depth of lower resolution than the colour image is registered at its own resolution and then resampled, since its
-        points would otherwise be too far apart to cover each other. Raises ``InputError`` for depth of another aspect ratio
-        than the sensor's, and where nothing of it falls into the colour image.
+        Depth of a lower resolution than the colour image is registered at its own resolution and then resampled, since its
+        points would otherwise be too far apart to occlude each other. Raises ``InputError`` for depth whose aspect ratio is
+        not the sensor's, and where none of it falls into the colour image.
         """
         height, width = depth.shape
         camera = Raster(width, height, UPRIGHT).upright(self.camera)
@@ -79,8 +79,8 @@ def register_depth(
 ) -> Float[Tensor, "h w"]:
     """Return planar z (metres) in the colour camera, 0 where no measurement falls.
 
-    Each measurement is moved to the colour camera and written to the pixel that it falls into. Where several do, the nearest
-    is kept, which hides what the colour camera cannot see.
+    Each measurement is moved to the colour camera's frame and written to the pixel into which it projects. Of several in one
+    pixel the nearest is kept, which removes what the colour camera cannot see.
     """
     measured = depth > 0
     rays = depth_camera.unproject(depth_camera.pixel_centres(torch.float64)[measured])
@@ -95,7 +95,7 @@ def register_depth(
 
 
 def _ahead(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Bool[Tensor, "n"]:
-    """Return which points lie in the pyramid of the image; a polynomial lens maps others into the image as well."""
+    """Return which points lie within the image's frustum; a polynomial lens model maps some others into the image as well."""
     centres = camera.pixel_centres(torch.float64)
     border = torch.cat([centres[[0, -1]].reshape(-1, 2), centres[:, [0, -1]].reshape(-1, 2)])
     edge = camera.unproject(border)[:, :2]

@@ -1,4 +1,4 @@
-"""The one camera of a recording whose format has none in its files."""
+"""The single camera of a recording whose format has none in its files."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.orientation import UPRIGHT
 
 CAMERA_FILES = ("camera.json", "cameras.txt")
-"""Files in the folder of a recording that hold its camera, as ``read_camera`` takes them."""
+"""Files in a recording's folder that may hold its camera, in the formats of ``read_camera``."""
 
 
 class FolderCamera:
     """The camera ``given`` (intrinsics or a file), or that of a file in ``folder``, or the ``published`` one of the format.
 
-    Raises ``InputError`` where there is none of them, with ``unknown``, which says why, and the ``ways`` to give one; and
-    for a given file that does not exist.
+    Raises ``InputError`` where none of them exists, with the reason ``unknown`` and the ``ways`` to give one, and for a given
+    file that does not exist.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class FolderCamera:
         self._source = found
 
     def at(self, image: Path, width: int, height: int) -> Intrinsics:
-        """Return the camera at the size of an image. Raises ``InputError`` where it is of another aspect ratio."""
+        """Return the camera at the size of an image. Raises ``InputError`` if their aspect ratios differ."""
         camera = (
             self._source
             if isinstance(self._source, Intrinsics)

@@ -1,4 +1,4 @@
-"""The cameras of images that have no description beside them, as a user gives them."""
+"""User-given cameras of images that come without a description."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from bidnerf_core.orientation import UPRIGHT
 class GivenCamera:
     """At most one of intrinsics or a file that holds them, a focal length (pixels), and a horizontal field of view (degrees).
 
-    Depth is registered to the images from ``sensor``, if there is one. ``assumed``: cameras one of which probably took images
-    whose focal length nothing tells.
+    Depth is registered to the images from ``sensor``, if there is one. ``assumed`` are cameras of which one probably took the
+    images whose focal length is unknown.
     """
 
     camera: Intrinsics | str | Path | None = None
@@ -36,7 +36,7 @@ class GivenCamera:
         return any(given is not None for given in (self.camera, self.focal, self.hfov))
 
     def require(self, path: Path, why: str) -> None:
-        """Raise ``InputError`` where no camera is given or assumed; ``why`` says why one is needed."""
+        """Raise ``InputError`` where no camera is given or assumed; ``why`` is the reason why one is needed."""
         if not self.is_given and not self.assumed:
             raise InputError(f"{path}: {why}, expected a camera: {WAYS}")
 
@@ -55,7 +55,7 @@ class GivenCamera:
     def read(
         self, image: Path, depth: Path | None, depth_unit: float | None, background: Background
     ) -> Frame:
-        """Read an image and its depth, upright. Without a camera, that of EXIF is taken, or else an assumed one.
+        """Read an image and its depth, upright. Without a camera, that of EXIF is used, or else an assumed one.
 
         Raises ``InputError`` as ``Frame.open`` does.
         """

@@ -16,10 +16,10 @@ from bidnerf_core.photos import DEPTH_STEM, photos_in
 
 
 def open_images(folder: Path, camera: GivenCamera, background: Background | None = None) -> FileSequence:
-    """Return the images of a folder by their times where all names are times (``12.345.png``), or in natural order.
+    """Return the images of a folder, by time if all names are times (``12.345.png``), else in the natural order of names.
 
-    ``NAME.depth.png`` (millimetres) beside ``NAME.png`` is its depth, as ``bidnerf render`` writes it. Images have the given
-    camera, or that of their EXIF; both are found as in ``Frame.open``. Raises ``InputError`` where there is no image.
+    ``NAME.depth.png`` (millimetres) next to ``NAME.png`` is its depth, as ``bidnerf render`` writes it. Images have the given
+    camera, or that of their EXIF, as in ``Frame.open``. Raises ``InputError`` where there is no image.
     """
     photos, _ = photos_in(folder)
     if not photos:

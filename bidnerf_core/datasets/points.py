@@ -19,8 +19,8 @@ EXPECTED_POINTS = "expected n rows of x, y, z in metres"
 def read_depth_points(path: Path) -> Observations:
     """Read points (metres, OpenCV axes) as depth rays in the camera's frame.
 
-    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by either commas or blanks. Further columns are ignored,
-    and ``#`` begins a comment. Text and .npy files hold points in the camera's frame, measured from the camera. A .npz file
+    A text file (.txt, .csv, .xyz) has rows of x, y, z, separated by commas or by blanks. Further columns are ignored, and
+    ``#`` begins a comment. Text and .npy files hold points in the camera's frame, measured from the camera. A .npz file
     holds ``points`` and, for a separate sensor such as a lidar, ``T_camera_sensor`` (4x4); the points are then in the
     sensor's frame. Raises ``InputError`` for anything else.
     """
@@ -37,7 +37,7 @@ def read_depth_points(path: Path) -> Observations:
 
 
 def _read(path: Path) -> tuple[np.ndarray, SE3]:
-    """Return the array in a file, and the pose of the sensor that it belongs to."""
+    """Return the array in a file, and T_camera_sensor of the sensor that measured it."""
     if path.suffix == ".npz":
         return _from_archive(path)
     if path.suffix == ".npy":
@@ -50,9 +50,9 @@ def _read(path: Path) -> tuple[np.ndarray, SE3]:
 
 
 def _from_text(text: str) -> np.ndarray:
-    """Parse rows of numbers, of which the first three count."""
+    """Parse rows of numbers, of which the first three are used."""
     lines = [line.partition("#")[0].strip() for line in text.splitlines()]
-    # A row with commas has no other separator: "1,5 2,5" has decimal commas and is refused.
+    # A row with commas has no other separator: "1,5 2,5" has decimal commas and is rejected.
     rows = [line.split("," if "," in line else None)[:3] for line in lines if line]
     return np.array([[float(word) for word in row] for row in rows], dtype=np.float64)
 

@@ -18,7 +18,7 @@ LARGEST_POSE = 4096
 
 
 def read_pose_matrix(path: Path) -> SE3:
-    """Return ``T_world_camera`` (metres, float64). Raises ``InputError`` with the line that is not usable."""
+    """Return ``T_world_camera`` (metres, float64). Raises ``InputError``, which names the line that is not usable."""
     with open_binary(path, "a file of a pose") as file:
         text = file.read(LARGEST_POSE).decode("utf-8-sig", "replace")
     rows = [

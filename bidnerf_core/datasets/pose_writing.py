@@ -1,4 +1,4 @@
-"""Files of estimated poses: TUM trajectories, JSON with covariances, and ``transforms.json`` as nerfstudio reads it."""
+"""Files of estimated poses: TUM trajectories, JSON with covariances, and ``transforms.json`` for nerfstudio."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PosedImage:
     """An image with its camera and an estimated pose."""
 
     name: str
-    number: int  # among the images of the same run or sequence, from 0; it is the timestamp where names are not times
+    number: int  # index in the run or sequence, from 0; it serves as the timestamp where names are not times
     intrinsics: Intrinsics  # of the upright image
     T_world_camera: SE3  # OpenCV axes
     file: Path | None = None
@@ -45,8 +45,8 @@ class PosedImage:
 def tum_trajectory(images: Sequence[PosedImage]) -> str:
     """Return rows ``timestamp tx ty tz qx qy qz qw`` (metres, unit quaternions with the scalar last).
 
-    The timestamp is the image's time where all have one, else its name where all names are numbers, such as those of the TUM
-    RGB-D datasets, else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
+    The timestamp is the image's time if all have one, else its name if all names are numbers, as in the TUM RGB-D datasets,
+    else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
     """
     stamps = _timestamps(images)
     rows = (_tum_row(stamp, image.T_world_camera) for stamp, image in zip(stamps, images, strict=True))
@@ -75,10 +75,10 @@ def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
 
 
 def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
-    """Return a ``transforms.json`` for ``folder``: poses with OpenGL axes, a camera each, and ``file_path`` relative to it.
+    """Return a ``transforms.json`` for ``folder``: poses with OpenGL axes, one camera each, ``file_path`` relative to it.
 
-    It describes the image files as they are stored, so poses and cameras of photos with an EXIF orientation are turned.
-    Raises ``InputError`` for a photo that is stored as a mirror image, for which no rigid pose exists.
+    It describes the image files as they are stored, so the poses and cameras of photos with an EXIF orientation are rotated.
+    Raises ``InputError`` for a photo that is stored mirrored, for which no rigid pose exists.
     """
     frames = [_transforms_entry(image, folder) for image in images]
     return json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1, allow_nan=False) + "\n"
@@ -98,7 +98,7 @@ def _transforms_entry(image: PosedImage, folder: Path) -> dict[str, Any]:
 
 
 def poses_json(images: Sequence[PosedImage]) -> str:
-    """Return a list of objects ``{"frame", "time", "T_world_camera", "covariance"}``, one a line: poses with OpenCV axes.
+    """Return a JSON list of ``{"frame", "time", "T_world_camera", "covariance"}``, one per line; poses have OpenCV axes.
 
     ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in metres, then rotation in rad, at the camera) are
     null where they are not known.
@@ -153,11 +153,11 @@ POSE_WRITERS: dict[str, Callable[[Path, Sequence[PosedImage]], None]] = {
     ".txt": write_tum,
     ".tum": write_tum,
 }
-"""Writers by the ending of a file's name; the first that fits is taken."""
+"""Writers by the ending of the file's name; the first that matches is used."""
 
 
 def write_poses(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write a file in the format that its name's ending says. Raises ``InputError`` for another ending."""
+    """Write poses in the format that the ending of the file's name selects. Raises ``InputError`` for an unknown ending."""
     for ending, write in POSE_WRITERS.items():
         if path.name.lower().endswith(ending):
             write(path, images)

@@ -1,4 +1,4 @@
-"""Camera poses as datasets describe them, in our conventions: ``T_world_camera`` with OpenCV axes.
+"""Camera poses of datasets, converted to our conventions: ``T_world_camera`` with OpenCV axes.
 
 NeRF's and nerfstudio's JSON and ARKit's exports hold camera-to-world matrices with OpenGL axes (x right, y up, z backward).
 """
@@ -16,28 +16,28 @@ from bidnerf_core.records import Record
 from bidnerf_core.se3 import SE3
 
 RIGID_TO = 5e-3
-"""Largest entry of R^T R - 1 that passes for rounding (matrices printed with three decimals reach 2e-3)."""
+"""Largest entry of R^T R - 1 that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
 
 
 def pose(record: Record) -> SE3:
     """Return ``T_world_camera`` (OpenCV axes, float64) from ``transform_matrix`` (3x4 or 4x4, OpenGL axes).
 
-    A rotation that is orthonormal up to rounding is made so. Raises ``InputError`` for any other matrix.
+    A rotation that is orthonormal up to rounding is orthonormalized. Raises ``InputError`` for any other matrix.
     """
     return pose_of_rows(record, "transform_matrix", record.items("transform_matrix"))
 
 
 def pose_of_rows(record: Record, key: str, rows: list[Any] | None) -> SE3:
-    """Return ``T_world_camera`` as ``pose`` does; ``key`` is where ``record`` has ``rows``, for messages."""
+    """Return ``T_world_camera`` as ``pose`` does; ``key`` is the key of ``rows`` in ``record``, for messages."""
     matrix = _matrix(record, key, rows)
     matrix[:, 1:3] *= -1  # y up becomes y down, z backward becomes z forward
     return _rigid(record, key, matrix)
 
 
 def rigid_of_rows(record: Record, key: str, rows: list[Any]) -> SE3:
-    """Return the rigid transform (float64) that ``rows`` (3x4 or 4x4) are up to rounding, whatever its axes.
+    """Return the rigid transform (float64) that ``rows`` (3x4 or 4x4) represent up to rounding, whatever its axes.
 
-    ``key`` is where ``record`` has them. Raises ``InputError`` for any other matrix.
+    ``key`` is their key in ``record``, for messages. Raises ``InputError`` for any other matrix.
     """
     return _rigid(record, key, _matrix(record, key, rows))
 
@@ -50,9 +50,9 @@ def _rigid(record: Record, key: str, matrix: Float[Tensor, "3 4"]) -> SE3:
 
 
 def rigid_pose(matrix: Float[Tensor, "3 4"]) -> SE3:
-    """Return the rigid transform that ``matrix`` is up to rounding.
+    """Return the rigid transform that ``matrix`` represents up to rounding.
 
-    Raises ``InputError``, with nothing but what the rotation is instead, where it is none.
+    Raises ``InputError`` for any other matrix; the message states only how its rotation part is wrong.
     """
     given = SE3(matrix[:3, :3], matrix[:3, 3])
     if not given.is_rigid(RIGID_TO):

@@ -1,19 +1,20 @@
 """Folders of "All Data" as the iOS program "3D Scanner App" exports them.
 
-A frame N has ``frame_N.json`` (ARKit's ``cameraPoseARFrame``, a camera-to-world matrix row by row with OpenGL axes, and
-``intrinsics``, 3x3 row by row, of the photo), some frames a photo ``frame_N.jpg``, and scans with a LiDAR ``depth_N.png``
-(16-bit planar z in millimetres, of lower resolution) with ``conf_N.png`` (ARKit's confidence: 0 low, 1 medium, 2 high).
-The dataset has the frames with a photo, ordered by their number. Every eighth photo (the first, the ninth ...) is held out
-as "test" and the others are "train". The sequence has the frames between them as well, which have depth alone, at the
-resolution of the depth; its times are ``time``, in seconds since the phone was switched on.
+A frame N has ``frame_N.json`` (ARKit's ``cameraPoseARFrame``, a row-major camera-to-world matrix with OpenGL axes, and
+``intrinsics`` of the photo, 3x3 and row-major). Some frames have a photo ``frame_N.jpg``. Scans with a LiDAR have
+``depth_N.png`` (16-bit planar z in millimetres, of lower resolution) with ``conf_N.png`` (ARKit's confidence: 0 low, 1 medium,
+2 high). The dataset has the frames with a photo, ordered by number. Every eighth photo (the first, the ninth ...) is held out
+as "test" and the others are "train". The sequence also has the frames in between, which have only depth, at the resolution of
+the depth; its times are ``time``, in seconds since the phone was switched on.
 
-Photos are large and many: those with more than 640 pixels on the longer side are reduced to that size as they are read,
+Photos are large and many: those with more than 640 pixels on the longer side are reduced to that size when they are read,
 and the intrinsics with them. A scan of 127 training photos then takes 0.6 GB instead of 1.4 GB. Depth is dropped where the
-confidence is not high and beyond 5 m, the range of the LiDAR; the photo's pixels have that of the nearest measurement.
+confidence is not high and beyond 5 m, the range of the LiDAR; each of the photo's pixels has the depth of the nearest
+measurement.
 
-ARKit counts pixels from the centre of the upper left one. Where a frame has ARKit's ``projectionMatrix`` the principal
-point is taken from that, which is relative to the image's borders and so holds for photos of any size; without it half a
-pixel is added.
+ARKit counts pixels from the centre of the upper left one. Where a frame has ARKit's ``projectionMatrix``, the principal
+point is taken from it: it is relative to the image's borders and so holds for photos of any size. Otherwise, half a pixel
+is added.
 """
 
 from __future__ import annotations
@@ -45,15 +46,15 @@ from bidnerf_core.records import Record, read_record
 from bidnerf_core.se3 import SE3
 
 LARGEST_SIDE = 640
-"""Pixels of the longer side of a photo once it is read."""
+"""Maximum number of pixels on the longer side of a photo once it is read."""
 RANGE = 5.0
-"""Metres that the LiDAR measures, by Apple's statement; what is beyond was inferred from the photo."""
+"""Range of the LiDAR (metres) according to Apple; depth beyond it was inferred from the photo."""
 HIGH_CONFIDENCE = 2
 POSE, INTRINSICS, PROJECTION = "cameraPoseARFrame", "intrinsics", "projectionMatrix"
 PHOTO = re.compile(r"frame_(\d+)\.jpe?g", re.IGNORECASE)
 DEPTH = re.compile(r"depth_(\d+)\.png")
 OTHER_SIZE = 0.01
-"""Relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that shows another image size."""
+"""Relative difference of the focal lengths of ``intrinsics`` and ``projectionMatrix`` that indicates another image size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ class ScannerAppReader:
         return ScannerAppDataset(Splits(path, hold_out(scanner_frames(path))), background, self.largest)
 
     def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
-        """Read all descriptions, those of frames that have depth alone included."""
+        """Read all descriptions, including those of frames that have only depth."""
         splits = Splits(path, hold_out(scanner_frames(path)))
         return ScannerAppDataset(splits, background, self.largest).sequence(depth_frames(path))
 
@@ -138,7 +139,7 @@ class ScannerAppDataset(OpaqueDataset[ScannerFrame]):
         return View(Frame(name, rgb, small, depth), frame.T_world_camera)
 
     def _between(self, frame: ScannerFrame, name: str) -> View:
-        """Read a frame of depth alone. Its description has the camera of the photo that was not taken."""
+        """Read a frame that has only depth. Its description holds the camera of a photo that was not saved."""
         depth = read_measured(frame.beside("depth"), frame.beside("conf")).metres
         height, width = depth.shape
         photo_width, photo_height = projected_size(frame.record)
@@ -155,7 +156,7 @@ class ScannerAppDataset(OpaqueDataset[ScannerFrame]):
 def scanner_frames(folder: Path) -> list[ScannerFrame]:
     """Read the descriptions of all photos, ordered by number. Raises ``InputError`` where one is missing or not usable.
 
-    Depth is expected of all frames or of none, as phones without a LiDAR export it.
+    Depth is expected for all frames or, as from phones without a LiDAR, for none.
     """
     numbered = {path: PHOTO.fullmatch(path.name) for path in folder.iterdir()}
     photos = sorted((int(found[1]), path) for path, found in numbered.items() if found)
@@ -169,7 +170,7 @@ def scanner_frames(folder: Path) -> list[ScannerFrame]:
 
 
 def depth_frames(folder: Path) -> list[ScannerFrame]:
-    """Read the descriptions of the frames that have depth and no photo. Raises ``InputError`` as ``scanner_frames``."""
+    """Read the descriptions of the frames that have depth and no photo. Raises ``InputError`` as ``scanner_frames`` does."""
     photos = {path.stem for path in folder.iterdir() if PHOTO.fullmatch(path.name)}
     numbered = {path: DEPTH.fullmatch(path.name) for path in sorted(folder.glob("depth_*.png"))}
     descriptions = [folder / f"frame_{found[1]}.json" for found in numbered.values() if found]
@@ -191,7 +192,7 @@ def _frame(description: Path, photo: Path | None, has_depth: bool) -> ScannerFra
 def projected_size(record: Record) -> tuple[int, int]:
     """Return the size (width, height) of the photos to which the intrinsics belong.
 
-    Raises ``InputError`` where there is no projection matrix to tell it from.
+    Raises ``InputError`` where there is no projection matrix to determine it from.
     """
     fx, _, _, _, fy, *_ = _numbers(record, INTRINSICS, 9)
     projection = _numbers(record, PROJECTION, 16)
@@ -201,13 +202,13 @@ def projected_size(record: Record) -> tuple[int, int]:
 
 
 def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
-    """Return the camera of a photo of this size. Raises ``InputError`` where the intrinsics are of another size."""
+    """Return the camera of a photo of this size. Raises ``InputError`` where the intrinsics are for another size."""
     fx, skew, cx, _, fy, cy, *last = _numbers(record, INTRINSICS, 9)
     if abs(skew) > 1e-6 or last != [0, 0, 1]:
         raise record.error(f"{INTRINSICS} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1], expected 3x3 row by row")
     centre = (cx + 0.5, cy + 0.5)
     if record.items(PROJECTION) is not None:
-        # u = (1 + x_ndc) w / 2 with x_ndc = P00 x / -z - P02, and v likewise, downwards
+        # u = (1 + x_ndc) w / 2 with x_ndc = P00 x / -z - P02, and likewise v, which points down
         projection = _numbers(record, PROJECTION, 16)
         if abs(projection[0] * width / 2 / fx - 1) > OTHER_SIZE:
             raise _other_size(record, width, height)
@@ -218,9 +219,9 @@ def scanner_camera(record: Record, width: int, height: int) -> Intrinsics:
 
 
 def read_measured(depth: Path, confidence: Path) -> DepthImage:
-    """Read depth (metres), 0 where the confidence is not high and out of the sensor's range.
+    """Read depth (metres), 0 where the confidence is not high and outside the sensor's range.
 
-    Raises ``InputError`` where a file is not readable or not what it should be.
+    Raises ``InputError`` where a file is not readable or does not have the expected content.
     """
     measured = read_depth_image(depth, MILLIMETRE)
     sure = decode(confidence)

@@ -1,4 +1,4 @@
-"""Sequences: frames in the order of time, read one at a time.
+"""Sequences: frames in chronological order, read one at a time.
 
 ``open_sequence`` (see ``bidnerf_core.datasets``) returns one for every format that ``open_dataset`` reads, for folders of
 images, and for video files.
@@ -27,9 +27,9 @@ TIMESTAMP = re.compile(r"\d+\.\d+")
 
 @dataclass(frozen=True, eq=False)
 class TimedFrame:
-    """A frame of a sequence, when it was taken, and where."""
+    """A frame of a sequence, its time, and its true pose if that is known."""
 
-    time: float | None  # seconds, from an origin that the recording chose
+    time: float | None  # seconds, from an origin that depends on the recording
     frame: Frame  # without colours (``has_colour``) where only depth was recorded at this time
     truth: SE3 | None = None  # T_world_camera, OpenCV axes, where the recording has it
     split: str | None = None  # the split of the dataset that holds the frame
@@ -37,9 +37,9 @@ class TimedFrame:
 
 @runtime_checkable
 class FrameSequence(Protocol):
-    """Frames in the order of time. Each is read when the iteration reaches it, and raises ``InputError`` as it is read.
+    """Frames in chronological order. Each is read when the iteration reaches it, which may raise ``InputError``.
 
-    Either all frames have a time or none has. Iterating again starts anew.
+    Either all frames have a time or none has. Iterating again starts over.
     """
 
     @property
@@ -52,7 +52,7 @@ class FrameSequence(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SequenceEntry:
-    """A frame that is not read yet."""
+    """A frame that has not been read yet."""
 
     name: str
     time: float | None  # seconds
@@ -63,14 +63,14 @@ class SequenceEntry:
 class FileSequence:
     """A sequence whose frames are files of their own, so that it can be indexed, sliced and reversed."""
 
-    # It is no subclass of collections.abc.Sequence: checkers of types look at an item of those, and so would read one.
+    # Not a subclass of collections.abc.Sequence: run-time type checkers look at an item of those, which would read a file.
 
     def __init__(self, path: Path, entries: Sequence[SequenceEntry]) -> None:
         self._path, self._entries = path, entries
 
     @staticmethod
     def ordered(path: Path, entries: Sequence[SequenceEntry]) -> FileSequence:
-        """Return the frames by their times; as they are listed, and without any time, where a frame has none."""
+        """Return the frames in order of time; if any lacks a time, as they are listed and all without times."""
         if any(entry.time is None for entry in entries):
             return FileSequence(path, [replace(entry, time=None) for entry in entries])
         return FileSequence(path, sorted(entries, key=lambda entry: entry.time or 0.0))
@@ -81,16 +81,16 @@ class FileSequence:
 
     @property
     def names(self) -> list[str]:
-        """The names of the frames; none is read."""
+        """The names of the frames, none of which is read."""
         return [entry.name for entry in self._entries]
 
     @property
     def times(self) -> list[float | None]:
-        """The times of the frames (seconds); none is read."""
+        """The times of the frames (seconds), none of which is read."""
         return [entry.time for entry in self._entries]
 
     def of_split(self, split: str) -> FileSequence:
-        """Return the frames of one split of a dataset. Raises ``InputError`` where none is of it."""
+        """Return the frames of one split of a dataset. Raises ``InputError`` if there are none."""
         chosen = [entry for entry in self._entries if entry.split == split]
         if not chosen:
             known = ", ".join(sorted({entry.split for entry in self._entries if entry.split is not None}))
@@ -120,12 +120,12 @@ class FileSequence:
 
 
 def timestamp(stem: str) -> float | None:
-    """Return the time (seconds) that names a file, as ``1305031102.175304.png``; None for names without a fraction."""
+    """Return the time (seconds) in a file name such as ``1305031102.175304.png``; None for names without a fraction."""
     return float(stem) if TIMESTAMP.fullmatch(stem) else None
 
 
 def sequence_of(dataset: Dataset) -> FileSequence:
-    """Return the frames of all splits of a dataset in the natural order of their names; it has no times."""
+    """Return the frames of all splits of a dataset in the natural order of their names, without times."""
     listed = [(split, name) for split in dataset.splits for name in dataset.frame_names(split)]
     listed.sort(key=lambda frame: natural_order(frame[1]))
     return FileSequence.ordered(

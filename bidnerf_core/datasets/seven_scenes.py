@@ -3,18 +3,18 @@
 A frame is ``frame-000000.color.png``, ``frame-000000.depth.png`` (16-bit planar z in millimetres, 0 and 65535 where nothing
 was measured) and ``frame-000000.pose.txt`` (4x4, camera to world, OpenCV axes, metres). A scene has folders ``seq-01``,
 ``seq-02`` ..., and the files ``TrainSplit.txt`` and ``TestSplit.txt`` list them ("sequence1" or "seq-01"). The folder of one
-sequence is read as well; there, and in a scene without split files, every eighth frame (the first, the ninth ...) is held out
-as "test" and the others are "train". The format records no times: a sequence is in the order of folders and numbers.
+sequence can be read as well; there, and in a scene without split files, every eighth frame (the first, the ninth ...) is held
+out as "test" and the others are "train". The format records no times: a sequence is in the order of folders and numbers.
 
 The Kinect's two cameras were not calibrated, and its depth is not registered to its colour images. The poses are those of
-the depth camera (focal length 585 px); the colour camera has 525 px and is 2.6 cm beside it. By default both are treated as
-the literature on relocalization does (ACE, CVPR 2023, and the pseudo ground truth of Brachmann et al., ICCV 2021): poses
-are moved to the colour camera and depth is registered to it, by a calibration of another Kinect, or by that which is given.
-Without registration, images, depth and poses are taken as they are, with the 585 px of the dataset's page for both, as in
-KinectFusion and its successors; colours at the border are then some 30 px beside their depth.
+the depth camera (focal length 585 px); the colour camera has 525 px and is mounted 2.6 cm away. By default both are treated as
+in the literature on relocalization (ACE, CVPR 2023, and the pseudo ground truth of Brachmann et al., ICCV 2021): poses are
+moved to the colour camera and depth is registered to it, using the calibration of another Kinect or the one that is given.
+Without registration, images, depth and poses are used as they are, with the 585 px of the dataset's page for both, as in
+KinectFusion and its successors; at the border, colours are then some 30 px away from their depth.
 
-Cameras of images of other sizes are scaled. A camera that is given, or in ``camera.json`` or ``cameras.txt`` of the folder, is
-taken for the colour camera; without registration for both.
+For images of other sizes, cameras are scaled. A camera that is given, or in ``camera.json`` or ``cameras.txt`` of the folder,
+is that of the colour images; without registration, it is that of the depth images as well.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 
 @dataclass(frozen=True, eq=False)
 class SceneFrame:
-    """A colour image, and the paths of what may lie beside it."""
+    """A colour image, and the paths of the files that may accompany it."""
 
     image: Path
 
@@ -106,7 +106,7 @@ class SevenScenesReader:
         return replace(self, sensor=sensor)
 
     def open(self, path: Path, background: Background | None) -> Dataset:
-        """List the frames. Raises ``InputError`` where one has no pose, and for split files that are not usable."""
+        """List the frames. Raises ``InputError`` where one lacks a pose, and for split files that are not usable."""
         splits = _splits(path)
         for frames in splits.values():
             for frame in frames:
@@ -117,7 +117,7 @@ class SevenScenesReader:
         return self._dataset(path, splits, background)
 
     def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
-        """List the frames, those without a pose as well."""
+        """List the frames, including those without a pose."""
         splits = _splits(path)
         posed = {split: [frame for frame in group if frame.pose.is_file()] for split, group in splits.items()}
         unposed = {frame: None for group in splits.values() for frame in group if not frame.pose.is_file()}

@@ -24,11 +24,11 @@ class Similarity:
 
 
 FARTHEST_CAMERA = 1e12
-"""Largest coordinate; the squares of larger ones lose all precision."""
+"""Largest coordinate of a camera; the squares of larger ones lose all precision."""
 
 
 def fit_similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Similarity:
-    """Fit the similarity that maps ``source`` to ``target`` in least squares (Umeyama 1991, eqs. 34 to 43).
+    """Return the similarity that maps ``source`` to ``target`` in the least-squares sense (Umeyama 1991, eqs. 34 to 43).
 
     Where the points lie on a line, the rotation about it is arbitrary; the scale is still determined. Raises ``InputError``
     where all points of either set coincide.

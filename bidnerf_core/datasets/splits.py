@@ -1,4 +1,4 @@
-"""The frames of a dataset in named splits, before any image is read, and the dataset that reads them."""
+"""The frames of a dataset in named splits, before any image is read, and the base class of datasets that read them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class NamedFrame(Protocol):
 
     @property
     def time(self) -> float | None:
-        """When the image was taken (seconds), where the format records it."""
+        """The time (seconds) at which the image was taken, where the format records it."""
         ...
 
 
@@ -76,7 +76,7 @@ class Splits(Generic[F]):
         return [group[0] for group in self._frames.values()]
 
     def distinct(self) -> list[tuple[str, F]]:
-        """Return every description once, with the first split that holds it; splits may share frames."""
+        """Return each description once, with the first split that holds it; splits may share frames."""
         found = {
             id(frame): (split, frame) for split in reversed(self.splits) for frame in self._frames[split]
         }
@@ -88,7 +88,7 @@ class Splits(Generic[F]):
 
 
 class SplitDataset(ABC, Generic[F]):
-    """A ``Dataset`` whose frames are described in ``Splits``; a subclass reads one frame and has the background."""
+    """A ``Dataset`` whose frames are described by ``Splits``; subclasses read a frame and define the background."""
 
     def __init__(self, frames: Splits[F]) -> None:
         self._frames = frames
@@ -120,9 +120,9 @@ class SplitDataset(ABC, Generic[F]):
         return views
 
     def sequence(self, others: Sequence[F] = ()) -> FrameSequence:
-        """Return the frames of all splits in the order of time, or of their files' names where times are not recorded.
+        """Return the frames of all splits in chronological order, or in that of file names where times are not recorded.
 
-        ``others`` are frames that no split has, since they lack what a dataset needs.
+        ``others`` are frames that are in no split, since they lack what a dataset needs.
         """
         listed: list[tuple[str | None, F]] = [*self._frames.distinct(), *((None, frame) for frame in others)]
         listed.sort(key=lambda item: natural_order("/".join(item[1].parts)))
@@ -146,7 +146,7 @@ class SplitDataset(ABC, Generic[F]):
 
 
 class OpaqueDataset(SplitDataset[F]):
-    """A ``SplitDataset`` of images that have no alpha channel as a rule: the background is black unless it is given."""
+    """A ``SplitDataset`` of images that usually have no alpha channel: the background is black unless it is given."""
 
     def __init__(self, frames: Splits[F], background: Background | None) -> None:
         super().__init__(frames)

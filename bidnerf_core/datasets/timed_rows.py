@@ -1,7 +1,7 @@
-"""Text files of rows that begin with a time stamp, as the TUM RGB-D benchmark has them.
+"""Text files of rows that begin with a time stamp, as in the TUM RGB-D benchmark.
 
 A row is ``timestamp value value ...``, separated by blanks or commas; ``#`` begins a comment, empty lines are skipped, and
-lines may end as on Windows. Rows may stand in any order.
+Windows line endings are allowed. Rows may be in any order.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.files import open_binary
 
 LARGEST_LIST = 256 * 2**20
-"""Bytes. A trajectory of a day at 100 Hz has as much."""
+"""Bytes. A trajectory over a whole day at 100 Hz is about as large."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class TimedRow:
 
 
 def read_timed_rows(path: Path, columns: str) -> list[TimedRow]:
-    """Read the rows in the order of time; ``columns`` names what each has after its time stamp ("tx ty tz").
+    """Read the rows in chronological order; ``columns`` names the columns after the time stamp ("tx ty tz").
 
     Raises ``InputError`` where the file is missing, not text, too large or without rows, and for a row with fewer
     entries or without a finite time.
@@ -58,7 +58,7 @@ def _row(where: str, words: list[str], columns: str) -> TimedRow:
 
 
 def require_distinct_times(rows: list[TimedRow]) -> None:
-    """Raise ``InputError`` where two rows, which are in the order of time, have the same time stamp."""
+    """Raise ``InputError`` where two of the rows, which are in chronological order, have the same time stamp."""
     for row, following in pairwise(rows):
         if row.time == following.time:
             first, second = sorted((row.where, following.where), key=_line)

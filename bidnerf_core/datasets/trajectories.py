@@ -18,15 +18,15 @@ from bidnerf_core.se3 import SE3
 
 NUMBERS_A_LINE = "tx ty tz qx qy qz qw"
 UNIT_TO = 0.01
-"""How far the length of a quaternion may be from 1, as rounding to four decimals causes it."""
+"""How far the length of a quaternion may be from 1, for example because of rounding to four decimals."""
 LARGEST_GAP = 0.1
-"""Seconds. Over it a hand-held camera strays some millimetres from the interpolated path; motion capture that lost its
-markers leaves longer gaps, in which no pose is known."""
+"""Seconds. Within this time a hand-held camera deviates from the interpolated path by a few millimetres; motion capture that
+lost its markers leaves longer gaps, in which no pose is known."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses ``T_world_camera`` (OpenCV axes, metres) in the order of time (seconds); no time occurs twice."""
+    """Poses ``T_world_camera`` (OpenCV axes, metres) in chronological order (seconds); no time occurs twice."""
 
     times: Float[Tensor, "n"]
     rotations: Float[Tensor, "n 3 3"]
@@ -36,7 +36,7 @@ class Trajectory:
         return len(self.times)
 
     def at(self, time: float, largest_gap: float = LARGEST_GAP) -> SE3 | None:
-        """Return the pose at a time: the sample, or an interpolation of its two neighbours (slerp and linear).
+        """Return the pose at a time: a sample, or the interpolation of its two neighbours (slerp and linear).
 
         None before the first sample, after the last, and between two that are more than ``largest_gap`` seconds apart.
         """
@@ -55,10 +55,10 @@ class Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a file of rows ``timestamp tx ty tz qx qy qz qw``, as TUM's ``groundtruth.txt`` and ``bidnerf`` write it.
+    """Read a file of rows ``timestamp tx ty tz qx qy qz qw``, such as TUM's ``groundtruth.txt`` or what ``bidnerf`` writes.
 
-    Raises ``InputError`` with the file and its line where a row is cut off, a number is not finite, a quaternion is not of
-    length 1, or two rows have one time and different poses.
+    Raises ``InputError``, with the file and line, where a row is cut off, a number is not finite, a quaternion is not of
+    length 1, or two rows have the same time and different poses.
     """
     rows = read_timed_rows(path, NUMBERS_A_LINE)
     numbers = [_pose_numbers(row) for row in rows]

@@ -6,14 +6,14 @@ such lists every eighth frame (the first, the ninth ...) is held out as "test" a
 captures; a single frame is both.
 
 These keys are read from a frame or, where it lacks them, from the file: ``camera_angle_x [camera_angle_y]`` or
-``fl_x [fl_y]``, ``cx cy w h``, ``k1 k2 p1 p2 k3``, ``camera_model``, ``depth_unit_scale_factor`` (metres a unit, default
-0.001; as in nerfstudio it holds for ``.npy`` depth as well). These are read from a frame only: ``file_path`` (its extension
+``fl_x [fl_y]``, ``cx cy w h``, ``k1 k2 p1 p2 k3``, ``camera_model``, ``depth_unit_scale_factor`` (metres per unit, default
+0.001; as in nerfstudio it applies to ``.npy`` depth as well). These are read only from a frame: ``file_path`` (its extension
 may be missing), ``transform_matrix``, ``depth_file_path`` (planar z; see ``depth_images`` for values that count as not
-measured). ``applied_transform`` and ``applied_scale`` record what was already done to the poses. They are not undone, so
-the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or by the number
-that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
+measured). ``applied_transform`` and ``applied_scale`` record transformations that were already applied to the poses. They are
+not undone, so the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or
+by the number that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
 
-Images are used as they are stored: poses and intrinsics describe that raster, so an EXIF orientation is not applied.
+Images are used as they are stored: poses and intrinsics describe that raster, so the EXIF orientation is not applied.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         self._read_depth = DepthReader()
         self._background = None if background is None else background_colour(background)
         self._first: tuple[str, int, int] | None = (
-            None  # file, width, height of the first image of unknown size
+            None  # file, width and height of the first image whose camera has no size
         )
 
     @cached_property
     def background(self) -> tuple[float, float, float]:
-        """The requested colour, or white where the first image of a split has an alpha channel, or black."""
+        """The requested colour; by default white if the first image of a split has an alpha channel, else black."""
         if self._background is not None:
             return self._background
         return background_colour("white" if any(map(self._has_alpha, self._frames.first())) else "black")
@@ -78,7 +78,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         path = self._image_file(frame)
         header = read_header(path)
         width, height = header.width, header.height
-        self._check_size(frame, path, width, height)  # before the pixels take memory
+        self._check_size(frame, path, width, height)  # before memory is allocated for the pixels
         colour, alpha = read_image(path)
         depth = None
         if frame.depth_path is not None:
@@ -110,7 +110,7 @@ class TransformsDataset(SplitDataset[FrameRecord]):
         return path
 
     def _check_size(self, frame: FrameRecord, path: Path, width: int, height: int) -> None:
-        """Compare with the camera's size or, where it has none, with the first such image, which the same lens took."""
+        """Compare with the camera's size or, where it has none, with the first such image, taken with the same lens."""
         camera = frame.camera
         expected, whose = (camera.width or width, camera.height or height), "w and h say"
         if camera.width is None and camera.height is None:

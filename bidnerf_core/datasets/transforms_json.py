@@ -1,4 +1,4 @@
-"""The frames and splits that ``transforms*.json`` describes; no image is read here."""
+"""The frames and splits described by ``transforms*.json``; no image is read here."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class FrameRecord:
     @property
     def stem(self) -> str:
         known = self.file_path.suffix.lower() in IMAGE_SUFFIXES
-        return self.file_path.stem if known else self.file_path.name  # "r_0.5" may well have no extension
+        return self.file_path.stem if known else self.file_path.name  # "r_0.5" may have no extension
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -109,7 +109,7 @@ def _frame(file: Record, number: int, entry: object) -> FrameRecord:
 
 
 def _time(own: Record) -> float | None:
-    """Return ``time`` or ``timestamp`` (seconds), or the number that names the file ``source`` was made of."""
+    """Return ``time`` or ``timestamp`` (seconds), or the number that is the name of the file in ``source``."""
     for key in ("time", "timestamp"):
         if (found := own.number(key)) is not None:
             return found

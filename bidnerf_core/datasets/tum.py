@@ -1,20 +1,21 @@
 """Folders of the TUM RGB-D benchmark as it is distributed (https://cvg.cit.tum.de/data/datasets/rgbd-dataset).
 
 ``rgb.txt`` and ``depth.txt`` list images with their time stamps (seconds), ``groundtruth.txt`` the poses of the colour
-camera in the frame of the motion capture: ``timestamp tx ty tz qx qy qz qw``, camera to world, OpenCV axes. The three have
-clocks and rates of their own. An image has the depth image that is nearest in time, if it is no other's and at most 20 ms
-away, and the pose that is interpolated between the samples before and after it. A frame outside the time of the ground truth,
-or in a gap of it of more than 0.1 s, has no pose: it is in the sequence and not in the dataset. Of the posed frames every
-eighth (the first, the ninth ...) is held out as "test" and the others are "train".
+camera in the frame of the motion capture: ``timestamp tx ty tz qx qy qz qw``, camera to world, OpenCV axes. The three are
+sampled at different times and rates. A colour image is paired with the depth image that is nearest in time, if each is the
+other's nearest and they are at most 20 ms apart, and with the pose interpolated between the samples before and after it. A
+frame outside the time span of the ground truth, or in a gap of more than 0.1 s, has no pose: it is in the sequence but not in
+the dataset. Every eighth of the posed frames (the first, the ninth ...) is held out as "test" and the others are "train".
 
 Depth is 16-bit planar z in steps of 1/5000 m, 0 where nothing was measured, registered to the colour image. The published
-images contain the correction of the depth scale already. Depth of other recordings in this layout is registered by the sensor
-that is given.
+images already contain the correction of the depth scale. Depth of other recordings in this layout is registered from the
+sensor that is given.
 
-The camera is, in this order, the one that is given, as a file or as ``freiburg1``, 2 or 3; that in ``camera.json`` or
-``cameras.txt`` of the folder (as ``--camera`` of ``bidnerf localize`` takes them); and the published one of freiburg1, 2 or 3,
-which the folder's name says. Published principal points count pixels from the centre of the upper left one and are half a pixel larger here. Colour images of
-freiburg1 and freiburg2 are distorted; the camera models it (k1 k2 p1 p2 k3), so that no image is resampled.
+The camera is, in this order: the one that is given, as a file or as ``freiburg1``, 2 or 3; the one in ``camera.json`` or
+``cameras.txt`` of the folder (in the formats of ``bidnerf localize --camera``); the published one of freiburg1, 2 or 3,
+according to the folder's name. Published principal points count pixels from the centre of the upper left one, so half a pixel
+is added here. Colour images of freiburg1 and freiburg2 are distorted; the camera models this (k1 k2 p1 p2 k3), and no image
+is resampled.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ from bidnerf_core.se3 import SE3
 COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 METRES_PER_STEP = 1 / 5000
 LARGEST_DIFFERENCE = 0.02
-"""Seconds between a colour image and its depth image, as the benchmark's own association has it."""
+"""Maximum time (seconds) between a colour image and its depth image, as in the benchmark's own association."""
 CAMERAS = {
     "1": Intrinsics(517.3, 516.5, 319.1, 255.8, 640, 480, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "2": Intrinsics(520.9, 521.0, 325.6, 250.2, 640, 480, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "3": Intrinsics(535.4, 539.2, 320.6, 248.1, 640, 480),
 }
-"""The benchmark's "ROS default" is none of them: these are its calibrations of the three colour cameras."""
+"""The benchmark's calibrations of its three colour cameras, not its "ROS default"."""
 SENSORS = "freiburg1, freiburg2 and freiburg3"
 SENSOR = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
 
@@ -86,7 +87,7 @@ class TumFrame:
 class TumReader:
     """The reader of folders of the TUM RGB-D benchmark.
 
-    ``camera`` (intrinsics or a file) goes before all others; depth is registered from ``sensor``, if there is one.
+    ``camera`` (intrinsics or a file) takes precedence over all others; depth is registered from ``sensor``, if there is one.
     """
 
     camera: Intrinsics | Path | None = None
@@ -97,7 +98,7 @@ class TumReader:
         return (path / COLOUR_LIST).is_file()
 
     def with_camera(self, camera: Intrinsics | Path) -> TumReader:
-        """Return a reader with this camera; a path may also be a name of one of the benchmark's sensors."""
+        """Return a reader with this camera; a path may also be the name of one of the benchmark's sensors."""
         return replace(self, camera=_named_camera(camera) or camera)
 
     def with_depth_sensor(self, sensor: DepthSensor | None) -> TumReader:
@@ -116,7 +117,7 @@ class TumReader:
         return self._dataset(path, hold_out(posed), background)
 
     def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
-        """Read the lists; frames without a pose are in the sequence as well, and all where there is no ground truth."""
+        """Read the lists; the sequence includes frames without a pose, and has only these if there is no ground truth."""
         frames = tum_frames(path)
         posed = [frame for frame in frames if frame.truth is not None]
         unposed = [frame for frame in frames if frame.truth is None]
@@ -173,7 +174,7 @@ class TumDataset(OpaqueDataset[TumFrame]):
 
 
 def published_camera(folder: Path) -> Intrinsics | None:
-    """Return the benchmark's calibration of the sensor that the folder's name says, or None."""
+    """Return the benchmark's calibration of the sensor in the folder's name, or None."""
     found = SENSOR.search(folder.resolve().name)
     return CAMERAS[found[1]] if found else None
 
@@ -204,9 +205,9 @@ def tum_frames(folder: Path) -> list[TumFrame]:
 
 
 def associate(times: Sequence[float], others: Sequence[float], largest: float) -> dict[int, int]:
-    """Return the indices of those pairs that are each other's nearest in time, at most ``largest`` seconds apart.
+    """Return the pairs of indices that are mutually nearest in time, at most ``largest`` seconds apart.
 
-    Both lists are in the order of time.
+    Both lists are in chronological order.
     """
     if not len(times) or not len(others):
         return {}
@@ -219,7 +220,7 @@ def associate(times: Sequence[float], others: Sequence[float], largest: float) -
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return for each time the index of the nearest of the others; the earlier one of two equally near ones."""
+    """Return, for each time, the index of the nearest of the others; of two equally near ones, the earlier."""
     after = np.searchsorted(others, times).clip(1, max(1, len(others) - 1))
     before = after - 1
     after = after.clip(max=len(others) - 1)

@@ -1,8 +1,8 @@
 """Video files as sequences; needs the extra ``video`` (imageio-ffmpeg, which brings ffmpeg along).
 
-Frames are decoded one after the other, each with the time stamp that the file has for it, in seconds from its start: phones record at a
-varying rate. A rotation that the file asks for is applied, so the camera is that of the upright image. A video does not record its focal
-length, so the camera has to be given, or assumed.
+Frames are decoded one after another, each with its time stamp from the file, in seconds from the start: phones record at a
+varying rate. A rotation in the file's metadata is applied, so the camera is that of the upright image. A video does not record
+its focal length, so the camera has to be given, or assumed.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ AS_PICTURES = (
 AS_LIST = ("-map", "0:v:0", "-c", "copy", "-f", "framecrc", "-")
 PICTURE_TIME = re.compile(rb"showinfo.* pts_time: *(-?\d[\d.e+-]*)")
 LONGEST_LISTING = 60.0
-"""Seconds that ffmpeg may take to list the frames of a file, of which it decodes none."""
+"""Seconds that ffmpeg may take to list the frames of a file, without decoding any."""
 
 
 @dataclass(frozen=True)
 class Video:
-    """The frames of a video file in the order of time; see ``FrameSequence``.
+    """The frames of a video file in chronological order; see ``FrameSequence``.
 
-    Its length is the number of frames in the file, of which a trimmed video shows fewer. An iteration raises ``InputError``
-    where the file breaks off.
+    Its length is the number of frames in the file; a trimmed video shows fewer. Iteration raises ``InputError`` where the
+    file breaks off.
     """
 
     path: Path
@@ -80,7 +80,7 @@ class Video:
 
 
 def open_video(path: Path, camera: GivenCamera) -> Video:
-    """Open a video file. Raises ``InputError`` where it is none, without a camera, and where the extra is missing."""
+    """Open a video file. Raises ``InputError`` if it is not one, if there is no camera, and if the extra is missing."""
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError as error:
@@ -95,7 +95,7 @@ def open_video(path: Path, camera: GivenCamera) -> Video:
 
 
 def _count(ffmpeg: str, path: Path) -> int:
-    """Return how many frames a file has to show; those before time 0 were cut off."""
+    """Return the number of frames of a file, except those before time 0, which were trimmed."""
     try:
         listed = subprocess.run(
             [ffmpeg, "-loglevel", "error", *INPUT, str(path.resolve()), *AS_LIST],
@@ -153,7 +153,7 @@ class _Decoder:
         return np.frombuffer(content, np.uint8).reshape(height, width, 3)
 
     def _read_log(self) -> None:
-        """Collect the time stamps that ffmpeg has logged; it logs a frame before it writes it."""
+        """Collect the time stamps that ffmpeg has logged; it logs each frame before writing it."""
         *lines, self._partial = (self._partial + self._log.read()).split(b"\n")
         self._times += [float(found[1]) for line in lines if (found := PICTURE_TIME.search(line))]
         self._last = _last_line(b"\n".join(line for line in lines if b"showinfo" not in line)) or self._last

@@ -1,4 +1,4 @@
-"""Writing views to a folder of ``transforms_SPLIT.json``, images and depth, which the readers understand."""
+"""Writing views to a folder of ``transforms_SPLIT.json``, images and depth, which the readers can read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bidnerf_core.frames import Frame, View
 
 OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
 LENS = ("k1", "k2", "p1", "p2", "k3")
-LARGEST_DEPTH = 65534  # readers take the largest number of 16 bits for "not measured"
+LARGEST_DEPTH = 65534  # readers interpret the largest 16-bit number as "not measured"
 
 
 def write_transforms(
@@ -27,8 +27,8 @@ def write_transforms(
     """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bit) and ``depth/SPLIT/NAME.png`` (16 bit).
 
     ``background`` is the colour behind frames that have an alpha channel; it is removed from their colours. Depth is stored
-    in millimetres, or in larger steps where 16 bits would not reach far enough. Raises ``InputError`` for an unknown split,
-    a name that occurs twice, and a lens of more than five coefficients.
+    in millimetres, or in larger steps where 16 bits would not suffice. Raises ``InputError`` for an unknown split, a name
+    that occurs twice, and a lens with more than five distortion coefficients.
     """
     for split, views in splits.items():
         if split not in SPLITS:
@@ -61,7 +61,7 @@ def _written(folder: Path, split: str, view: View, background: tuple[float, floa
 
 
 def camera_entry(camera: Intrinsics, name: str) -> dict[str, float]:
-    """Return the entries of ``transforms.json`` that describe a camera. Raises ``InputError`` for a lens that it lacks."""
+    """Return the ``transforms.json`` entries of a camera. Raises ``InputError`` for a lens that the format cannot describe."""
     if len(camera.distortion) > len(LENS):
         found = len(camera.distortion)
         raise InputError(f"frame {name}: lens of {found} coefficients, expected at most {len(LENS)}")

@@ -1,1 +1,1 @@
-"""How localizers are judged: protocols, pose errors, statistics, figures."""
+"""Evaluation of localizers: protocols, pose errors, statistics, figures."""

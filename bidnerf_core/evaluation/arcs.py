@@ -23,10 +23,10 @@ def turned_about(
 
 
 def seen_middle(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
-    """Return the point nearest to all optical axes in least squares (metres, world): what cameras around it look at."""
+    """Return the least-squares point nearest to all optical axes (metres, world), which the surrounding cameras look at."""
     eye = torch.eye(3, dtype=torch.float64)
     across = [eye - torch.outer(T.rotation[:, 2], T.rotation[:, 2]) for T in poses]
-    normal = torch.stack(across).sum(0) + 1e-9 * eye  # parallel axes have no such point, and any one does
+    normal = torch.stack(across).sum(0) + 1e-9 * eye  # for parallel axes, any point will do
     return torch.linalg.solve(
         normal, torch.stack([A @ T.translation for A, T in zip(across, poses, strict=True)]).sum(0)
     )
@@ -39,10 +39,10 @@ def mean_up(poses: Sequence[SE3]) -> Float[Tensor, "3"]:
 
 
 def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[int, ...] | None:
-    """Return the indices of ``count`` frames that end with ``last`` and lie ``angle_deg`` apart about their common middle.
+    """Return the indices of ``count`` frames, ``angle_deg`` apart about their common centre, the last of which is ``last``.
 
-    At each step about the vertical axis, the frame with the nearest direction from the middle is chosen. Both senses of
-    rotation are tried, and the better fit is returned; none where no free frame lies within half of the angle of a step.
+    At each step about the vertical axis, the frame whose direction from the centre is nearest is chosen. Both senses of
+    rotation are tried, and the better fit is returned; None if at some step no unused frame lies within half a step.
     """
     middle, up = seen_middle(poses), mean_up(poses)
     directions = torch.nn.functional.normalize(torch.stack([T.translation - middle for T in poses]), dim=-1)
@@ -54,7 +54,7 @@ def arc(poses: Sequence[SE3], last: int, count: int, angle_deg: float) -> tuple[
 def _one_way(
     poses: Sequence[SE3], directions: Tensor, last: int, middle: Tensor, up: Tensor, count: int, angle: float
 ) -> tuple[float, tuple[int, ...]] | None:
-    """Return the mean angle (rad) by which the frames miss their steps, and their indices."""
+    """Return the mean angle (rad) between frames and their ideal places, and the frames' indices; None if one is missing."""
     taken, missed = [last], 0.0
     for step in range(1, count):
         wanted = turned_about(poses[last], middle, up, step * angle).translation - middle

@@ -1,4 +1,4 @@
-"""Many trials: planned from a protocol, run by any executor, and each kept as soon as it is done."""
+"""Many trials: planned from a protocol, run by any executor, and each stored as soon as it is done."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ CHANGED = {
     "points": "depth points than {trial.depth_points} has now",
     "surface": "surface than map {trial.map} has now, which was baked anew",
 }
-"""What a changed digest of a trial's input means, by the digest's name."""
+"""The meaning of a change in each digest of a trial's input, by the digest's name."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to try. None stands for the protocol's own sizes, number of trials and seed."""
+    """A set of trials to run. None selects the protocol's own sizes, number of trials and seed."""
 
     map: str
     data: str
@@ -110,16 +110,16 @@ def changed_settings(method: str, settings: Any) -> str:
 
 
 def left_to_do(trials: Sequence[Trial], file: ResultsFile) -> list[Trial]:
-    """Return the trials that the file does not hold.
+    """Return the trials whose results are not in the file.
 
-    Raises ``InputError`` where it holds one with another training or surface of the map, other images or other settings.
+    Raises ``InputError`` where it holds a result from another training or surface of the map, other images or other settings.
     """
     _check_same([trial for trial in trials if key_of(trial) in file.results], file)
     return [trial for trial in trials if key_of(trial) not in file.results]
 
 
 def repeated_frames(trials: Sequence[Trial]) -> str | None:
-    """Return a sentence about frames that are tried several times from each size, or none where there are none."""
+    """Return a sentence about frames that are tried several times at each size, or None if there are none."""
     times = Counter((trial.fault, trial.size, trial.frames) for trial in trials)
     if not times or max(times.values()) == 1:
         return None
@@ -139,10 +139,10 @@ def run_trials(
     finished: Callable[[TrialResult], None] = lambda result: None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Run the trials that ``file`` does not hold, and keep each result as it comes.
+    """Run the trials whose results ``file`` does not hold, and store each result when it is done.
 
-    At most ``without_motion`` trials are under way, so that a kill loses little. No trial begins once ``stopping`` returns true. A
-    trial that fails ends the run with its error, after the results of the trials under way are kept.
+    At most ``without_motion`` trials are under way at once, so that a kill loses little. No trial begins once ``stopping``
+    returns True. A trial that fails ends the run with its error, after the results of the trials under way have been stored.
     """
     waiting, under_way = iter(left_to_do(trials, file)), set[Future[TrialResult]]()
     failed: BaseException | None = None
@@ -174,13 +174,13 @@ def shard_of(trials: Sequence[Trial], number: int, shards: int) -> list[Trial]:
 
 
 def run_in_worker(trial: Trial) -> TrialResult:
-    """Run a trial in a process that does nothing else, which therefore keeps to one thread."""
+    """Run a trial on one thread, in a process that runs nothing else."""
     torch.set_num_threads(1)
     return run_trial(trial)
 
 
 class InThisProcess(Executor):
-    """An executor that runs every call at once in this process."""
+    """An executor that runs every call immediately, in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -192,14 +192,14 @@ class InThisProcess(Executor):
 
 
 def local_processes(count: int) -> Executor:
-    """Return an executor of ``count`` processes of one thread each, which end when this process ends, however it does."""
+    """Return an executor of ``count`` processes of one thread each, which end when this process ends, for whatever reason."""
     if count == 1:
         return InThisProcess()
     return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=prepare_worker)
 
 
 def prepare_worker() -> None:
-    """Set a worker up: it leaves Ctrl-C to its parent and exits when its parent is gone."""
+    """Set up a worker: it leaves Ctrl-C to its parent and exits when its parent is gone."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -215,7 +215,7 @@ def _follow_parent() -> None:
 
 
 def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
-    """Raise ``InputError`` where a result of ``file`` had other weights, settings or input than its trial has now."""
+    """Raise ``InputError`` where a result in ``file`` came from other weights, settings or input than its trial has now."""
     digests: dict[Any, dict[str, Any]] = {}
     for trial in trials:
         known = file.results[key_of(trial)]
@@ -231,7 +231,7 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
             continue
         seed = (
             None if trial.fault == NO_FAULT else trial.seed
-        )  # the images depend on it only where they have faults
+        )  # the images depend on the seed only if they have faults
         read = trial.frames, trial.depth, trial.depth_points, trial.fault, seed
         if read not in digests:
             digests[read] = to_plain(input_digests(trial, stored, trial_views(trial, dataset)))
@@ -244,7 +244,7 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
 
 
 def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
-    """Raise ``InputError`` where a result was made with other settings; what an earlier version lacked had its default."""
+    """Raise ``InputError`` if a result was made with other settings; those that earlier versions lacked had their defaults."""
     usual = to_flat(find_method(trial.method).config_type())
     found = {RENAMED.get(name, name): value for name, value in known.settings.items()}
     for name, value in to_flat(parse_settings(trial.method, trial.config)).items():
@@ -254,7 +254,7 @@ def _check_settings(trial: Trial, known: TrialResult, message: str) -> None:
 
 
 def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...]]:
-    """Return the names of the views of each frame that may be tried."""
+    """Return, for each frame that may be tried, the names of its views."""
     for name in plan.frames or ():
         if name not in names:
             raise InputError(f"{plan.data}: split {plan.split!r} has no frame {name!r}")
@@ -273,7 +273,7 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
 
 
 def _check_points(plan: Plan, rigs: list[tuple[str, ...]]) -> None:
-    """Raise ``InputError`` where the method uses no depth points, or the views of some frame observe none."""
+    """Raise ``InputError`` if the method does not use depth points, or if the views of some frame observe none."""
     points = opened_points(plan.depth_points, plan.map)
     if points is None:
         return

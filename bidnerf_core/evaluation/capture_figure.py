@@ -1,4 +1,4 @@
-"""A picture of a capture from above: what its landmarks are seen by, where its cameras are, and what is wrong with them."""
+"""A picture of a capture from above: its landmarks by the number of photos that show them, its cameras, and their problems."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ LOOKS: dict[PhotoProblem, tuple[str, str]] = {
 """Colour and marker of each problem."""
 SOUND = COLOURS[2]
 MOST_POINTS = 20_000
-"""Largest number of landmarks that are drawn."""
+"""Maximum number of landmarks that are drawn."""
 CAPTURE_MARGIN = 0.5
-"""How far beyond the cameras the picture reaches, as a share of their extent; landmarks farther away are left out."""
+"""Margin of the picture around the cameras, as a share of their extent; landmarks farther away are left out."""
 MOST_LABELS = 16
-"""Largest number of photos with problems that are named in the picture."""
+"""Maximum number of photos with problems that are named in the picture."""
 
 
 def draw_capture(
     report: CaptureReport, points: Float[Tensor, "n 3"] | None, seen_by: Int[Tensor, "n"] | None, out: Path
 ) -> None:
-    """Draw a capture to ``out``, a PNG. ``points`` (metres, world) are its landmarks, ``seen_by`` the photos that show each.
+    """Draw a capture to ``out``, a PNG.
+
+    ``points`` (metres, world) are its landmarks, ``seen_by`` the number of photos that show each.
 
     Raises ``InputError`` where matplotlib is not installed, or the file cannot be written.
     """
@@ -58,7 +60,7 @@ def draw_capture(
 
 
 def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:
-    """Return points (world) on the horizontal plane, about the centre of the capture, metres."""
+    """Return points (world) projected to the horizontal plane, relative to the centre of the capture; metres."""
     up, centre = (torch.tensor(v, dtype=torch.float64) for v in (report.coverage.up, report.coverage.centre))
     away = torch.as_tensor(points, dtype=torch.float64).reshape(-1, 3) - centre
     first, second = horizontal_axes(up)
@@ -66,7 +68,7 @@ def _from_above(points: Any, report: CaptureReport) -> Float[np.ndarray, "n 2"]:
 
 
 def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport) -> None:
-    """Choose the part of the plane that is shown: the cameras, the centre if they look at it, and a margin."""
+    """Set the part of the plane that is shown: the cameras, the centre if they look at it, and a margin."""
     shown = cameras
     if report.coverage.arrangement in ("around", "one side"):
         shown = np.concatenate([cameras, np.zeros((1, 2))])
@@ -82,7 +84,7 @@ def _frame(panel: Any, cameras: Float[np.ndarray, "v 2"], report: CaptureReport)
 def _draw_landmarks(
     figure: Any, panel: Any, points: Float[np.ndarray, "n 2"], seen_by: Int[Tensor, "n"]
 ) -> None:
-    """Draw landmarks, darker where more photos show them."""
+    """Draw landmarks, darker if more photos show them."""
     step = max(1, math.ceil(len(points) / MOST_POINTS))
     views = seen_by.numpy()[::step]
     order = np.argsort(views, kind="stable")

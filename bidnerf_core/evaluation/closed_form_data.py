@@ -1,7 +1,7 @@
 """Closed-form scenes as maps and datasets, so that an evaluation needs no files.
 
-``demo:blobs`` is also a map: coloured clouds whose field is known exactly, with images rendered from that field.
-``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf_core.scenes`` with exact depth, as data
+``demo:blobs`` is both a dataset and a map: coloured clouds whose field is known exactly, with images rendered from it.
+``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf_core.scenes`` with exact depth, as datasets
 for maps that were trained on them.
 """
 
@@ -34,7 +34,7 @@ DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 FRAMES = 24
 BLOBS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 FRAME_NAME = re.compile(r"(?P<place>\d{4})(?:@(?P<angle>-?\d+(?:\.\d+)?))?")
-"""A frame's name: its number, and in a sequence the degrees by which it is turned."""
+"""A frame's name: its number and, in a sequence, the angle in degrees by which it is turned."""
 
 Scene = TypeVar("Scene")
 Render = Callable[[SE3, str], Frame]
@@ -42,7 +42,7 @@ Render = Callable[[SE3, str], Frame]
 
 @dataclass(frozen=True, eq=False)
 class ClosedFormData:
-    """A ``Dataset`` with the one split "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the middle."""
+    """A ``Dataset`` with the single split "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the middle."""
 
     name: str
     poses: tuple[SE3, ...]  # T_world_camera
@@ -52,7 +52,7 @@ class ClosedFormData:
 
     @property
     def path(self) -> Path:
-        """The name of the scene, in the place of a folder."""
+        """The name of the scene, in place of a folder."""
         return Path(PREFIX + self.name)
 
     @property
@@ -94,7 +94,7 @@ class ClosedFormData:
 
 
 def is_closed_form(name: str) -> bool:
-    """Return whether a map or dataset is a closed-form scene, and no folder."""
+    """Return whether a name is that of a closed-form scene and not of a folder."""
     return name.startswith(PREFIX)
 
 

@@ -9,15 +9,15 @@ from contextlib import contextmanager
 from bidnerf_core.errors import InputError
 
 PATIENCE = "20s"
-"""How long to wait for the scheduler."""
+"""Time to wait for the scheduler."""
 
 
 @contextmanager
 def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
     """Yield an executor of the scheduler at ``address``, and the number of trials that its workers run at once.
 
-    Workers need this package, the same backends, and the maps and data under the same paths. Peak memory is measured for
-    a process: a worker needs one thread (``dask worker --nthreads 1``) for it to be the memory of one trial.
+    Workers need this package, the same backends, and the maps and data under the same paths. Peak memory is measured per
+    process: it is that of one trial only if the worker has one thread (``dask worker --nthreads 1``).
 
     Raises ``InputError`` where dask is missing, and where no scheduler or worker answers.
     """

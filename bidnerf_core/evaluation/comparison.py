@@ -1,4 +1,4 @@
-"""Several maps compared on the same frames from the same starts: what each finds, and at what cost."""
+"""Comparison of several maps on the same frames from the same starts: success and cost."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ ProgressCallback: TypeAlias = Callable[[int, int, Measured], None]
 
 @dataclass(frozen=True)
 class MapRow:
-    """One map of a comparison. Medians and means are over its trials."""
+    """The statistics of one map in a comparison. Medians and means are over its trials."""
 
     map: str  # the shortest name that is unique among the maps
     backend: str
     weights: str  # file name, new with every training
-    success: dict[str, Success | None]  # by criterion; none where it does not apply
-    translation: float | None  # metres, median of the final errors; none where most are not finite
+    success: dict[str, Success | None]  # by criterion; None where it does not apply
+    translation: float | None  # metres, median of the final errors; None where most are not finite
     rotation_deg: float | None
     steps: float  # median
-    seconds: float  # median of a trial's
+    seconds: float  # median time of a trial
     ms_per_step: float  # median
     peak_memory_bytes: int  # of the process of this map
     samples_per_ray: float  # mean
-    map_bytes: int  # size of the files that localization reads
+    map_bytes: int  # size of the map's description and weights
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The setup of a comparison, and one row a map in the order given."""
+    """The setup of a comparison, and one row per map in the order given."""
 
     data: str
     split: str
@@ -59,9 +59,9 @@ class Comparison:
 def plan_comparison(
     usual: Trial, maps: Sequence[str], names: Sequence[str], count: int | None
 ) -> list[list[Trial]]:
-    """Return one trial a map for each start, with the frames and seeds of the protocol.
+    """Return, for each start, one trial per map, with the frames and seeds of the protocol.
 
-    ``usual`` gives everything but the map and the frame; ``names`` are the frames to choose from, empty for all frames of
+    ``usual`` defines everything but the map and the frame; ``names`` are the frames to choose from, empty for all frames of
     the split. Raises ``InputError`` for a name or a number that cannot be used.
     """
     if len({Path(m).resolve() for m in maps}) != len(maps):
@@ -78,9 +78,9 @@ def plan_comparison(
 
 
 def compare_maps(planned: Sequence[Sequence[Trial]], progress: ProgressCallback) -> Comparison:
-    """Run what was planned: each map in a process of its own, one map after the other at each start.
+    """Run the planned trials: each map in its own process, and at each start one map after another.
 
-    Only one process works at a time, so that a change of the machine's load affects all maps alike.
+    Only one process works at a time, so that a change in the machine's load affects all maps alike.
     """
     maps = [trial.map for trial in planned[0]]
     done: list[list[Measured]] = [[] for _ in maps]
@@ -119,7 +119,7 @@ def map_row(label: str, folder: str, measured: Sequence[Measured]) -> MapRow:
 
 
 def map_labels(maps: Sequence[str]) -> list[str]:
-    """Return the folders' names, with as many of their parents as make them unique."""
+    """Return the folders' names, prefixed with as few of their parents as make them unique."""
     parts = [Path(m).resolve().parts for m in maps]
     length = 1
     while len({p[-length:] for p in parts}) < len(parts):
@@ -128,7 +128,7 @@ def map_labels(maps: Sequence[str]) -> list[str]:
 
 
 def map_bytes(folder: Path) -> int:
-    """Return the size of a map's description and weights, without what an interrupted training keeps for itself."""
+    """Return the size of a map's description and weights, without the state that an interrupted training keeps."""
     if is_closed_form(str(folder)):
         return 0
     return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))

@@ -29,9 +29,9 @@ COSTS: dict[str, Callable[[MapRow], float]] = {
 
 
 def comparison_figure(paths: Sequence[Path], comparison: Comparison) -> None:
-    """Draw success with Wilson intervals, time to success and four costs, one colour a map; suffixes give the formats.
+    """Draw success with Wilson intervals, time to success and four costs, one colour per map; suffixes give the formats.
 
-    Raises ``InputError`` where matplotlib, an extra, is missing.
+    Raises ``InputError`` where matplotlib, which is optional, is missing.
     """
     with styled():
         figure = new_figure(11, 6.4)
@@ -75,7 +75,7 @@ def _draw_success(axes: Any, comparison: Comparison) -> None:
 
 
 def _draw_times(axes: Any, comparison: Comparison) -> None:
-    """Draw the share of trials that have met the usual criterion after a time."""
+    """Draw the share of trials that have met the usual criterion as a function of time."""
     criterion = usual_criterion([result for results in comparison.results for result in results])
     for place, (row, results) in enumerate(zip(comparison.rows, comparison.results, strict=True)):
         times = seconds_to_success(results, criterion)

@@ -36,10 +36,9 @@ def normalized_error_squared(
 ) -> Float[Tensor, "*b"]:
     """Return ``xi^T C^-1 xi`` with ``true = found exp(xi)``.
 
-    It is chi-squared with 6 degrees of freedom where the covariance C is consistent (Bar-Shalom et al. 2001, "Estimation
-    with applications to tracking and navigation", 5.4.2).
-
-    Infinite or not a number where the covariance has no inverse.
+    It follows a chi-squared distribution with 6 degrees of freedom if the covariance C is consistent (Bar-Shalom et al. 2001,
+    "Estimation with applications to tracking and navigation", 5.4.2). It is infinite or NaN where the covariance has no
+    inverse.
     """
     xi = (found.to(dtype=torch.float64).inverse() @ true.to(dtype=torch.float64)).log()
     solved, _ = torch.linalg.solve_ex(covariance.double(), xi[..., None])
@@ -47,11 +46,11 @@ def normalized_error_squared(
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return the angle in radians, 0 to pi. ``acos`` of the trace would lose half of the digits near both ends."""
+    """Return the angle in radians, 0 to pi. ``acos`` of the trace would lose half of the digits near either end."""
     skewed = rotation - rotation.mT
     twice_axis = torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.atan2(torch.linalg.vector_norm(twice_axis, dim=-1), trace - 1)  # both twice sin and cos
+    return torch.atan2(torch.linalg.vector_norm(twice_axis, dim=-1), trace - 1)  # twice sine and cosine
 
 
 @runtime_checkable
@@ -63,7 +62,7 @@ class Criterion(Protocol):
 
 @dataclass(frozen=True)
 class Reduced:
-    """Success is a translation error of at most ``fraction`` of the start's (BID-NeRF, section IV)."""
+    """The criterion of a translation error of at most ``fraction`` of the start's (BID-NeRF, section IV)."""
 
     fraction: float
 
@@ -73,7 +72,7 @@ class Reduced:
 
 @dataclass(frozen=True)
 class Within:
-    """Success is a rotation and a translation error below fixed thresholds, wherever the start was."""
+    """The criterion of a rotation and a translation error below fixed thresholds, wherever the start was."""
 
     rotation_deg: float
     translation: float  # metres
@@ -87,11 +86,11 @@ CRITERIA: dict[str, Criterion] = {
     "5deg 0.05": Within(5.0, 0.05),
     "1deg 0.02": Within(1.0, 0.02),
 }
-"""Reported side by side: the criterion of the paper, a usual one and a strict one."""
+"""The criteria that are reported side by side: that of the paper, a common one and a strict one."""
 
 
 def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
-    """Return the first step from which on the criterion holds; none where it does not hold at the end.
+    """Return the first step from which the criterion holds to the end; None if it does not hold at the end.
 
     ``trace`` has one axis: entry 0 is the start's error, entry n the error after step n.
     """

@@ -1,4 +1,4 @@
-"""A figure of faults: success, acceptance and silent errors against the size of each fault."""
+"""A figure of success, acceptance and silent errors against the size of each fault."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ DRAWN_SHARES: dict[str, tuple[Callable[[Summary], int], str]] = {
     "converged": (lambda s: s.converged, COLOURS[0]),
     "converged, but wrong": (lambda s: s.converged_but_wrong, COLOURS[1]),
 }
-"""What a panel shows, as the number of trials and the colour of its line."""
+"""The lines of a panel: each a number of trials, and a colour."""
 
 
 @dataclass(frozen=True)
 class FaultCurve:
-    """The trials of one condition under one kind of fault, by the fault's size in rising order."""
+    """The trials of one condition under one kind of fault, by the fault's size in ascending order."""
 
     situation: Situation  # without fault
     label: str  # of the condition
@@ -59,7 +59,7 @@ def fault_curves(groups: Sequence[Group]) -> list[FaultCurve]:
 def draw_faults(groups: Sequence[Group], folder: Path) -> Path | None:
     """Draw a panel for each curve with Wilson intervals, as PNG and SVG in ``folder``; return the SVG's path.
 
-    None where no fault was tried on its own. Raises ``InputError`` without matplotlib.
+    Returns None where no fault was tried on its own. Raises ``InputError`` without matplotlib.
     """
     curves = fault_curves(groups)
     if not curves:

@@ -25,7 +25,7 @@ INK, FRAME, PAPER = (30, 34, 42), (214, 216, 220), (255, 255, 255)
 OBSERVED_EDGES, RENDERED_EDGES = (0, 190, 110), (235, 0, 140)
 NO_DEPTH = (38, 38, 42)  # colour where no depth was measured
 
-# Turbo colours (Mikhailov 2019): their author's polynomial of degree 5: rows red, green, blue; columns 1, x, x^2 ...
+# Turbo colour map (Mikhailov 2019), its author's polynomial of degree 5; rows: red, green, blue; columns: 1, x, x^2 ...
 TURBO = (
     (0.13572138, 4.61539260, -42.66032258, 132.13108234, -152.94239396, 59.28637943),
     (0.09140261, 2.19418839, 4.84296658, -14.18503333, 4.27729857, 2.82956604),
@@ -39,11 +39,9 @@ def overlay(
     found: ArrayLike | Tensor,
     captions: tuple[str, str, str] = ("observed", "rendered at the start", "rendered at the pose found"),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Return one picture of the observed image and of what is rendered at the start and at the pose found.
+    """Return one picture of the observed image, the rendering at the start and the rendering at the pose found.
 
-    Below each image is its comparison with the observed one.
-
-    Images (h w 3) as ``as_picture`` takes them.
+    Below each image is its comparison with the observed one. Images (h w 3) are as for ``as_picture``.
     """
     images = [as_picture(image, what) for image, what in zip((observed, start, found), captions, strict=True)]
     _require_same_size(images, captions)
@@ -76,7 +74,7 @@ def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarr
 def depth_to_rgb(
     depth: ArrayLike | Tensor, near: float | None = None, far: float | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return depth (h w, metres) in colours from near red to far blue, dark where none was measured (0 or not finite).
+    """Return depth (h w, metres) in colours from red (near) to blue (far), dark where none was measured (0 or not finite).
 
     ``near`` and ``far`` (metres) are the ends of the scale; by default the 1st and 99th percentile of the measured depth.
     """
@@ -89,12 +87,12 @@ def depth_to_rgb(
     low, high = np.percentile(array[measured], (1, 99))
     low, high = low if near is None else near, high if far is None else far
     share = ((np.where(measured, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
-    powers = (0.96 - 0.9 * share)[..., None] ** np.arange(6)  # the map's own ends are nearly black
+    powers = (0.96 - 0.9 * share)[..., None] ** np.arange(6)  # the ends of the colour map are nearly black
     return np.where(measured[..., None], as_picture(powers @ np.array(TURBO).T), np.array(NO_DEPTH, np.uint8))
 
 
 def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pale mean of two images with the edges of each in its own colour, which coincide at the true pose."""
+    """Return the pale mean of two images, with the edges of each in its own colour; they coincide at the true pose."""
     a, b = as_picture(observed, "observed"), as_picture(rendered, "rendered")
     _require_same_size([a, b], ("observed", "rendered"))
     mixed = 0.55 * (a / 2 + b / 2) + 0.45 * 255
@@ -116,7 +114,7 @@ def chequered(
 
 
 def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
-    """Return the strength of edges, 0 to 1, of which the strongest tenth stands out."""
+    """Return the strength of edges, 0 to 1, scaled so that the strongest tenth stands out."""
     grey = as_picture(image).astype(np.float64).mean(-1) / 255
     padded = np.pad(grey, 1, mode="edge")
     across, down = padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]
@@ -126,7 +124,7 @@ def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
 
 
 def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the image on white, enlarged if it is small, with its caption above."""
+    """Return the image on white, enlarged if it is small, with its caption above it."""
     picture = Image.fromarray(as_picture(image))
     scale = max(1, round(TILE / picture.width))
     picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
@@ -141,7 +139,7 @@ def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
-    """Write an endless animation of images (h w 3) of one size."""
+    """Write an endless animation of images (h w 3) of the same size."""
     if not (math.isfinite(fps) and fps > 0):
         raise InputError(f"{path}: {fps} frames a second, expected a positive number")
     pictures = [as_picture(frame, f"frame {i}") for i, frame in enumerate(frames)]
@@ -154,9 +152,9 @@ def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float 
 
 
 def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
-    """Plot translation and rotation error after each step on a logarithmic scale, one curve a name.
+    """Plot translation and rotation error after each step on a logarithmic scale, one curve per name.
 
-    Entry 0 of a trace is the start. Values that have no logarithm leave a gap. Raises ``InputError`` without matplotlib.
+    Entry 0 of a trace is the start. Values without a logarithm leave a gap. Raises ``InputError`` without matplotlib.
     """
     if not traces:
         raise InputError(f"{path}: a plot of no traces")

@@ -1,4 +1,4 @@
-"""Digests of what a trial reads, so that results of other images or another surface are not taken for its own."""
+"""Digests of a trial's input, so that results from other images or another surface are not mistaken for its own."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DIGEST_BYTES = 16  # enough that no two inputs share one by chance
 
 @dataclass(frozen=True)
 class InputDigests:
-    """What a trial's input contained. Folders may move, and machines may differ; content may not."""
+    """Digests of the content of a trial's input. Folders may move, and machines may differ; content may not."""
 
     views: str  # images, depth, intrinsics and true poses of the frames, in hexadecimal
     points: str | None = None  # files of the COLMAP model that depth points were taken from
@@ -28,7 +28,7 @@ class InputDigests:
 
 
 def views_digest(views: Sequence[View]) -> str:
-    """Return the digest of the images, depth, alpha, intrinsics and poses of ``views``, which their order is part of."""
+    """Return the digest of the images, depth, alpha, intrinsics and poses of ``views``; it depends on their order."""
     hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
     for view in views:
         frame = view.frame

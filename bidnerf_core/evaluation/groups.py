@@ -1,4 +1,4 @@
-"""Results grouped by situation, which is what was to be localized, and by condition, which is what localized it."""
+"""Results grouped by situation (what was to be localized) and by condition (what localized it)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from bidnerf_core.evaluation.trial import TrialResult
 
 @dataclass(frozen=True)
 class Situation:
-    """The map, the images and the starts of some trials. ``size`` is none where trials of all sizes are pooled."""
+    """The map, the images and the starts of some trials. ``size`` is None where trials of all sizes are pooled."""
 
     map: str
-    weights: str  # which training of it
+    weights: str  # file name of the map's weights, which identifies the training
     data: str
     split: str
     protocol: str
@@ -25,7 +25,7 @@ class Situation:
 
     @property
     def start(self) -> str:
-        """Return the start in words, and the faults of the images where they have any."""
+        """The start in words, with the faults of the images if there are any."""
         words = "no start" if self.protocol == "none" else self.protocol
         if self.size is None:
             words += ", all sizes"
@@ -36,7 +36,7 @@ class Situation:
 
 @dataclass(frozen=True)
 class Condition:
-    """The method with its settings and what it ran on."""
+    """The method with its settings, and the input and hardware that it ran on."""
 
     method: str
     settings: str  # JSON of all of them
@@ -47,7 +47,7 @@ class Condition:
     depth_points: str | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return everything that tells conditions apart, by name."""
+        """Return all properties that distinguish conditions, by name."""
         own = {"images": self.images, "depth": self.depth, "depth_points": self.depth_points}
         own |= {"backend": self.backend, "device": self.device}
         return {"method": self.method, **own, **json.loads(self.settings)}
@@ -64,7 +64,7 @@ class Group:
 
 
 def grouped(results: Sequence[TrialResult]) -> list[Group]:
-    """Return all groups in the order in which they appear; groups that pool all sizes come after the single sizes."""
+    """Return all groups in order of appearance; groups that pool all sizes come after those of single sizes."""
     found: dict[tuple[Situation, Condition], list[TrialResult]] = {}
     for result in results:
         found.setdefault((situation_of(result), condition_of(result)), []).append(result)
@@ -79,7 +79,7 @@ def situations(groups: Sequence[Group]) -> list[Situation]:
 
 
 def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
-    """Return a title for each situation: its start, after the map and the data where these are not all the same."""
+    """Return a title for each situation: its start, preceded by the map and the data unless all share these."""
     maps = {situation.map for situation in every}
     trainings = {(situation.map, situation.weights) for situation in every}
     datasets = {(situation.data, situation.split) for situation in every}
@@ -94,7 +94,7 @@ def situation_titles(every: Sequence[Situation]) -> dict[Situation, str]:
 
 
 def situation_of(result: TrialResult) -> Situation:
-    """Return the situation that a trial belongs to."""
+    """Return the situation to which a trial belongs."""
     trial = result.trial
     return Situation(
         trial.map, result.weights, trial.data, trial.split, trial.protocol, trial.size, trial.fault
@@ -102,7 +102,7 @@ def situation_of(result: TrialResult) -> Situation:
 
 
 def condition_of(result: TrialResult) -> Condition:
-    """Return the condition that a trial belongs to."""
+    """Return the condition to which a trial belongs."""
     trial, settings = result.trial, json.dumps(result.settings, sort_keys=True)
     images = len(trial.frames)
     return Condition(
@@ -111,7 +111,7 @@ def condition_of(result: TrialResult) -> Condition:
 
 
 def condition_labels(conditions: Sequence[Condition]) -> dict[Condition, str]:
-    """Return a label for each condition: its method, and whatever not all conditions of that method share."""
+    """Return a label for each condition: its method, and the properties in which that method's conditions differ."""
     named: dict[Condition, str] = {}
     for condition in conditions:
         same = [other.facts() for other in conditions if other.method == condition.method]

@@ -1,7 +1,7 @@
 """Append-only files of one JSON object per line, which stay valid if the process is killed at any moment.
 
-A line is on the disk before its work counts as done. A line that a kill left half-written at the end is cut off when the
-file is next opened. Anything else that is not JSON raises an error that names the line, and is never deleted.
+A line is on disk before its work counts as done. An incomplete last line, left by a kill, is cut off when the file is next
+opened. Anything else that is not JSON raises an error that names the line, and is never deleted.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.files import open_binary, read_file, read_open_file, write_file
 
 LARGEST_LINES = 512 * 2**20
-"""Bytes. A trial takes some kilobytes, so a file holds a hundred thousand of them."""
+"""Bytes. A trial takes a few kilobytes, so this is enough for a hundred thousand trials."""
 
 
 @dataclass(frozen=True)
 class LineFormat:
-    """The format of a JSON Lines file: how each of its lines begins, and how errors describe the expected content.
+    """The format of a JSON Lines file: the beginning of each line, and a description of the content for error messages.
 
-    An incomplete last line is dropped only if it begins like the others; any other is an error, so no foreign file is cut.
+    An incomplete last line is dropped only if it begins as expected; otherwise it is an error, so no foreign file is truncated.
     """
 
     opening: bytes
-    expected: str  # ends the error about a line that is something else
+    expected: str  # the end of the error message about any other line
 
     def parse(self, path: Path, content: bytes) -> tuple[list[tuple[str, Any]], int]:
-        """Return the place and the object of each line, and how many bytes belong to whole lines."""
+        """Return the place (for messages) and the object of each line, and the number of bytes in complete lines."""
         lines, found, length = content.split(b"\n"), [], 0
         for number, line in enumerate(lines, start=1):
             where = f"{path}: line {number}"
@@ -49,7 +49,7 @@ class LineFormat:
         return found, length
 
     def read(self, path: Path) -> list[tuple[str, Any]]:
-        """Return the place and the object of each whole line of ``path``. Raises ``InputError`` where it cannot be read."""
+        """Return the place and the object of each complete line of ``path``. Raises ``InputError`` if it cannot be read."""
         return self.parse(path, read_file(path, self.expected, LARGEST_LINES))[0]
 
 
@@ -87,7 +87,7 @@ class JsonLinesFile:
             self._file = None
 
     def append(self, plain: Any) -> None:
-        """Write one line, which is on the disk when this returns. Raises ``InputError`` where the file was removed."""
+        """Write one line, which is on disk when this returns. Raises ``InputError`` where the file was removed."""
         file = self._opened()
         self.check_there()
         file.write(as_line(plain))
@@ -95,14 +95,14 @@ class JsonLinesFile:
         os.fsync(file.fileno())
 
     def replace(self, plain: Iterable[Any]) -> None:
-        """Write all lines anew, all of them or none."""
+        """Replace all lines atomically."""
         self.check_there()
         write_file(self.path, b"".join(map(as_line, plain)))
-        self.close()  # what was open is the file of before
+        self.close()  # the open file is the one that was replaced
         self._file = self._locked()
 
     def check_there(self) -> None:
-        """Raise ``InputError`` where the path does not name the open file any more: its lines would be lost unnoticed."""
+        """Raise ``InputError`` where the path no longer names the open file, so that lines would be lost unnoticed."""
         try:
             same = os.path.samestat(os.fstat(self._opened().fileno()), self.path.stat())
         except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Measures the peak memory of this process."""
+"""The peak memory of this process."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def forget_peak_memory() -> None:
-    """Reset the peak where the system can; elsewhere it stays the peak since the process began."""
+    """Reset the peak where the system supports it; elsewhere it remains the peak since the process began."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()
     with contextlib.suppress(OSError):
-        RESET.write_text("5")  # proc(5): the peak resident set becomes the present one
+        RESET.write_text("5")  # proc(5): resets the peak resident set to the present one
 
 
 def peak_memory_bytes() -> int:

@@ -1,4 +1,4 @@
-"""The page of a report: one HTML file with everything in it, for a browser without a network."""
+"""The page of a report: one self-contained HTML file, which needs no network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bidnerf_core.evaluation.significance import PairTest, pairwise_tests
 from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summarize
 
 MARK = '<meta name="generator" content="bidnerf report">'
-"""Marks a page as a report, which a later report may replace."""
+"""The mark of a page as a report, which a later report may replace."""
 
 UNFINISHED = (
     f"<!doctype html>{MARK}<title>Unfinished report</title>"

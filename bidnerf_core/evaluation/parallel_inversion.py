@@ -1,7 +1,7 @@
-"""The 25 starts of Parallel Inversion (Lin et al. 2023, "Parallel Inversion of Neural Radiance Fields for Robust Pose
-Estimation"), from the description of its published bulk experiment.
+"""The 25 starts of Parallel Inversion, from the description of its published bulk experiment.
 
-The program seeds numpy's legacy generator once and draws 5 frames of the test file *with* replacement, 5x5x3 Euler
+The paper is Lin et al. 2023, "Parallel Inversion of Neural Radiance Fields for Robust Pose Estimation".
+The program seeds NumPy's legacy generator once and draws 5 frames of the test file *with* replacement, 5x5x3 Euler
 angles uniform in +-15 degrees, and 5x5x3 translations uniform in +-0.25. The angles (phi, theta, psi) turn the camera about
 its own centre and the *world's* axes, R' = Rz(phi) Ry(-theta) Rx(psi) R, and the centre moves along the world's axes. The
 numbers depend on the number of frames in the split, since the choice of frames consumes random numbers. Ranges and seed

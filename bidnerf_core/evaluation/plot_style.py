@@ -1,4 +1,4 @@
-"""What every plot shares: the palette, the style, the words for criteria, and a figure without global state."""
+"""The common parts of all plots: the palette, the style, the names of criteria, and figures without global state."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.files import write_file
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
-"""The colour-blind-safe palette of Okabe and Ito (2008), with brown for its yellow, which white paper swallows."""
+"""The colour-blind-safe palette of Okabe and Ito (2008), with brown instead of yellow, which is hard to see on white."""
 
 DASHES = ("-", "--", ":", "-.")  # for more lines than there are colours
 STYLE: dict[str, Any] = {
@@ -34,7 +34,7 @@ SHORT_CRITERION_NAMES = {
 
 
 def require_matplotlib() -> Any:
-    """Return matplotlib. Raises ``InputError`` where this extra is not installed."""
+    """Return matplotlib. Raises ``InputError`` where this optional dependency is not installed."""
     try:
         import matplotlib
     except ImportError as error:
@@ -48,7 +48,7 @@ def styled() -> Any:
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure (inches) that no window shows and pyplot does not hold."""
+    """Return an empty figure (inches) without a window, which pyplot does not keep alive."""
     require_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -59,7 +59,7 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save_figure(figure: Any, folder: Path, name: str) -> Path:
-    """Save a figure as SVG, whose path is returned, and as PNG beside it."""
+    """Save a figure as SVG, and as PNG next to it; return the path of the SVG."""
     folder.mkdir(parents=True, exist_ok=True)
     write_figure(figure, folder / f"{name}.png", dpi=160)
     write_figure(figure, folder / f"{name}.svg", metadata={"Date": None})

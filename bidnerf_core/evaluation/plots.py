@@ -1,4 +1,4 @@
-"""The figures of a report: one panel a situation, and for each condition the same colour everywhere."""
+"""The figures of a report: one panel per situation, and the same colour for a condition in all of them."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ DrawPanel = Callable[[Any, list[Group]], None]
 class Figures:
     """Draws figures of ``groups`` and saves them as PNG and SVG in ``folder``. Raises ``InputError`` without matplotlib.
 
-    ``criterion`` is what counts as success in the figures that show one criterion only. Figures of steps have panels for
-    images without faults only, unless there are no such trials.
+    ``criterion`` defines success in the figures that show a single criterion. Figures of steps have panels only for images
+    without faults, unless there are no such trials.
     """
 
     def __init__(self, groups: Sequence[Group], folder: Path, criterion: str) -> None:
@@ -43,7 +43,7 @@ class Figures:
         self.titles = situation_titles(situations(groups))
 
     def rates(self) -> Path:
-        """Draw success rates with intervals: one panel a criterion, one line a group."""
+        """Draw success rates with intervals: one panel per criterion, one line per group."""
         shown = self.groups
         height = 0.9 + 0.27 * len(shown) + 0.2 * len(situations(shown))
         with styled():
@@ -62,7 +62,7 @@ class Figures:
             return save_figure(figure, self.folder, "rates")
 
     def steps(self) -> Path:
-        """Draw box plots of steps to success, with whiskers to 1.5 times the interquartile range and a point a trial."""
+        """Draw box plots of steps to success, with whiskers to 1.5 times the interquartile range and one point per trial."""
 
         def draw(panel: Any, groups: list[Group]) -> None:
             for place, group in enumerate(groups):
@@ -79,7 +79,7 @@ class Figures:
         return self._panels("steps", draw, title_pad=15)
 
     def share(self) -> Path:
-        """Draw the share of trials that meet the criterion from each step on."""
+        """Draw, for each step, the share of trials that meet the criterion from then on."""
 
         def draw(panel: Any, groups: list[Group]) -> None:
             last = max(1, *(result.steps for group in groups for result in group.results))
@@ -124,7 +124,7 @@ class Figures:
         sharey: bool = False,
         groups: Sequence[Group] | None = None,
     ) -> Path:
-        """Draw one panel a situation with a legend below: of ``groups``, by default those that the criterion applies to."""
+        """Draw one panel per situation of ``groups`` (by default those to which the criterion applies), and a legend below."""
         fitting = [group for group in self.without_faults if applies(self.criterion, group.results)]
         shown = fitting if groups is None else groups
         places = situations(shown)
@@ -187,7 +187,7 @@ class Figures:
 
 
 def _lines(groups: Sequence[Group]) -> list[float]:
-    """Return the heights of lines, with a gap between situations."""
+    """Return the vertical positions of the lines, with a gap between situations."""
     heights: list[float] = []
     for place, group in enumerate(groups):
         new = place > 0 and group.situation != groups[place - 1].situation
@@ -203,7 +203,7 @@ def _quartiles(errors: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "3 s"]:
 
 
 def _table(group: Group, kind: str) -> Float[np.ndarray, "n s"]:
-    """Return errors (trials, steps); the last one continues where a trial ended sooner."""
+    """Return errors (trials, steps); where a trial ended early, its last error is repeated."""
     rows = [
         np.array([np.nan if x is None else x for x in getattr(result.errors, kind)])
         for result in group.results

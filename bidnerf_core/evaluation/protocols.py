@@ -1,4 +1,4 @@
-"""Protocols: which frames are tried with which seeds, and from which start, reproducible from a seed alone.
+"""Protocols, which choose frames, seeds and starts; their choices are reproducible from a seed alone.
 
 ``PROTOCOLS`` holds them by name.
 """
@@ -31,7 +31,7 @@ def bid_start(T_true: SE3, size: float, seed: int) -> SE3:
 
 
 def bid_hard_start(T_true: SE3, size: float, seed: int) -> SE3:
-    """Return a start as ``bid_start`` does, with e_r up to 1.4 rad, the upper end of the range that the paper prints."""
+    """Return a start as ``bid_start`` does, with e_r up to 1.4 rad, the upper end of the range in the paper."""
     return _bid(T_true, size, 1.4, seed)
 
 
@@ -86,7 +86,7 @@ FARTHEST_START = 1e6
 """The largest translation error of a start, metres."""
 
 MOST_TRIALS = 100_000
-"""The largest number of trials of one size: all trials of a plan are in memory."""
+"""The maximum number of trials of one size, since all trials of a plan are in memory."""
 
 Case = tuple[int, int]
 """The index of a frame in its split, and the seed of a trial on it."""
@@ -105,10 +105,10 @@ class Protocol:
     plan: Callable[[int, int, int], list[Case]] | None = (
         None  # takes the numbers of frames and trials, and the seed
     )
-    fixed: bool = False  # whether it needs all frames of a split to choose from
+    fixed: bool = False  # whether it always chooses from all frames of a split
 
     def cases(self, frames: int, trials: int, seed: int) -> list[Case]:
-        """Return the trials of one size. A larger number begins with the same trials."""
+        """Return the cases of one size. A larger number of trials begins with the same cases."""
         if frames < 1:
             raise InputError("nothing to try: expected at least one frame")
         if trials > MOST_TRIALS:
@@ -127,7 +127,7 @@ class Protocol:
 
 
 def each_in_turn(frames: int, trials: int, seed: int) -> list[Case]:
-    """Return all frames in a random order, over and over; every trial has its own seed."""
+    """Return all frames in random order, repeatedly; every trial has its own seed."""
     order = torch.randperm(frames, generator=torch.Generator().manual_seed(seed)).tolist()
     return [(order[i % frames], seed + i) for i in range(trials)]
 

@@ -1,4 +1,4 @@
-"""What it takes to reproduce results: the command, the code and the machine; and records that hold it."""
+"""The provenance that is needed to reproduce results (command, code and machine), and records that include it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bidnerf_core.serialization import from_plain, to_plain
 
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
 SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
-"""Folders whose changes make a run irreproducible from its commit."""
+"""Folders in which uncommitted changes make a run irreproducible from its commit."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class Provenance:
     system: str
     python: str
     versions: dict[str, str]
-    workers: str  # what ran the trials
+    workers: str  # a description of the workers that ran the trials
 
 
 def provenance(command: str, workers: str) -> Provenance:
-    """Return the provenance of a run that begins now; ``workers`` says what runs it."""
+    """Return the provenance of a run that begins now; ``workers`` describes what runs it."""
     return Provenance(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         command=command,
@@ -63,7 +63,7 @@ def provenance(command: str, workers: str) -> Provenance:
 
 
 def command_line(name: str, arguments: list[str]) -> str:
-    """Return a command as a shell takes it."""
+    """Return a command, quoted for a shell."""
     return shlex.join([*name.split(), *arguments])
 
 
@@ -73,13 +73,13 @@ def beside(results: Path) -> Path:
 
 
 def note_run(results: Path, run: Provenance) -> None:
-    """Add a run to the list beside a file of results, which may take several runs to complete."""
+    """Add a run to the list that accompanies a file of results, which may take several runs to complete."""
     runs = [*read_runs(results), run]
     write_file(beside(results), (json.dumps({"runs": to_plain(runs)}, indent=1) + "\n").encode())
 
 
 def read_runs(results: Path) -> list[Provenance]:
-    """Return the runs behind a file of results, first to last; none where no list lies beside it."""
+    """Return the runs behind a file of results, first to last; empty if no list accompanies it."""
     path = beside(results)
     if not path.is_file():
         return []
@@ -87,7 +87,7 @@ def read_runs(results: Path) -> list[Provenance]:
     content, expected = read_file(path, what), f"expected {what}"
     try:
         found: Any = json.loads(content)
-        json.dumps(found, ensure_ascii=False).encode()  # half of a surrogate pair cannot be written again
+        json.dumps(found, ensure_ascii=False).encode()  # fails for half a surrogate pair
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}), {expected}") from error
     if not isinstance(found, dict) or not isinstance(found.get("runs"), list):
@@ -96,9 +96,9 @@ def read_runs(results: Path) -> list[Provenance]:
 
 
 def git(*arguments: str) -> str:
-    """Return the output of a git command in this package's checkout; nothing where there is no checkout or no git."""
+    """Return the output of a git command in this package's checkout; empty where there is no checkout or no git."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
-    if not (root / ".git").exists():  # installed, perhaps inside of some other project
+    if not (root / ".git").exists():  # installed, perhaps inside another project
         return ""
     try:
         done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True)
@@ -120,12 +120,12 @@ def cpu_model() -> str:
 def _memory() -> int | None:
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # not everywhere
+    except (AttributeError, ValueError, OSError):  # not available on all systems
         return None
 
 
 def _version(name: str) -> str | None:
-    if name == "torch":  # its build says more than its distribution
+    if name == "torch":  # its version names the build, unlike the distribution's
         return str(torch.__version__)
     try:
         return version(name)
@@ -134,7 +134,7 @@ def _version(name: str) -> str | None:
 
 
 def script_command() -> str:
-    """Return the command of the running script, with paths relative to the checkout, or their names outside of it."""
+    """Return the command of the running script; paths are relative to the checkout, or only names outside of it."""
     root = Path(bidnerf_core.__file__).resolve().parents[1]
     return shlex.join(["python", *(_without_local_path(word, root) for word in sys.argv)])
 
@@ -142,7 +142,7 @@ def script_command() -> str:
 def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:
     """Write the results of a benchmark script with its provenance to ``path``, a JSON file, and return the path.
 
-    Raises ``ValueError`` where ``results`` hold what strict JSON cannot.
+    Raises ``ValueError`` where ``results`` hold values that strict JSON cannot represent.
     """
     threads = torch.get_num_threads()
     run = provenance(script_command(), f"one process of {threads} thread{'s' if threads > 1 else ''}")

@@ -1,4 +1,4 @@
-"""A file of results: one JSON line per trial, each on the disk before its trial counts as done."""
+"""A file of results: one JSON line per trial, each on disk before its trial counts as done."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.serialization import from_plain, to_plain
 
 Key: TypeAlias = str
-"""What tells trials apart, wherever their folders are."""
+"""The identity of a trial, independent of where its folders are."""
 
 RESULT_LINES = LineFormat(b'{"T_world_camera": ', "lines as 'bidnerf evaluate' writes")
 
@@ -29,9 +29,9 @@ def result_line(result: TrialResult) -> bytes:
 
 
 def read_results(paths: Iterable[Path]) -> list[TrialResult]:
-    """Return the results of all files in order; one that several files hold is returned once.
+    """Return the results of all files in order; a result that several files hold is returned once.
 
-    A half-written last line is passed over. Raises ``InputError`` for a file that cannot be read or holds something else.
+    An incomplete last line is ignored. Raises ``InputError`` for a file that cannot be read or holds something else.
     """
     found: dict[Any, TrialResult] = {}
     for path in paths:
@@ -66,12 +66,12 @@ class ResultsFile:
         self._file.close()
 
     def add(self, result: TrialResult) -> None:
-        """Keep a result, which is on the disk when this returns. Raises ``InputError`` where the file was removed."""
+        """Append a result, which is on disk when this returns. Raises ``InputError`` where the file was removed."""
         self._file.append(to_plain(result))
         self.results[key_of(result.trial)] = result
 
     def put_in_order(self, trials: Sequence[Trial]) -> None:
-        """Write the results of ``trials`` in their order, after everything else the file holds, in one atomic step."""
+        """Move the results of ``trials`` to the end of the file, in their order, in one atomic step."""
         self._file.check_there()
         wanted = [key_of(trial) for trial in trials]
         asked = set(wanted)

@@ -26,7 +26,7 @@ class PairTest:
 
 
 def pairwise_tests(groups: Sequence[Group], criterion: str) -> list[PairTest]:
-    """Return the tests of every pair of groups that share a situation and that the criterion applies to."""
+    """Return the tests of every pair of groups that share a situation and to which the criterion applies."""
     fitting = [group for group in groups if applies(criterion, group.results)]
     pairs = itertools.combinations(fitting, 2)
     return [compare_pair(a, b, criterion) for a, b in pairs if a.situation == b.situation]
@@ -54,11 +54,11 @@ def compare_pair(first: Group, second: Group, criterion: str) -> PairTest:
 
 
 def _all_p(first: list[float], second: list[float]) -> float:
-    """Return the p value over all trials. Failures tie; where all trials tie, nothing differs."""
+    """Return the p value over all trials. All failures tie; it is 1 where all trials tie."""
     from scipy.stats import mannwhitneyu
 
     if len({*first, *second}) == 1:
         return 1.0
     largest = 1 + max((s for s in (*first, *second) if s < NEVER), default=0)
-    ranks = [[min(s, largest) for s in row] for row in (first, second)]  # only the order counts
+    ranks = [[min(s, largest) for s in row] for row in (first, second)]  # only the order matters
     return float(mannwhitneyu(*ranks, alternative="two-sided", method="asymptotic").pvalue)

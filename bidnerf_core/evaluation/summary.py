@@ -14,12 +14,12 @@ NEVER = math.inf
 """Steps to success of a trial that did not succeed."""
 
 RELATIVE, ABSOLUTE = "10%", "5deg 0.05"
-"""The criteria that are used where there is room for one: with a start, and without."""
+"""The criterion shown where there is room for only one: with a start, and without."""
 
 
 @dataclass(frozen=True)
 class Success:
-    """How often trials met a criterion, and how soon: medians over the trials that met it."""
+    """The rate at which trials met a criterion, and the median steps and time of those that met it."""
 
     rate: Rate
     steps: float | None
@@ -28,10 +28,10 @@ class Success:
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of one group of trials. A median is none where the middle value is unknown."""
+    """Statistics of one group of trials. A median is None where the middle value is unknown."""
 
     trials: int
-    criteria: dict[str, Success | None]  # by name; none where a criterion does not apply
+    criteria: dict[str, Success | None]  # by name; None where a criterion does not apply
     translation: float | None  # metres, median of the final errors
     rotation_deg: float | None  # median of the final errors
     steps: float  # median
@@ -44,18 +44,18 @@ class Summary:
 
 
 def applies(criterion: str, results: Sequence[TrialResult]) -> bool:
-    """Return whether every trial can be judged by a criterion: a share of the start's error needs a start."""
+    """Return whether a criterion applies to every trial: a share of the start's error needs a start."""
     needs_start = isinstance(CRITERIA[criterion], Reduced)
     return not needs_start or all(result.start_error is not None for result in results)
 
 
 def usual_criterion(results: Sequence[TrialResult]) -> str:
-    """Return the name of the criterion to show where there is room for one."""
+    """Return the name of the criterion to show where there is room for only one."""
     return RELATIVE if applies(RELATIVE, results) else ABSOLUTE
 
 
 def steps_of(results: Sequence[TrialResult], criterion: str) -> list[float]:
-    """Return the steps to success of each trial, ``NEVER`` where there was none."""
+    """Return the steps to success of each trial, ``NEVER`` for those without success."""
     found = (steps_to_success(result.errors.as_error(), CRITERIA[criterion]) for result in results)
     return [NEVER if steps is None else float(steps) for steps in found]
 
@@ -91,7 +91,7 @@ def summarize(results: Sequence[TrialResult]) -> Summary:
 
 
 def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None:
-    """Return how often and how soon trials met a criterion; none where it does not apply to them."""
+    """Return how often and how soon trials met a criterion; None where it does not apply to them."""
     if not applies(criterion, results):
         return None
     reached = [s for s in steps_of(results, criterion) if s < NEVER]
@@ -100,9 +100,9 @@ def success_of(results: Sequence[TrialResult], criterion: str) -> Success | None
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Return the median, the mean of two middle values; an unknown value counts as infinite.
+    """Return the median (of an even number, the mean of the two middle values); an unknown value counts as infinite.
 
-    None where there is no value, or where a middle value is unknown.
+    Returns None where there is no value, or where a middle value is unknown.
     """
     known = [math.inf if value is None else float(value) for value in values]
     middle = statistics.median(known) if known else math.inf

@@ -19,7 +19,7 @@ from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.se3 import SE3
 
 LEAST_POSES = 3
-"""Least number of poses that an alignment determines."""
+"""Minimum number of poses from which an alignment is determined."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ErrorSummary:
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """The errors of a trajectory; None where there are too few poses for the measure."""
+    """The errors of a trajectory; a measure is None where there are too few poses for it."""
 
     poses: int
     raw: ErrorSummary
@@ -52,7 +52,7 @@ class TrajectoryErrors:
 
     @staticmethod
     def of(found: SE3, true: SE3) -> TrajectoryErrors:
-        """Compare poses ``T_world_camera`` (n), in the order of time. Raises ``InputError`` where there are none."""
+        """Compare poses ``T_world_camera`` (n), in chronological order. Raises ``InputError`` where there are none."""
         count = len(found.translation)
         distances = alignment_errors(found, true) if count >= LEAST_POSES else None
         return TrajectoryErrors(
@@ -64,7 +64,7 @@ class TrajectoryErrors:
 
 
 def rigid_alignment(found: SE3, true: SE3) -> SE3:
-    """Return T_true_found that brings the camera centres of ``found`` (n) nearest to those of ``true``, without scaling.
+    """Return the T_true_found that brings the camera centres of ``found`` (n) nearest to those of ``true``, without scaling.
 
     Raises ``InputError`` where all centres coincide.
     """
@@ -76,7 +76,7 @@ def rigid_alignment(found: SE3, true: SE3) -> SE3:
 def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
     """Return the absolute trajectory error of each pose: its distance (metres) from the truth after a rigid alignment.
 
-    None where the camera did not move, so that no rotation aligns the trajectories.
+    Returns None where the camera did not move, so that the rotation is undetermined.
     """
     try:
         T_true_found = rigid_alignment(found, true)
@@ -87,7 +87,7 @@ def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
 
 
 def relative_errors(found: SE3, true: SE3, apart: int = 1) -> PoseError:
-    """Return the relative pose errors: those of the motion from each pose to the one ``apart`` places later (n - apart).
+    """Return the relative pose errors (n - apart), those of the motion from each pose to the one ``apart`` places later.
 
     Sturm et al. 2012, eq. 2. Raises ``InputError`` where the trajectory is too short.
     """

@@ -19,14 +19,14 @@ from bidnerf_core.moving import moved
 from bidnerf_core.se3 import SE3
 
 SURFELS = 12_000
-"""Largest number of surfels that are drawn."""
+"""Maximum number of surfels that are drawn."""
 PATH_MARGIN = 1.5
-"""How far around the path the surface is drawn, in multiples of the path's size; at least half of the scene's extent."""
+"""Extent of the drawn surface around the path, in multiples of the path's size; at least half of the scene's extent."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlottedPath:
-    """What is known of each frame of a sequence."""
+    """The estimated poses of a sequence's frames, their acceptance and uncertainty, and the true poses if known."""
 
     poses: SE3  # (n) T_world_camera
     accepted: Bool[Tensor, "n"]
@@ -69,7 +69,7 @@ def _axes(poses: SE3) -> Float[np.ndarray, "3 3"]:
 def _panel(
     panel: Any, path: PlottedPath, surface: SurfaceMap | None, projection: Float[np.ndarray, "3 2"]
 ) -> Any:
-    """Draw one projection and return what the colour bar belongs to."""
+    """Draw one projection and return the artist that the colour bar describes."""
     places = path.poses.translation.double().numpy() @ projection
     if surface is not None:
         _draw_surface(panel, surface, projection, places)

@@ -1,4 +1,4 @@
-"""A trial and its result as plain data: what was tried, and what one line of a results file holds."""
+"""A trial and its result as plain data: the inputs, and one line of a results file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bidnerf_core.evaluation.fingerprint import InputDigests
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 LARGEST_COUNT = 2**63 - 1
-"""JSON has integers that no tensor and no float holds."""
+"""The largest count. JSON can hold integers that no tensor or float can."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class Trial:
     config: str = "{}"  # JSON of the method's settings that differ from its defaults
     seed: int = 0  # of the start and of every random choice of the method
     split: str = "test"
-    device: str = "cpu"  # on which the map lies
+    device: str = "cpu"  # the map's device
     depth: bool = True  # whether the method gets the measured depth
     depth_points: str | None = None  # folder of a COLMAP model whose points the method gets as depth rays
-    fault: str = "none"  # faults of the images and their sizes, as depth-scale:1.02+exposure:0.7
+    fault: str = "none"  # faults of the images and their sizes, such as depth-scale:1.02+exposure:0.7
 
     @property
     def frame(self) -> str:
@@ -44,7 +44,7 @@ class Trial:
 
     @property
     def portable(self) -> Trial:
-        """Return this trial with the names of folders instead of their paths, which differ from machine to machine."""
+        """This trial with the names of folders instead of their paths, which differ from machine to machine."""
         points = None if self.depth_points is None else "/".join(_parts(self.depth_points)[-2:])  # sparse/0
         return replace(self, map=_name(self.map), data=_name(self.data), depth_points=points)
 
@@ -61,10 +61,10 @@ class ScalarPoseError:
 class Trace:
     """Errors at the start and after each step; without a start, entry 0 is the method's first pose.
 
-    Raises ``ValueError`` where the two rows differ in length or are empty.
+    Raises ``ValueError`` where the two sequences differ in length or are empty.
     """
 
-    translation: tuple[float | None, ...]  # metres; none where a pose was not finite
+    translation: tuple[float | None, ...]  # metres; None where a pose was not finite
     rotation_deg: tuple[float | None, ...]
 
     def __post_init__(self) -> None:
@@ -87,7 +87,7 @@ class TrialResult:
     Raises ``ValueError`` for a count that does not fit into 64 bits.
     """
 
-    T_world_camera: Rows | None  # 4x4; none where it was not finite
+    T_world_camera: Rows | None  # 4x4; None where it was not finite
     converged: bool  # according to the method itself
     steps: int
     seconds: float
@@ -95,21 +95,21 @@ class TrialResult:
     loss: float | None
     backend: str
     method: str
-    error: ScalarPoseError | None  # none where the pose was not finite
+    error: ScalarPoseError | None  # None where the pose was not finite
     frame: str
     seed: int
-    start_error: ScalarPoseError | None  # none where no start was given
+    start_error: ScalarPoseError | None  # None where no start was given
     errors: Trace
     reason: str  # why the method stopped
     peak_memory_bytes: int  # of the process during the trial: resident memory, or memory of the GPU
     settings: dict[str, Any]  # all settings of the method
     weights: str  # file name of the map's weights, which is new with every training
     trial: Trial  # with folders' names instead of paths
-    outcome: str = ""  # the kind of the method's judgement; empty in results of earlier versions
-    focal_factor: float = 1.0  # true focal length over the given one, where it was estimated along
-    intrinsics: Intrinsics | None = None  # with which the pose was found, where other than those given
+    outcome: str = ""  # the method's verdict; empty in results of earlier versions
+    focal_factor: float = 1.0  # ratio of the true to the given focal length, where it was estimated as well
+    intrinsics: Intrinsics | None = None  # those used for the pose, where they differ from those given
     confidence: float | None = None  # probability that the pose is right, where a model of it was learned
-    inputs: InputDigests | None = None  # none in results of earlier versions
+    inputs: InputDigests | None = None  # None in results of earlier versions
 
     def __post_init__(self) -> None:
         for name in ("steps", "seed", "peak_memory_bytes"):

@@ -1,4 +1,4 @@
-"""Trials in a process of their own, so that its memory and time belong to one map."""
+"""Trials in a process of their own, so that its memory and time are those of one map."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class Measured:
 class TrialProcess:
     """A process that runs trials one after another and keeps its map in memory. Use it as a context manager.
 
-    It is a new interpreter that exchanges JSON, not a fork: it shares no memory, and no script needs a guard for it.
+    It is a new interpreter that exchanges JSON, not a fork: it shares no memory, and scripts need no ``__main__`` guard.
     """
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            start_new_session=True,  # Ctrl-C goes to this process, which ends the other
+            start_new_session=True,  # so that Ctrl-C reaches only this process, which ends the other
         )  # fmt: skip
 
     def run(self, trial: Trial) -> Measured:
@@ -88,7 +88,7 @@ def samples_per_ray(trial: Trial) -> float:
 
 
 def _serve(questions: Iterable[str], answers: Any) -> None:
-    """Answer each line with a line, until there are no more."""
+    """Answer each line with a line, until there are none left."""
     for line in questions:
         trial = from_plain(Trial, json.loads(line), "trial")
         try:
@@ -104,5 +104,5 @@ def _send(stream: Any, value: dict[str, Any]) -> None:
 
 if __name__ == "__main__":
     with os.fdopen(os.dup(1), "w") as answers:
-        os.dup2(2, 1)  # what a backend prints is not an answer
+        os.dup2(2, 1)  # output that a backend prints must not be mistaken for an answer
         _serve(sys.stdin, answers)

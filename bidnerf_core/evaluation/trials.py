@@ -1,7 +1,7 @@
-"""Run one trial: localize a frame from a start with a method, and measure the result.
+"""Running one trial: localize a frame from a start with a method, and measure the result.
 
-``run_trial`` depends on its argument and on the files that this names alone, so trials may run in any order, in any
-process and on any machine; two runs of the same trial differ in ``seconds`` and ``peak_memory_bytes`` only.
+``run_trial`` depends only on its argument and on the files that this names, so trials may run in any order, in any process
+and on any machine; two runs of the same trial differ only in ``seconds`` and ``peak_memory_bytes``.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
 
 
 def run_trial(trial: Trial) -> TrialResult:
-    """Localize once. Raises ``InputError`` for an unknown name, and for a method that lacks what it needs."""
+    """Run a trial. Raises ``InputError`` for an unknown name, and for a method that lacks an input it needs."""
     with one_thread():
         stored, dataset = opened(trial.map, trial.data, trial.device)
         views = trial_views(trial, dataset)
@@ -53,7 +53,7 @@ def run_trial(trial: Trial) -> TrialResult:
 def _localized(
     trial: Trial, stored: Map, views: list[View], start: SE3 | None, settings: Any
 ) -> Localization:
-    """Return the answer of the trial's method. This is the only place of this package that calls the localizer."""
+    """Return the answer of the trial's method. This is the only place in this package that calls the localizer."""
     points = opened_points(trial.depth_points, trial.map)
     rays = None if points is None else points.rays(views, trial.split)
     localizer = Localizer(stored, trial.method, settings, warm_up=False)
@@ -63,7 +63,7 @@ def _localized(
 def trial_views(trial: Trial, dataset: Dataset) -> list[View]:
     """Return the views that the method gets, with T_world_camera.
 
-    They have the trial's faults, and no depth where the trial withholds it.
+    They have the trial's faults, and no depth if the trial withholds it.
     """
     views = [faulty(view, trial.fault, trial.seed) for view in dataset.views(trial.split, trial.frames)]
     if trial.depth:
@@ -78,7 +78,7 @@ def input_digests(trial: Trial, stored: Map, views: list[View]) -> InputDigests:
 
 
 def start_of(trial: Trial, views: list[View], dataset: Dataset) -> SE3 | None:
-    """Return T_world_camera at which the trial begins; none where its protocol gives no start."""
+    """Return T_world_camera at which the trial begins; None where its protocol gives no start."""
     protocol = find_protocol(trial.protocol)
     protocol.check_size(trial.size)
     frames = len(dataset.frame_names(trial.split))
@@ -100,7 +100,7 @@ def parse_settings(method: str, config: str) -> Any:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute on one thread: its sums are the same everywhere, and parallel trials are faster than parallel sums."""
+    """Compute on one thread, so that sums are the same everywhere; parallel trials are faster than parallel sums."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -111,7 +111,7 @@ def one_thread() -> Iterator[None]:
 
 @lru_cache(maxsize=4)
 def opened(map_folder: str, data: str, device: str = "cpu") -> tuple[Map, Dataset]:
-    """Return the map and the dataset of two folders or names of closed-form scenes, each read once a process."""
+    """Return the map and the dataset of two folders or closed-form scenes; each is read once per process."""
     where = working_device(device)
     stored = closed_form_map(map_folder) if is_closed_form(map_folder) else load_map(Path(map_folder), where)
     if is_closed_form(data):

@@ -37,8 +37,8 @@ class ClosedFormScene:
     primitives: Sequence[Primitive]
     bounds: SceneBounds
     name: str
-    light: tuple[float, float, float] = (0.4, -0.5, 0.77)  # direction towards it, world
-    contrast: float = 0.6  # how much darker a surface is that faces away from the light
+    light: tuple[float, float, float] = (0.4, -0.5, 0.77)  # direction towards the light, world
+    contrast: float = 0.6  # how much darker a surface is if it faces away from the light
 
     @torch.no_grad()
     def intersect(self, origins: Float[Tensor, "*#r 3"], directions: Float[Tensor, "*r 3"]) -> Hits:

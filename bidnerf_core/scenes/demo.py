@@ -1,6 +1,6 @@
-"""The two demo scenes, in closed form: a toy lorry and a furnished room. World axes: z up; metres.
+"""The two demo scenes, in closed form: a toy lorry and a furnished room. Metres; the world's z axis points up.
 
-No rotation or reflection maps either onto itself, so a pose is never ambiguous.
+No rotation or reflection maps either onto itself, so poses are never ambiguous.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ WHITE: Colour = (0.99, 0.98, 0.95)
 
 
 def demo_object() -> ClosedFormScene:
-    """Return a toy lorry, nose towards +x, within the cube from -1 to 1, before a white background."""
+    """Return a toy lorry, nose towards +x, within the cube from -1 to 1, in front of a white background."""
     bounds = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
     return ClosedFormScene([*_lorry(), *_wheels(), *_load()], bounds, "demo_object")
 

@@ -18,7 +18,7 @@ from bidnerf_core.scenes.textures import Texture, dominant_axis
 from bidnerf_core.se3 import SE3
 
 PARALLEL_BELOW = 1e-12
-"""Components of a direction below this are set to it, to avoid a division by zero; the change of the ray is negligible."""
+"""Components of a direction below this are set to it, to avoid division by zero; the change of the ray is negligible."""
 
 
 @runtime_checkable
@@ -27,7 +27,7 @@ class Shape(Protocol):
 
     @property
     def reach(self) -> float:
-        """Radius of a ball around the origin that contains the shape (metres)."""
+        """Radius (metres) of a ball around the origin that contains the shape."""
         ...
 
     def interval(
@@ -140,7 +140,7 @@ class Primitive:
     ) -> Float[Tensor, " n"]:
         """Return the distance to the first crossing ahead of the origin (metres; world, unit directions); inf: none.
 
-        From inside a solid, that is where the ray leaves it: a box seen from inside is a room.
+        From inside a solid, this is where the ray leaves it: a box seen from inside is a room.
         """
         T = self.T_world_shape.to(directions)
         turned = T.rotation.mT @ directions

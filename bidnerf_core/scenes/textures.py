@@ -1,7 +1,7 @@
-"""Textures for closed-form scenes: smooth functions of position, rich enough to tell one place from another.
+"""Textures for closed-form scenes: smooth functions of position, rich enough to distinguish one place from another.
 
-All are practically band-limited, being plane waves with softened edges: an image of 100 to 200 pixels from a usual distance
-shows them without aliasing.
+All are practically band-limited, as they are plane waves with softened edges: an image of 100 to 200 pixels from a typical
+distance shows them without aliasing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 Colour = tuple[float, float, float]
 Vector = tuple[float, float, float]
 Texture = Callable[[Tensor, Tensor], Tensor]
-"""Points (n 3; metres, frame of the shape) and outward unit normals (n 3) to colours (n 3) in [0, 1]."""
+"""A function from points (n 3; metres, frame of the shape) and outward unit normals (n 3) to colours (n 3) in [0, 1]."""
 
 DRIFT = ((2.3, 1.1, -1.7), (-1.3, 2.1, 1.9), (1.6, -1.9, 2.2))
 """Wave vectors (radians per metre) of the slow drift of red, green and blue: periods of about two metres."""
@@ -27,8 +27,8 @@ DRIFT = ((2.3, 1.1, -1.7), (-1.3, 2.1, 1.9), (1.6, -1.9, 2.2))
 class Waves:
     """Two colours mixed by the product of plane waves (radians per metre), with a slow drift of the hue.
 
-    One wave gives stripes, three give a chequered solid. The drift makes a pattern's periods differ, so that a pose cannot
-    be off by one of them.
+    One wave gives stripes, three give a chequered solid. The drift makes a pattern's periods differ from one another, so that
+    a pose that is off by one period does not fit.
     """
 
     first: Colour
@@ -58,7 +58,7 @@ class Blotches(Waves):
 
 @dataclass(frozen=True)
 class Faces:
-    """A texture for each side (+x, -x, +y, -y, +z, -z); a point has that of the axis nearest to its normal."""
+    """A texture for each side (+x, -x, +y, -y, +z, -z); a point gets that of the axis nearest to its normal."""
 
     sides: tuple[Texture, Texture, Texture, Texture, Texture, Texture]
 

@@ -44,8 +44,8 @@ def orbit(
 ) -> list[SE3]:
     """Return poses (``T_world_camera``) spread evenly over a sphere (Fibonacci) around ``centre``, which they look at.
 
-    ``radius`` is in metres; ``elevation`` is the lowest and the highest, in degrees above the horizon, (-90, 90) being the
-    whole sphere. ``seed`` rotates the spiral, so that two seeds have no position in common.
+    ``radius`` is in metres. ``elevation`` is the range in degrees above the horizon; (-90, 90) is the whole sphere. ``seed``
+    rotates the spiral, so that two seeds have no position in common.
     """
     turn, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).tolist()
     low, high = (math.sin(math.radians(e)) for e in elevation)
@@ -61,7 +61,7 @@ def orbit(
 def look_around(bounds: SceneBounds, count: int, seed: int = 0, spread: float = 0.5) -> list[SE3]:
     """Return poses (``T_world_camera``) in a room, at head height, in all compass directions, tilted up or down a little.
 
-    Each camera is about ``spread`` of the way from the middle of the room to the wall behind it, to see much of the room.
+    Each camera stands about ``spread`` of the way from the middle of the room to the wall behind it, to see much of the room.
     """
     generator = torch.Generator().manual_seed(seed)
     lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (bounds.lower, bounds.upper))

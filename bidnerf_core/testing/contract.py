@@ -1,4 +1,4 @@
-"""``BackendContract``: what every backend has to fulfil, one test for each requirement."""
+"""``BackendContract``: the requirements on every backend, one test for each."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from bidnerf_core.testing.subject import Subject, called, frozen, precise
 
 
 class BackendContract(Subject):
-    """Tests of a backend: subclass it under a name that begins with ``Test``, and set ``backend`` or ``name``.
+    """Tests of a backend: derive a class whose name begins with ``Test``, and set ``backend`` or ``name``.
 
     ``backend`` is the object that the entry point names, ``name`` the entry point's name. ``config`` should be small: a few
     dozen steps of milliseconds each, enough to learn something from 6 images of 24 x 24 pixels. Without it, the default
     config is used with fewer steps.
     """
 
-    # What the entry point names.
+    # The object that the entry point names.
 
     def test_backend_says_what_it_is(self) -> None:
         backend = self._backend()

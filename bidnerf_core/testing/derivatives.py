@@ -19,11 +19,11 @@ AGREEING = 0.7
 """Fraction of the points at which derivatives must agree: a field may have kinks, which some steps cross."""
 
 Asked = Callable[[Tensor], Tensor]
-"""A map of points (n 3) to values (n c)."""
+"""A function from points (n 3) to values (n c)."""
 
 
 def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
-    """Check the derivative by position, along a random line through each point."""
+    """Check the derivative with respect to position, along a random line through each point."""
     positions, directions = (x.to(dtype) for x in points(COUNT))
     along = points(COUNT, seed=1)[1].to(dtype)
     for what in ("density", "rgb"):
@@ -37,7 +37,7 @@ def check_position_derivatives(field: RadianceField, dtype: torch.dtype) -> None
 
 
 def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> None:
-    """Check the derivative by direction, along a random great circle through each, since directions are unit."""
+    """Check the derivative with respect to direction, along a random great circle through each, as directions are unit."""
     positions, directions = (x.to(dtype) for x in points(COUNT))
     along = points(COUNT, seed=1)[1].to(dtype)
     along = torch.nn.functional.normalize(
@@ -57,7 +57,7 @@ def check_direction_derivatives(field: RadianceField, dtype: torch.dtype) -> Non
 
 
 def check_pose_gradient(field: RadianceField, dtype: torch.dtype) -> None:
-    """Check that rendered colour and distance have a gradient by the camera's pose."""
+    """Check that rendered colour and distance have a gradient with respect to the camera's pose."""
     delta = torch.zeros(6, dtype=dtype, requires_grad=True)
     start = rgbd_views()[0].T_ref_camera.to(dtype=dtype)
     nudge = torch.tensor([0.02, -0.03, 0.01, 0.02, 0.01, -0.02], dtype=dtype)
@@ -96,7 +96,7 @@ def agreement(
 
 
 def _slopes(ask: Asked, at: Float[Tensor, "n 3"], speed: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-    """Return the derivative of each channel along ``speed``, by reverse mode; 0 where it does not depend on the argument."""
+    """Return the derivative of each channel along ``speed``, in reverse mode; 0 where it does not depend on the argument."""
     leaf = at.detach().requires_grad_()
     values = ask(leaf)
     slopes = torch.zeros_like(values)

@@ -1,4 +1,4 @@
-"""The check that a field lets the steps of a localization stay on its device."""
+"""The check that the steps of a localization can stay on the field's device."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from bidnerf_core.waiting import without_waiting
 
 CHECKED_RAYS = 48
 OFF = (0.05, -0.03, 0.04, 0.01, -0.02, 0.01)
-"""Tangent vector from the true pose to the one that steps begin at: metres, radians."""
+"""Tangent vector (metres, radians) from the true pose to the pose at which steps begin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class _Scene:
 
 
 def check_steps(field: RadianceField) -> None:
-    """Check that steps at each level neither copy between devices nor wait for one, and lead where they do on the CPU.
+    """Check that steps at each level neither copy between devices nor wait for one, and reach the same pose as on the CPU.
 
-    The device is a simulated one, see ``elsewhere``. Fields without parameters and buffers have no device and pass.
+    The device is simulated, see ``elsewhere``. Fields without parameters and buffers have no device and pass.
     """
     for number in range(len(levels(field))):
         expected = _first_order(_problem(field), number, None)
@@ -74,7 +74,7 @@ def check_steps(field: RadianceField) -> None:
 
 @contextmanager
 def _naming(what: str) -> Iterator[None]:
-    """Turn a ``DeviceFault`` into a failure of the contract that says where it happened."""
+    """Turn a ``DeviceFault`` into a failure of the contract that names the place where it happened."""
     try:
         yield
     except DeviceFault as fault:

@@ -1,9 +1,10 @@
 """A simulated device, which proves on any machine that code neither copies between devices nor waits for one.
 
-Tensors on the device "meta" stand for those on a GPU. While ``Elsewhere`` is active they hold values, which are kept and
-computed on the CPU, so that code runs as it does elsewhere; but tensors of both devices in one operation, which a GPU forbids,
-raise ``DeviceFault``. So does, while ``strict``, what makes the host wait for it: copies to and from the CPU, numbers read from a
-tensor (``float``, ``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``, indexing by a mask).
+Tensors on the device "meta" stand in for those on a GPU. While ``Elsewhere`` is active they hold values, which are kept and
+computed on the CPU, so that code runs as it would on a GPU; but operations on tensors of both devices, which a GPU does not
+allow, raise ``DeviceFault``. Within ``strict``, so does whatever makes the host wait for the device: copies to and from the
+CPU, reading numbers from a tensor (``float``, ``bool``, ``item``, ``tolist``), and sizes that depend on values (``nonzero``,
+indexing by a mask).
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ INDEXED = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_inde
 
 
 class DeviceFault(AssertionError):
-    """Code waited for the device, or copied from or to it."""
+    """Code waited for the device, copied from or to it, or mixed it with the CPU."""
 
 
 class _There(torch.Tensor):
@@ -85,7 +86,7 @@ class _There(torch.Tensor):
 
 
 class Elsewhere(TorchDispatchMode):
-    """Makes ``DEVICE`` usable. Faults raise within ``strict()``; outside of it, tensors may be moved and read, not mixed."""
+    """Makes ``DEVICE`` usable. Outside of ``strict()``, tensors may be moved between devices and read, but not mixed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -104,7 +105,7 @@ class Elsewhere(TorchDispatchMode):
 
     @contextmanager
     def strict(self) -> Iterator[None]:
-        """Raise ``DeviceFault`` for what makes a GPU and its host wait for each other."""
+        """Raise ``DeviceFault`` for anything that would make a GPU and its host wait for each other."""
         self._strict = True
         try:
             yield
@@ -141,7 +142,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any], strict: bool) -> Any:
 
 
 def _wrapped(func: Any, args: Any, kwargs: dict[str, Any], found: Any) -> Any:
-    """Return results as tensors that claim to be elsewhere; what was written in place is the argument itself."""
+    """Return results as tensors on ``DEVICE``; a result that was written in place is the argument itself."""
     schema = func._schema
     aliases = [
         (args[place] if place < len(args) else kwargs.get(argument.name))
@@ -154,7 +155,7 @@ def _wrapped(func: Any, args: Any, kwargs: dict[str, Any], found: Any) -> Any:
 
 
 def _check_waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: torch.device | None) -> None:
-    """Raise ``DeviceFault`` for copies and for what the host would wait for."""
+    """Raise ``DeviceFault`` for copies, and for operations on which the host would wait."""
     name = func._schema.name.removeprefix("aten::")
     if there and name in READS:
         raise DeviceFault(f"{name} {READS[name]}: the host waits for the device")
@@ -175,8 +176,9 @@ def _check_waiting(func: Any, args: Any, flat: list[Any], there: bool, wanted: t
 
 
 def _check_mixing(func: Any, args: Any, flat: list[Any], there: bool) -> None:
-    """Raise ``DeviceFault`` for tensors of both devices in one operation, but for what PyTorch moves by itself: numbers, and
-    the indices of a tensor on the device.
+    """Raise ``DeviceFault`` for tensors of both devices in one operation.
+
+    Excepted is what PyTorch moves by itself: numbers, and the indices of a tensor on the device.
     """
     name = func._schema.name.removeprefix("aten::")
     if not there or name in ("_to_copy", "copy_"):
@@ -190,7 +192,7 @@ def _check_mixing(func: Any, args: Any, flat: list[Any], there: bool) -> None:
 
 
 def _leaves(parts: Any) -> list[Any]:
-    """Return what lists, tuples and dictionaries hold."""
+    """Return the leaves of nested lists, tuples and dictionaries."""
     found: list[Any] = []
     for part in parts.values() if isinstance(parts, dict) else parts:
         if isinstance(part, list | tuple | dict):
@@ -201,7 +203,7 @@ def _leaves(parts: Any) -> list[Any]:
 
 
 def _mapped(function: Callable[[Any], Any], parts: Any) -> Any:
-    """Return ``parts`` with ``function`` applied to what lists, tuples and dictionaries hold. PyTorch's trees are slower."""
+    """Return ``parts`` with ``function`` applied to the leaves, see ``_leaves``. PyTorch's pytrees are slower."""
     if isinstance(parts, dict):
         return {key: _mapped(function, part) for key, part in parts.items()}
     if isinstance(parts, list | tuple):
@@ -214,7 +216,7 @@ def _values(part: Any) -> Any:
 
 
 def _generator_of(kind: Any) -> Any:
-    """Return the class of generators, with ones that claim to be elsewhere."""
+    """Return a subclass of the generators' class whose instances may claim to be on ``DEVICE``."""
 
     class There(kind):
         def __new__(cls, device: Any = "cpu") -> Any:

@@ -1,4 +1,4 @@
-"""Failures of the contract, each in one sentence that says what was found and what was expected."""
+"""Failures of the contract, each in one sentence that states what was found and what was expected."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def calling(doing: str) -> Iterator[None]:
 
 
 def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) -> FieldValues:
-    """Return the field's values after a check of their shapes. ``of`` describes the points."""
+    """Return the field's values after checking their shapes. ``of`` describes the points."""
     who = f"{type(field).__name__}.query of {of}"
     with calling(who):
         values = field.query(positions, directions)
@@ -47,7 +47,7 @@ def query(field: RadianceField, positions: Tensor, directions: Tensor, of: str) 
 
 
 def sample(field: RadianceField, rays: Rays, of: str, jitter: Generator | None = None) -> RaySamples:
-    """Return the samples of the field's sampler after a check of their shapes. ``of`` describes the rays."""
+    """Return the samples of the field's sampler after checking their shapes. ``of`` describes the rays."""
     who = f"sampler {type(field.sampler).__name__} of {of}"
     with calling(who):
         samples = field.sampler(rays, jitter)

@@ -24,7 +24,7 @@ LEARNED = 0.8
 
 
 class Recorder:
-    """A ``Report`` that records progress, and keeps states as a map on disk does: as bytes."""
+    """A ``Report`` that records progress, and keeps states as bytes, as a map on disk does."""
 
     def __init__(
         self, due: Sequence[int] = (), stop: int | None = None, state: TrainingState | None = None
@@ -75,7 +75,7 @@ def check_learning(
 
 
 def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
-    """Check that every step is reported in order, and that states are saved when due, and only then, and hold the field."""
+    """Check that all steps are reported in order, and that states, which hold the field, are saved exactly when due."""
     total = config.steps
     due = sorted({1, total // 2, total})
     report = Recorder(due)
@@ -101,12 +101,12 @@ def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
 
 
 def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: Any) -> None:
-    """Check that a training that stops midway with ``TrainingStopped`` and is resumed ends with the same bits."""
+    """Check that a training that stops midway with ``TrainingStopped`` and is resumed ends with a bitwise identical result."""
     who, middle = f"{_name(backend)}.train", config.steps // 2
     first, second, third = make(), make(), make()
     beginning = stored(_state_of(first))
     _train(backend, first, rgbd_views(), config, Recorder(), "")
-    for field in (second, third):  # whether builds differ is another test
+    for field in (second, third):  # another test checks whether builds differ
         _module(field).load_state_dict(beginning)
     report = Recorder(stop=middle)
     try:

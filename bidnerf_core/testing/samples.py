@@ -1,4 +1,4 @@
-"""Checks of a field's sampler, and of what is rendered with it."""
+"""Checks of a field's sampler, and of renderings with it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from bidnerf_core.testing.faults import calling, require_that, sample
 from bidnerf_core.testing.scene import SIDE, awkward_rays, joined, picked
 from bidnerf_core.testing.values import close
 
-SLACK = 1e-4 * SIDE  # metres: what rounding may do to a distance
+SLACK = 1e-4 * SIDE  # metres: rounding error allowed in a distance
 BACKGROUND = (0.1, 0.5, 0.9)
 
 
 def check_intervals(field: RadianceField) -> None:
-    """Check that valid samples are sorted, disjoint and in [near, far], and that rays that miss have none; also no rays."""
+    """Check that valid samples are sorted, disjoint and in [near, far] and that rays that miss have none, even with 0 rays."""
     for of, rays in awkward_rays().items():
         for jitter, how in ((None, ""), (_generator(), " with jitter")):
             _check_order(field, rays, sample(field, rays, of + how, jitter), of + how)

@@ -1,4 +1,4 @@
-"""Inputs of the contract: views of a tiny closed-form scene, and rays and points of every awkward kind."""
+"""Test inputs of the contract: views of a tiny closed-form scene, and awkward rays and points of all kinds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIDE = max(BOUNDS.size)  # metres
 def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
     """Return six views of a toy with exact depth.
 
-    With ``coverage`` they have an alpha channel; without, they show the toy before white, as a sensor would see it.
+    With ``coverage`` they have an alpha channel; without, they show the toy in front of white, as a sensor would see it.
     """
     seen = seen_from(demo_object(), CAMERA, orbit(3.5, 6))
     return tuple(v if coverage else replace(v, frame=replace(v.frame, alpha=None)) for v in seen)
@@ -35,7 +35,7 @@ def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
 
 @cache
 def rgb_views() -> tuple[View, ...]:
-    """Return six views of the toy before white, without depth or alpha."""
+    """Return six views of the toy in front of white, without depth or alpha."""
     return tuple(replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views(coverage=False))
 
 
@@ -54,7 +54,7 @@ def points(count: int, seed: int = 0) -> tuple[Float[Tensor, "n 3"], Float[Tenso
 
 
 def awkward_points() -> dict[str, Float[Tensor, "n 3"]]:
-    """Return positions at which careless fields index out of range or overflow."""
+    """Return positions at which carelessly written fields index out of range or overflow."""
     lower, upper = torch.tensor(BOUNDS.lower), torch.tensor(BOUNDS.upper)
     share = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     middle, corners = (lower + upper) / 2, lower + share * (upper - lower)
@@ -83,7 +83,7 @@ def awkward_rays() -> dict[str, Rays]:
 
 
 def picked(rays: Rays, index: Tensor) -> Rays:
-    """Return the rays with the numbers ``index``, in its shape."""
+    """Return the rays at ``index``, in its shape."""
     return Rays(rays.origins[index], rays.directions[index], rays.near[index], rays.far[index])
 
 

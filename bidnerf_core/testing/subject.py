@@ -44,7 +44,7 @@ class Subject:
         return dataclasses.replace(self._backend().config_type(), steps=SUBJECT_STEPS)
 
     def _reread(self, config: Any) -> Any:
-        """Return the config as it is read back from a map on disk."""
+        """Return the config as it would be read back from a map on disk."""
         with calling(f"{type(config).__name__} to JSON and back"):
             text = json.dumps(to_plain(config, "config"), allow_nan=False)
             return from_plain(self._backend().config_type, json.loads(text), "config")
@@ -86,13 +86,13 @@ def precise(field: RadianceField) -> tuple[RadianceField, torch.dtype]:
         positions, directions = (x.double() for x in points(2))
         if query(doubled, positions, directions, "points").density.dtype == torch.float64:
             return doubled, torch.float64
-    except Exception:  # reported by the test of dtypes
+    except Exception:  # the test of dtypes reports it
         pass
     return field, torch.float32
 
 
 def _double(field: Any) -> None:
-    """Convert a field to float64 in place; of a level that is no module, the modules that it holds."""
+    """Convert a field to float64 in place; for a level that is not a module, convert the modules that it holds."""
     if isinstance(field, nn.Module):
         field.double()
     else:

@@ -1,4 +1,4 @@
-"""Checks of ``RadianceField.query``: shapes, ranges, and values that depend on the query alone."""
+"""Checks of ``RadianceField.query``: shapes, ranges, and that values depend on the query alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ THREADS, ROUNDS = 4, 8
 
 
 def check_shapes(field: RadianceField) -> None:
-    """Check any leading axes, also without any points, and that values do not depend on how the points are arranged."""
+    """Check any leading axes, including those without points, and that values do not depend on the points' arrangement."""
     positions, directions = points(7)
     flat = stacked(query(field, positions, directions, "7 points"))
     for shape in SHAPES:
@@ -52,7 +52,7 @@ def check_ranges(field: RadianceField) -> None:
 
 
 def check_precision(field: RadianceField, doubled: RadianceField) -> None:
-    """Check that ``doubled``, a copy of ``field`` in float64, computes in that precision and to the same values."""
+    """Check that ``doubled``, a copy of ``field`` in float64, computes the same values in that precision."""
     positions, directions = points(64)
     expected = query(field, positions, directions, "points in float32")
     found = query(doubled, positions.double(), directions.double(), "points in float64, after .double()")
@@ -74,7 +74,7 @@ def check_precision(field: RadianceField, doubled: RadianceField) -> None:
 
 
 def check_threads(field: RadianceField) -> None:
-    """Check that concurrent queries give the values of a single one."""
+    """Check that concurrent queries return the same values as a single one."""
     parts = [points(200 + 31 * i, seed=i) for i in range(THREADS)]
     alone = [stacked(query(field, *part, "points")) for part in parts]
 

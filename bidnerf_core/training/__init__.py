@@ -1,4 +1,4 @@
-"""What training recipes share: batches of rays, the loss, and the loop with its schedule, checkpoints and resumption."""
+"""Shared parts of training recipes: batches of rays, the loss, and the loop with its schedule, checkpoints and resumption."""
 
 from bidnerf_core.training.colour_transform import ColourTransforms, fitted_colours
 from bidnerf_core.training.loop import StepOutcome, cosine, fit

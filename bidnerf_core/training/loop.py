@@ -15,12 +15,12 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.training.report import Progress, Report, TrainingState, TrainingStopped
 
 BESIDE = "beside."
-"""Prefix of the names under which a state holds what is learned beside the field."""
+"""Prefix of the names under which a state holds parameters that are learned jointly with the field."""
 
 
 @dataclass(frozen=True, eq=False)
 class StepOutcome:
-    """The result of a recipe's step."""
+    """The result of one step of a recipe."""
 
     loss: Float[Tensor, ""]
     mse: float  # of colours, for display
@@ -48,11 +48,11 @@ def fit(
 ) -> None:
     """Minimize the loss of ``outcome(step, generator)`` over parameter ``groups`` (each with its ``lr``) by ``steps`` of Adam.
 
-    ``beside`` is what is learned with the field and not kept with it; its parameters are among the groups. Training resumes from ``report.resume()``, saves when ``report.due`` says so and, when ``report.stopping`` is set, saves
-    and raises ``TrainingStopped``. A resumed run computes what an uninterrupted one would have; on a GPU,
-    where sums have no fixed order, but for rounding. The generator is on the CPU whatever the field's device, so that the same
-    rays are drawn everywhere. Raises ``InputError`` where
-    the loss is not finite.
+    ``beside`` holds parameters that are learned with the field but not kept with it; they are among the groups. Training
+    resumes from ``report.resume()``, saves when ``report.due`` returns True and, when ``report.stopping`` is set, saves and
+    raises ``TrainingStopped``. A resumed run computes what an uninterrupted one would have; on a GPU, where sums have no fixed
+    order, it does so up to rounding. The generator is on the CPU whatever the field's device, so that the same rays are drawn
+    everywhere. Raises ``InputError`` where the loss is not finite.
     """
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
     rates = [group["lr"] for group in optimizer.param_groups]
@@ -72,7 +72,7 @@ def fit(
         optimizer.step()
         psnr = -10 * math.log10(max(result.mse, 1e-10))
         report.step(Progress(step + 1, steps, loss, psnr, result.samples_per_ray))
-        # Read once: it may change at any time, and a training that stops must have saved.
+        # Read it once: it may change at any time, and a training that stops must have saved its state.
         stopping = report.stopping
         if stopping or report.due(step + 1):
             report.save(_state(step + 1, field, optimizer, generator, beside))

@@ -1,4 +1,4 @@
-"""The supervised loss: colour, and depth where it was measured or a landmark is."""
+"""The supervised loss of colour, and of depth where a sensor measured it or a landmark gives it."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ def supervised_loss(
     depth_weight: float,
     colour_weight: Float[Tensor, "r"] | None = None,
 ) -> tuple[Float[Tensor, ""], float]:
-    """Return the squared error of colour plus ``depth_weight`` times the depth term, and the mean squared error of colour
-    for display.
+    """Return the loss, and the unweighted mean squared error of colour for display.
 
-    The depth term (``ray_termination``) is a fraction of ``side``, the scene's longest side (metres). ``colour_weight`` is
-    the weight of each ray's colour, 1 by default.
+    The loss is the mean squared error of colour plus ``depth_weight`` times the depth term (``ray_termination``) as a fraction
+    of ``side``, the scene's longest side (metres). ``colour_weight`` is the weight of each ray's colour, 1 by default.
     """
     error = (rendering.rgb - batch.observed.rgb) ** 2
     mse = float(error.detach().mean())
@@ -33,12 +32,12 @@ def supervised_loss(
 
 
 def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor, ""]:
-    """Return the mean distance (metres) of a ray's weight from its measured depth; 0 where no ray has any.
+    """Return the mean distance (metres) of the rays' weight from their measured depth; 0 where no ray has a measurement.
 
-    Like the ray termination loss of DS-NeRF (Deng et al. 2022) it is least where all weight is at the measured depth; an
-    error of the mean depth would also be 0 with equal weight on both sides. Weight that a ray lacks counts as at the camera.
-    Where the distance comes from a landmark, the mean is also over its normal distribution, so that weight within its
-    deviation is hardly pulled.
+    Like the ray termination loss of DS-NeRF (Deng et al. 2022) it is smallest where all weight is at the measured depth; an
+    error of the mean depth could also be 0 with equal weight on both sides. Weight that a ray lacks counts as if it were at
+    the camera. Where the distance comes from a landmark, the mean is also taken over its normal distribution, so that weight
+    within its standard deviation is hardly moved.
     """
     distance, measured = batch.observed.distance, batch.observed.measured
     off = rendering.samples.middles - distance[:, None]
@@ -58,7 +57,7 @@ def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p
 def distortion(rendering: Rendering, side: float) -> Float[Tensor, ""]:
     """Return the mean distortion of the rays' weights (Barron et al. 2022, eq. 15), distances in units of ``side``.
 
-    It is least where a ray's weight is in one short interval. Sums over pairs are computed from cumulative sums.
+    It is smallest where a ray's weight is in one short interval. Sums over pairs are computed from cumulative sums.
     """
     samples, weights = rendering.samples, rendering.weights
     middles, widths = samples.middles / side, (samples.ends - samples.starts) / side

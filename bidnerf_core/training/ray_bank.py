@@ -15,7 +15,7 @@ from bidnerf_core.moving import moved
 from bidnerf_core.observations import Observations
 
 MEASURED_SHARE = 0.25
-"""Fraction of a batch's rays that are drawn from pixels with depth, where so few have any that hardly one would be drawn
+"""Fraction of a batch's rays that are drawn from pixels with depth, if these are so few that hardly any would be drawn
 otherwise (in DS-NeRF: half)."""
 LANDMARK_SHARE = 0.125
 """Fraction of a batch's rays that are drawn from pixels that show a landmark."""
@@ -23,22 +23,22 @@ LANDMARK_SHARE = 0.125
 
 @dataclass(frozen=True, eq=False)
 class TrainingBatch:
-    """Rays of training views, what was measured along them, and the background that colours were composed over."""
+    """Rays of training views, the measurements along them, and the background over which their colours were composited."""
 
     rays: Rays  # world
     observed: Observations  # of the same rays, in the world; all of them have a colour
     background: Float[Tensor, "r 3"]
     image: Int[Tensor, "r"]  # number of the view that shows the ray
-    deviation: Float[Tensor, "r"]  # metres: of a distance that a landmark gives; 0 where a sensor measured it
+    deviation: Float[Tensor, "r"]  # metres: of a landmark's distance; 0 where a sensor measured it
 
     def __len__(self) -> int:
         return len(self.observed)
 
 
 class RayBank:
-    """All pixels of the training views, from which batches are drawn. Pixels stay in the host's memory; batches lie on ``device``.
+    """All pixels of the training views, from which batches are drawn. Pixels stay in host memory; batches are on ``device``.
 
-    Where an image has an alpha channel, each batch has its background replaced by random colours, so that a field cannot
+    Where an image has an alpha channel, each batch replaces its background by random colours, so that a field cannot
     explain the background by matter of one colour (as in the code of Mueller et al. 2022).
     """
 
@@ -70,8 +70,9 @@ class RayBank:
         self._camera_start = torch.stack([starts[kinds.index(frame.intrinsics)] for frame in frames])
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
-        """Return the rays of ``count`` pixels, drawn uniformly from all views; a fixed part of them from pixels with depth, where
-        only few have any.
+        """Return the rays of ``count`` pixels, drawn uniformly from all views.
+
+        Where only few pixels have depth, a fixed share is drawn from these; another share is drawn from those with landmarks.
         """
         index = torch.randint(self.count, (count,), generator=generator)
         if len(self._few):
@@ -96,14 +97,14 @@ class RayBank:
         return moved(TrainingBatch(rays, observed, background, view, deviation), self.device)
 
     def _few_measured(self) -> Int[Tensor, "m"]:
-        """Return the indices of the pixels with depth where it is sparse (structure from motion), and none otherwise."""
+        """Return the indices of the pixels with depth if it is sparse (structure from motion); otherwise none."""
         if not self.has_depth:
             return torch.zeros(0, dtype=torch.long)
         measured = (self._depth > 0).nonzero()[:, 0]
         return measured if len(measured) < SPARSE * self.count else measured[:0]
 
     def _coloured(self, index: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
-        """Return the pixels' colours and the background colours that they are composed over."""
+        """Return the pixels' colours and the background colours over which they are composited."""
         usual = torch.tensor(self.bounds.background).expand(len(index), 3)
         if not self.has_alpha:
             return self._rgb[index], usual
@@ -113,9 +114,9 @@ class RayBank:
 
 @dataclass(frozen=True, eq=False)
 class _LandmarkPixels:
-    """The pixels of all views that show a landmark."""
+    """The pixels, in all views, that show a landmark."""
 
-    pixel: Int[Tensor, "m"]  # number among the pixels of all views
+    pixel: Int[Tensor, "m"]  # index among the pixels of all views
     distance: Float[Tensor, "m"]  # metres
     deviation: Float[Tensor, "m"]  # metres
 
@@ -124,7 +125,7 @@ class _LandmarkPixels:
 
 
 def _landmark_pixels(views: Sequence[View], offsets: Int[Tensor, "v"]) -> _LandmarkPixels:
-    """Return the landmarks of the views without dense depth, whose own measurements are better."""
+    """Return the landmarks of the views without dense depth; where depth is dense, its measurements are better."""
     parts: list[tuple[Tensor, Tensor, Tensor]] = [
         (torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))
     ]

@@ -1,4 +1,4 @@
-"""Progress of a training, its state, and who receives them."""
+"""The progress of a training, its state, and the interface that receives them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ class TrainingState:
 
     step: int
     field: dict[str, Tensor]
-    optimizer: dict[str, Tensor]  # Adam's moments and the state of the random generator
+    # Adam's moments, the state of the random generator, and parameters learned jointly with the field
+    optimizer: dict[str, Tensor]
 
 
 @runtime_checkable
@@ -41,7 +42,7 @@ class Report(Protocol):
         ...
 
     def due(self, step: int) -> bool:
-        """Whether ``save`` is wanted after this step."""
+        """Return whether ``save`` is to be called after this step."""
         ...
 
     def save(self, state: TrainingState) -> None:
@@ -73,7 +74,7 @@ class Silent:
 
 
 class TrainingStopped(Exception):
-    """Training was asked to stop; its state was saved at ``step``."""
+    """Training stopped on request; its state was saved at ``step``."""
 
     def __init__(self, step: int) -> None:
         super().__init__(f"training stopped after step {step}")

@@ -1,4 +1,4 @@
-"""What training views teach a field: batches of their rays, and the loss of rendering them."""
+"""The supervision of a field by training views: batches of their rays, and the loss of rendering them."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from bidnerf_core.training.loss import distortion, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
 
 COLOUR_RATE = 2e-3  # learning rate of the colour transforms
-COLOUR_PENALTY = 1e-3  # weight of their penalty beside the colour error
+COLOUR_PENALTY = 1e-3  # weight of their penalty relative to the colour error
 
 
 @dataclass(frozen=True)
 class SupervisionConfig(Settings):
     """Weights of the terms of the loss, for every recipe."""
 
-    # weight of depth, measured or of landmarks, beside colour; 0 leaves it out
+    # weight of depth, from sensors or landmarks, relative to colour; 0 leaves it out
     depth_weight: NotNegative = 0.1
-    distortion_weight: NotNegative = 0.0  # weight of the term that gathers a ray's weight in one place
+    distortion_weight: NotNegative = 0.0  # weight of the term that concentrates a ray's weight in one place
     exposure: bool = True  # learn a colour transform of each image, unless images have alpha
     sharpness: bool = True  # down-weight blurred images
 
 
 class Supervision:
-    """The rays of training views and their loss, on the device of the field that is trained."""
+    """The rays of training views and their loss, on the device of the trained field."""
 
     def __init__(
         self, views: Sequence[View], bounds: SceneBounds, config: SupervisionConfig, device: torch.device | str = "cpu"
@@ -46,14 +46,14 @@ class Supervision:
         learned = config.exposure and not self.bank.has_alpha
         self.colours = ColourTransforms(len(views)).to(device) if learned else None
         kept = detail_kept(views) if config.sharpness else None
-        # None where no image is blurred, so that nothing changes
+        # None where no image is blurred, so that the loss is then unweighted.
         self.image_weight = None if kept is None or bool((kept == 1).all()) else kept.float().to(device)
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
         return self.bank.draw(count, generator)
 
     def groups(self) -> list[dict[str, Any]]:
-        """Return the parameters that are learned beside the field, as a group for ``fit``."""
+        """Return the parameters that are learned jointly with the field, as a group for ``fit``."""
         if self.colours is None:
             return []
         return [{"params": list(self.colours.parameters()), "lr": COLOUR_RATE}]

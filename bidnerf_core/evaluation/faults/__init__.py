@@ -1,4 +1,4 @@
-"""Faults of sensors and scenes: named, seeded changes of an image, by which a localizer's honesty is measured."""
+"""Faults of sensors and scenes: named, seeded changes of an image that test whether a localizer rejects its wrong answers."""
 
 from bidnerf_core.evaluation.faults.catalogue import FAULTS, find_fault
 from bidnerf_core.evaluation.faults.composition import (

@@ -11,17 +11,17 @@ from torch import Generator, Tensor
 from bidnerf_core.evaluation.faults.fault import uniform_number
 
 WAVES = (2, 3, 4, 5)
-"""Numbers of bulges around a blob's outline, of which its radius is composed."""
+"""Numbers of periods around a blob's outline of the waves that compose its radius."""
 BULGE = 0.35
-"""Amplitude of each, in the logarithm of the radius, at most."""
+"""Maximum amplitude of each wave, in the logarithm of the radius."""
 BLOB_OCTAVES = (4, 8, 16, 32, 64, 128)
-"""Cells along the longer side, of the noises that a texture is the sum of."""
+"""Numbers of cells along the longer side, for the octaves of noise whose sum is a texture."""
 
 
 def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
-    """Return a mask of one irregular piece around a random place, which covers ``share`` of the image exactly.
+    """Return a mask of one irregular piece around a random place, which covers exactly ``share`` of the image.
 
-    A larger share with the same generator's state covers all that a smaller one does.
+    With the same state of the generator, a larger share covers all that a smaller one does.
     """
     centre = uniform_number(generator, 0.2, 0.8) * width, uniform_number(generator, 0.2, 0.8) * height
     down = torch.arange(height, dtype=torch.float32)[:, None] + 0.5 - centre[1]
@@ -36,7 +36,7 @@ def blob(height: int, width: int, share: float, generator: Generator) -> Bool[Te
 def _radius(angle: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, "h w"]:
     """Return the radius of an irregular outline at ``angle`` (radians) around its centre.
 
-    Every point of the outline is seen from the centre, so that the blob is one piece.
+    Every point of the outline is visible from the centre, so that the blob is one piece.
     """
     waves = [
         uniform_number(generator, -BULGE, BULGE)
@@ -47,7 +47,7 @@ def _radius(angle: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, 
 
 
 def texture(height: int, width: int, generator: Generator) -> Float[Tensor, "h w 3"]:
-    """Return random colours with detail at several scales and full contrast, which has as many features as a photo."""
+    """Return random colours with detail at several scales and full contrast, with as many features as a photo."""
     longer = max(height, width)
     layers = [
         torch.stack([smooth_noise(height, width, *_cells(height, width, n, longer), generator) for _ in range(3)], -1)

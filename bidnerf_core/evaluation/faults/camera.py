@@ -24,7 +24,7 @@ def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
 
 
 def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
-    """State the focal length alone and as approximate, as of a photo without a calibration; the image stays as it is."""
+    """State only a focal length, marked as approximate, as for an uncalibrated photo; the image stays as it is."""
     if not on:
         return frame
     camera = frame.intrinsics
@@ -33,14 +33,14 @@ def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
 
 
 def stretched(frame: Frame, factor: float, generator: Generator) -> Frame:
-    """State ``factor`` times the true focal length across, as if an image had been resized in height alone."""
+    """State ``factor`` times the true horizontal focal length, as if only the image's height had been resized."""
     return replace(frame, intrinsics=replace(frame.intrinsics, fx=frame.intrinsics.fx * factor))
 
 
 def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Cut a ``share`` of the width and of the height off at a random corner, and state the principal point as if nothing were cut off.
+    """Crop a ``share`` of the width and height at a random corner, and state the principal point as if nothing were cropped.
 
-    It is stated as far from the middle of what remains as it was from the middle of the whole.
+    Its stated offset from the centre of the cropped image is its true offset from the centre of the whole one.
     """
     camera = frame.intrinsics
     columns, rows = (
@@ -59,7 +59,7 @@ def cropped(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def _kept(size: int, share: float, end: Tensor) -> slice:
-    """Return what remains of a number of pixels without a ``share`` of them at the beginning or at the end."""
+    """Return the slice of ``size`` pixels that remains once a ``share`` is cut off at the beginning or the end."""
     cut = min(round(share * size), size - 1)
     return slice(0, size - cut) if bool(end) else slice(cut, size)
 
@@ -72,7 +72,7 @@ def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> 
 
 
 def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
-    """Take the image through a lens whose first radial coefficient is larger by ``k1``, which the intrinsics do not state."""
+    """Distort the image by a lens whose first radial coefficient is larger by ``k1``, unknown to the stated intrinsics."""
     camera = frame.intrinsics
     own = camera.distortion or (0.0, 0.0, 0.0, 0.0)
     lens = replace(camera, distortion=(own[0] + k1, *own[1:]))
@@ -80,10 +80,10 @@ def distorted(frame: Frame, k1: float, generator: Generator) -> Frame:
 
 
 def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame:
-    """Expose the rows one after the other while the camera turns by ``degrees`` about a random axis through its centre.
+    """Expose the rows one after another while the camera turns by ``degrees`` about a random axis through its centre.
 
-    The rows are those of the sensor, the columns of an upright image. The middle one is exposed at the frame's pose. A camera that only
-    turns sees the same points, so no depth is needed.
+    The rows are those of the sensor, which are the columns of a portrait image. The middle one is exposed at the frame's pose.
+    A camera that only rotates sees the same points, so no depth is needed.
     """
     camera = frame.intrinsics
     axis = random_units(1, generator)[0] * math.radians(degrees)
@@ -94,7 +94,7 @@ def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame
     turned = warped(frame, pixels.nan_to_num(-1.0))
     if frame.depth is None:
         return turned
-    # A point at planar z in the frame lies on the row's ray (x, y, 1) at z over the z of that ray in the frame's camera.
+    # Along a row's ray (x, y, 1), a point's depth is its z in the frame's camera divided by the ray's z in that camera.
     return replace(turned, depth=(nearest(frame.depth, pixels.nan_to_num(-1.0)) / seen[..., 2]).float())
 
 

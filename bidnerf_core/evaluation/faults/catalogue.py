@@ -14,9 +14,9 @@ from bidnerf_core.settings import Above, Range
 
 FACTOR = Above(0.0, 100.0)
 LARGEST_SHIFT = 10_000.0
-"""Pixels by which anything may be moved."""
+"""Maximum shift of anything, in pixels."""
 LARGER_THAN_IMAGES = 1_000_000
-"""Pixels, at which a window holds any image."""
+"""Size, in pixels, of a window that holds any image."""
 HALF_TURN = SE3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.pi], dtype=torch.float64))
 """A turn by 180 degrees about the optical axis."""
 

@@ -18,7 +18,7 @@ from bidnerf_core.localization.costs.thumbnails import KERNEL_REACH
 
 
 def exposure(frame: Frame, factor: float, generator: Generator) -> Frame:
-    """Multiply all values by ``factor``; what would be brighter than white is white."""
+    """Multiply all values by ``factor``; values brighter than white are clipped."""
     return _recoloured(frame, frame.rgb * factor)
 
 
@@ -35,13 +35,13 @@ def blur(frame: Frame, pixels: float, generator: Generator) -> Frame:
     smallest = min(frame.rgb.shape[:2])
     size = min(
         size, smallest - 1 + smallest % 2
-    )  # reflection at the border cannot reach farther than the image
+    )  # padding by reflection at the border cannot be wider than the image
     images = frame.rgb.permute(2, 0, 1)[None]
     return _recoloured(frame, gaussian_blur2d(images, (size, size), (pixels, pixels))[0].permute(1, 2, 0))
 
 
 def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
-    """Compress the colours as JPEG of a quality from 1 to 100 and decode them."""
+    """Compress the colours as JPEG of ``quality`` 1 to 100, and decode them."""
     file = io.BytesIO()
     Image.fromarray((frame.rgb * 255).round().to(torch.uint8).numpy()).save(
         file, "JPEG", quality=int(quality)
@@ -50,7 +50,7 @@ def jpeg(frame: Frame, quality: float, generator: Generator) -> Frame:
 
 
 def grey(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Replace ``share`` of the colours' saturation: 1 leaves their brightness only."""
+    """Remove ``share`` of the colours' saturation: 1 leaves only their brightness."""
     brightness = rgb_to_grayscale(frame.rgb.permute(2, 0, 1)).permute(1, 2, 0)
     return _recoloured(frame, frame.rgb + share * (brightness - frame.rgb))
 

@@ -14,7 +14,7 @@ from bidnerf_core.evaluation.faults.catalogue import find_fault
 from bidnerf_core.frames import View
 
 NO_FAULT = "none"
-"""Stands for a view as it is."""
+"""The name that leaves a view as it is."""
 EXAMPLE = "expected NAME:SIZE as depth-scale:1.02"
 
 
@@ -34,7 +34,7 @@ class AppliedFault:
         return f"{self.name}:{self.size:.12g}"
 
     def __call__(self, view: View, seed: int) -> View:
-        """Return the view with this fault. Raises ``InputError`` where it is one of depth and none was measured."""
+        """Return the view with this fault. Raises ``InputError`` if it is a fault of depth and none was measured."""
         fault = find_fault(self.name)
         generator = torch.Generator().manual_seed(_stream(seed, view.frame.name, self.name))
         T_ref_camera = view.T_ref_camera
@@ -44,10 +44,10 @@ class AppliedFault:
 
 
 def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
-    """Return every fault that the words of a command name, in a canonical form.
+    """Return every fault that a command's words name, in canonical form.
 
     A word is ``none``, ``NAME:SIZE``, ``NAME:SIZE,SIZE...`` for several faults, or faults of one size each joined by
-    ``+``, which are applied together, from left to right. A fault that is there or not needs no size. Raises
+    ``+``, which are applied together, from left to right. A fault that is simply on or off needs no size. Raises
     ``InputError`` for anything else, and for a fault that is named twice.
     """
     found: list[str] = []
@@ -62,7 +62,7 @@ def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
 
 
 def parse_faults(text: str) -> tuple[AppliedFault, ...]:
-    """Return the faults of a text as ``depth-scale:1.02+exposure:0.7``; none for ``NO_FAULT``."""
+    """Return the faults in a text such as ``depth-scale:1.02+exposure:0.7``; an empty tuple for ``NO_FAULT``."""
     if text == NO_FAULT:
         return ()
     faults = tuple(_parsed(part) for part in text.split("+"))
@@ -74,10 +74,10 @@ def parse_faults(text: str) -> tuple[AppliedFault, ...]:
 
 
 def faulty(view: View, faults: str | Sequence[AppliedFault], seed: int) -> View:
-    """Return the view with all faults, the first first.
+    """Return the view with all faults, applied in order.
 
-    ``T_ref_camera`` is the true pose of the faulty image. The same seed, frame and fault give the same result, whatever
-    other faults there are.
+    ``T_ref_camera`` is the true pose of the faulty image. The random choices of a fault depend only on the seed, the frame and
+    the fault, whatever other faults there are.
     """
     for fault in parse_faults(faults) if isinstance(faults, str) else faults:
         view = fault(view, seed)
@@ -85,7 +85,7 @@ def faulty(view: View, faults: str | Sequence[AppliedFault], seed: int) -> View:
 
 
 def check_depth(faults: Iterable[str], depth: bool) -> None:
-    """Raise ``InputError`` for an unknown fault, and, where ``depth`` is withheld, for one of the depth."""
+    """Raise ``InputError`` for an unknown fault and, unless ``depth`` is used, for a fault of depth."""
     for part in (part for text in faults for part in parse_faults(text)):
         if find_fault(part.name).needs_depth and not depth:
             raise InputError(f"fault {part} changes the measured depth, which the method does not get")

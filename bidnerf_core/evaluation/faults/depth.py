@@ -13,9 +13,9 @@ from bidnerf_core.evaluation.faults.warp import nearest
 from bidnerf_core.frames import Frame
 
 PLANE_TRIALS, PLANE_SAMPLE = 256, 4096
-"""Number of planes that are tried, and of points by which they are compared."""
+"""Number of planes to try, and of points by which they are compared."""
 PLANE_TOLERANCE = 0.01
-"""Distance of a point from its plane, over the point's depth, up to which it counts as part of the plane."""
+"""Maximum distance of a point from a plane that it belongs to, relative to the point's depth."""
 
 
 def scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
@@ -35,7 +35,7 @@ def proportional_noise(frame: Frame, share: float, generator: Generator) -> Fram
 
 
 def quadratic_noise(frame: Frame, per_metre: float, generator: Generator) -> Frame:
-    """Add independent Gaussian noise of standard deviation ``per_metre * depth ** 2``, as triangulating sensors have."""
+    """Add independent Gaussian noise of standard deviation ``per_metre * depth ** 2``, typical of triangulating sensors."""
     depth = depth_of(frame)
     return _remeasured(frame, depth + per_metre * depth.square() * _normal(depth, generator))
 
@@ -71,7 +71,7 @@ def misregistered(frame: Frame, pixels: float, generator: Generator) -> Frame:
 
 
 def square_window(frame: Frame, pixels: float, generator: Generator) -> Frame:
-    """Keep the depth inside a square of ``pixels`` by ``pixels`` around a random measured pixel only."""
+    """Keep only the depth inside a square of ``pixels`` by ``pixels`` around a random measured pixel."""
     row, column = random_pixel(depth_of(frame) > 0, generator)
     height, width = depth_of(frame).shape
     rows, columns = _interval(row, height, int(pixels)), _interval(column, width, int(pixels))
@@ -79,14 +79,14 @@ def square_window(frame: Frame, pixels: float, generator: Generator) -> Frame:
 
 
 def few_rows(frame: Frame, count: float, generator: Generator) -> Frame:
-    """Keep the depth of ``count`` neighbouring rows around a random measured pixel only, as a line scanner measures it."""
+    """Keep only the depth of ``count`` adjacent rows around a random measured pixel, as from a line scanner."""
     row, _ = random_pixel(depth_of(frame) > 0, generator)
     height, width = depth_of(frame).shape
     return _kept(frame, _interval(row, height, int(count))[:, None].expand(height, width))
 
 
 def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Keep the depth of the plane that holds the most measured points only."""
+    """Keep only the depth of the plane that holds the most measured points."""
     if not on:
         return frame
     depth = depth_of(frame)
@@ -96,14 +96,14 @@ def one_wall(frame: Frame, on: float, generator: Generator) -> Frame:
 
 
 def _largest_plane(points: Float[Tensor, "n 3"], generator: Generator) -> Float[Tensor, "4"]:
-    """Return the plane (unit normal, offset) through three random points on which most others lie."""
+    """Return the plane (unit normal, offset) with the most points, among random planes through three points each."""
     corners = points[torch.randint(len(points), (PLANE_TRIALS, 3), generator=generator)]
     sample = points[torch.randint(len(points), (PLANE_SAMPLE,), generator=generator)]
     crossed = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = torch.nn.functional.normalize(crossed, dim=-1)
     planes = torch.cat([normals, -(normals * corners[:, 0]).sum(-1, keepdim=True)], dim=-1)
     planes = planes[crossed.norm(dim=-1) > 0]
-    if len(planes) == 0:  # all points in one line: any plane through them holds them all
+    if len(planes) == 0:  # all points are collinear: any plane through them holds them all
         return points.new_zeros(4)
     counts = torch.stack([_on_plane(sample, plane).sum() for plane in planes])
     return planes[counts.argmax()]
@@ -114,7 +114,7 @@ def _on_plane(points: Float[Tensor, "*p 3"], plane: Float[Tensor, "4"]) -> Bool[
 
 
 def _interval(middle: int, length: int, size: int) -> Bool[Tensor, "n"]:
-    """Mark ``size`` neighbours of ``length`` places, around ``middle`` as far as the ends allow."""
+    """Mark ``length`` adjacent places out of ``size``, centred on ``middle`` as far as the ends allow."""
     first = max(0, min(middle - size // 2, length - size))
     places = torch.arange(length)
     return (places >= first) & (places < first + size)
@@ -125,7 +125,7 @@ def _normal(depth: Float[Tensor, "h w"], generator: Generator) -> Float[Tensor, 
 
 
 def _remeasured(frame: Frame, depth: Float[Tensor, "h w"]) -> Frame:
-    """Return the frame with another depth where there was a measurement; depths of 0 and below are none."""
+    """Return the frame with another depth where there was a measurement; values of 0 and below count as not measured."""
     valid = (depth_of(frame) > 0) & (depth > 0)
     return replace(frame, depth=torch.where(valid, depth, torch.zeros_like(depth)))
 

@@ -17,7 +17,7 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import Range
 
 Change: TypeAlias = Callable[[Frame, float, Generator], Frame]
-"""Returns the frame with a fault of the given size; every random choice is drawn from the generator."""
+"""A function that returns the frame with a fault of the given size; all random choices are drawn from the generator."""
 
 
 class WholeNumbers(Range):
@@ -41,16 +41,16 @@ class Fault:
     summary: str
     unit: str  # of the size, in words
     allowed: Range
-    neutral: float | None  # the size that leaves the frame as it is; none where no size does
-    sizes: tuple[float, ...]  # those worth measuring
+    neutral: float | None  # the size that leaves the frame as it is; None where no size does
+    sizes: tuple[float, ...]  # sizes worth measuring
     change: Change
     needs_depth: bool = False
     T_true_faulty: SE3 | None = None
-    """Pose of the faulty camera in the true camera's frame, at any size but the neutral one; none where they coincide."""
+    """Pose of the faulty camera in the true camera's frame, at any size but the neutral one; None where they coincide."""
 
     @property
     def is_switch(self) -> bool:
-        """Whether the fault is either there (size 1) or not (size 0)."""
+        """Whether the fault is simply on (size 1) or off (size 0)."""
         return self.allowed is SWITCH
 
 
@@ -73,7 +73,7 @@ def uniform_number(generator: Generator, low: float = 0.0, high: float = 1.0) ->
 
 
 def random_pixel(mask: Bool[Tensor, "h w"], generator: Generator) -> tuple[int, int]:
-    """Return the row and the column of a random pixel of ``mask``, which marks one at least."""
+    """Return the row and the column of a random pixel of ``mask``, which marks at least one."""
     places = mask.nonzero()
     row, column = places[int(torch.randint(len(places), (), generator=generator))].tolist()
     return row, column

@@ -1,4 +1,4 @@
-"""Faults of the scene: things in front of it, things that moved, came or went since it was mapped."""
+"""Faults of the scene: objects in front of it, and objects that moved, appeared or vanished since it was mapped."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from bidnerf_core.frames import Frame
 NEAREST_QUANTILE = 0.02
 """Quantile of the measured depth that counts as the nearest part of the scene."""
 OCCLUDER_DEPTH = (0.4, 0.8)
-"""Limits of the depth of an occluder, over that of the nearest part of the scene."""
+"""Limits of an occluder's depth relative to that of the nearest part of the scene."""
 RELIEF = 0.05
-"""Standard deviation of an occluder's depth over its mean."""
+"""Standard deviation of an occluder's depth relative to its mean."""
 TRAVEL, APPROACH = (0.15, 0.3), (0.85, 0.98)
-"""How far a thing moves across the image (over its smaller side), and by which factor towards the camera."""
+"""Limits of an object's motion across the image (relative to its shorter side), and of the factor on its depth."""
 ADDED_HEIGHT = (0.02, 0.1)
-"""How far an added thing rises from the surface towards the camera, over the depth."""
+"""Limits of the height of an added object above the surface, towards the camera, relative to the depth."""
 RIM = 3
-"""Width in pixels of the surroundings by which a hole is filled."""
+"""Width, in pixels, of the surroundings from which a hole is filled."""
 
 
 def occluder(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Put a textured thing in front of ``share`` of the image. Where depth was measured, its own depth is."""
+    """Put a textured object in front of ``share`` of the image. If the frame has depth, that of the object is measured."""
     mask, colours = _textured_blob(frame, share, generator)
     if frame.depth is None or not frame.has_depth:
         return _pasted(frame, mask, colours, frame.depth)
@@ -41,16 +41,16 @@ def occluder(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def unmeasured_occluder(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Put a textured thing in front of ``share`` of the image, too near for its depth to be measured."""
+    """Put a textured object in front of ``share`` of the image, too near for its depth to be measured."""
     mask, colours = _textured_blob(frame, share, generator)
     depth = None if frame.depth is None else torch.zeros_like(frame.depth)
     return _pasted(frame, mask, colours, depth)
 
 
 def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Show a piece of the scene at another place of the image as well, where it covers ``share`` of it, a little nearer.
+    """Show a piece of the scene at a second place in the image as well, where it covers ``share`` of it, a little nearer.
 
-    Its features match those of the map, and agree with each other on a wrong pose.
+    The features of the copy match those of the map, and agree with each other on a wrong pose.
     """
     height, width = frame.rgb.shape[:2]
     mask = blob(height, width, share, generator)
@@ -62,7 +62,7 @@ def moved_thing(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Put a textured thing onto ``share`` of the measured surface, from which it rises a little."""
+    """Put a textured object on ``share`` of the measured surface, from which it protrudes a little."""
     mask = _surface_piece(frame, share, generator)
     rise = uniform_number(generator, *ADDED_HEIGHT) * (1 + 0.4 * _bounded_noise(frame, 6, generator))
     colours = texture(frame.intrinsics.height, frame.intrinsics.width, generator)
@@ -70,10 +70,10 @@ def added_thing(frame: Frame, share: float, generator: Generator) -> Frame:
 
 
 def vanished_thing(frame: Frame, share: float, generator: Generator) -> Frame:
-    """Remove ``share`` of the measured surface in one piece. The background takes its place, or what lies around it.
+    """Remove ``share`` of the measured surface in one piece, and show the background or the surroundings in its place.
 
-    Where the frame has alpha and the piece reaches the edge of the scene, its background is seen; otherwise the colours
-    around are continued, at the depth of the farthest surface around.
+    Where the frame has alpha and the piece reaches the edge of the scene, the background is seen; otherwise the surrounding
+    colours are continued, at the depth of the farthest surrounding surface.
     """
     mask = _surface_piece(frame, share, generator)
     rim = torch.from_numpy(binary_dilation(mask.numpy(), iterations=RIM)) & ~mask
@@ -95,7 +95,7 @@ def _textured_blob(
 
 
 def _surface_piece(frame: Frame, share: float, generator: Generator) -> Bool[Tensor, "h w"]:
-    """Mark ``share`` of the measured pixels: those whose points are nearest to a random one of them."""
+    """Mark ``share`` of the measured pixels: those whose points are nearest to a randomly chosen one."""
     depth = depth_of(frame)
     points = frame.intrinsics.unproject(frame.intrinsics.pixel_centres()) * depth[..., None]
     row, column = random_pixel(depth > 0, generator)
@@ -118,7 +118,7 @@ def _pasted(
     depth: Float[Tensor, "h w"] | None,
     alpha: Float[Tensor, "h w"] | None = None,
 ) -> Frame:
-    """Return the frame with other colours, depth and alpha (1 by default) inside of ``mask``."""
+    """Return the frame with new colours, depth and alpha (1 by default) inside ``mask``."""
     pasted = replace(frame, rgb=torch.where(mask[..., None], rgb, frame.rgb))
     if frame.depth is not None and depth is not None:
         pasted = replace(pasted, depth=torch.where(mask, depth.to(frame.depth), frame.depth))

@@ -1,4 +1,4 @@
-"""Images resampled at other places of the image plane."""
+"""Resampling of images at other places of the image plane."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bidnerf_core.frames import Frame
 def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
     """Return the frame whose pixel (v, u) shows what ``frame`` shows at ``pixels[v, u]``, given as (u, v).
 
-    Colour and alpha are interpolated, and continue beyond the border as they are there. Depth is that of the nearest
+    Colour and alpha are interpolated, and the values at the border are repeated beyond it. Depth is that of the nearest
     pixel, since a mean across an edge lies on neither surface; it is 0 beyond the border.
     """
     alpha = None if frame.alpha is None else _interpolated(frame.alpha[..., None], pixels)[..., 0]
@@ -23,14 +23,14 @@ def warped(frame: Frame, pixels: Float[Tensor, "h w 2"]) -> Frame:
 
 
 def reflected(pixels: Float[Tensor, "*p 2"], width: int, height: int) -> Float[Tensor, "*p 2"]:
-    """Return pixels (u, v) inside of an image: those beyond a border are mirrored at it."""
+    """Return pixels (u, v) inside an image: those beyond a border are mirrored at it."""
     size = pixels.new_tensor([width, height])
     folded = pixels.remainder(2 * size)
     return torch.minimum(folded, 2 * size - folded)
 
 
 def nearest(image: Float[Tensor, "h w"], pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p"]:
-    """Return the values of the pixels that contain ``pixels``, 0 beyond the border."""
+    """Return the values of the pixels that contain the positions ``pixels``, and 0 beyond the border."""
     height, width = image.shape
     column, row = pixels.floor().long().unbind(-1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)

@@ -12,12 +12,12 @@ from bidnerf_core.orientation import Orientation
 
 
 def mirrored(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Swap left and right of colour and depth, which is no view of the scene from anywhere."""
+    """Swap left and right of colour and depth; the result is not a view of the scene from anywhere."""
     return _turned(frame, Orientation(mirrors_columns=True)) if on else frame
 
 
 def flipped(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Swap top and bottom of colour and depth, which is no view of the scene from anywhere."""
+    """Swap top and bottom of colour and depth; the result is not a view of the scene from anywhere."""
     return _turned(frame, Orientation(mirrors_rows=True)) if on else frame
 
 
@@ -27,7 +27,7 @@ def upside_down(frame: Frame, on: float, generator: Generator) -> Frame:
 
 
 def covered_lens(frame: Frame, on: float, generator: Generator) -> Frame:
-    """Show one random colour everywhere and measure no depth."""
+    """Show one random colour everywhere, without any measured depth."""
     if not on:
         return frame
     colour = torch.rand(3, generator=generator).to(frame.rgb)

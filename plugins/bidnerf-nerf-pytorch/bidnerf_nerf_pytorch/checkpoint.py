@@ -1,4 +1,4 @@
-"""Reading of checkpoints. The architecture is that of the weights, since the config file beside them may differ."""
+"""Reading of checkpoints. The architecture is inferred from the weights, since the accompanying config file may differ."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class Checkpoint:
 
 
 def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
-    """Return the networks in ``path``, without running any code in it. ``octaves`` is the only choice that no weight shows.
+    """Return the networks in ``path``, without running any code in it.
 
-    Raises ``InputError``, in one line, where there is no such file, it holds code or no checkpoint of nerf-pytorch, the
-    fine network is missing, or the architecture is not known.
+    ``octaves`` is the only choice that the weights do not show. Raises ``InputError``, in one line, where there is no such
+    file, it holds code or is not a checkpoint of nerf-pytorch, the fine network is missing, or the architecture is unknown.
     """
     found = _loaded(path)
     if not isinstance(found, dict) or not isinstance(found.get(NETWORKS["coarse"]), dict):
@@ -52,10 +52,10 @@ def read_checkpoint(path: Path, octaves: bool = True) -> Checkpoint:
 def _loaded(path: Path) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file, expected a checkpoint of nerf-pytorch")
-    path.open("rb").close()  # errors of reading the file pass as they are; all later ones are of its content
+    path.open("rb").close()  # errors here concern opening the file; all later ones concern its content
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # each kind of damage has an exception of its own
+    except Exception as error:  # each kind of damage raises another exception
         code = re.search(r"GLOBAL ([\w.]+)", str(error))
         if isinstance(error, pickle.UnpicklingError) and code:
             raise InputError(
@@ -67,7 +67,7 @@ def _loaded(path: Path) -> Any:
 
 
 def _architecture(tensors: dict[str, Any], octaves: bool, where: str) -> NetworkConfig:
-    """Return the architecture that the shapes show, after a check that a network of it has just these tensors."""
+    """Return the architecture that the shapes imply, after checking that such a network has exactly these tensors."""
     shapes = {name: tuple(getattr(value, "shape", ())) for name, value in tensors.items()}
     width, seen = _sizes(shapes.get("layer1.weight"), where)
     inputs = [shapes.get(f"layers_xyz.{i}.weight", ()) for i in range(sum(map(_is_hidden, shapes)))]
@@ -95,7 +95,7 @@ def _sizes(shape: tuple[int, ...] | None, where: str) -> tuple[int, int]:
 
 
 def _frequencies(width: int, where: str) -> tuple[int, bool]:
-    """Return how many frequencies give ``width`` numbers, and whether the input itself is among them."""
+    """Return the number of frequencies of an encoding of length ``width``, and whether the input itself is part of it."""
     if width < 3 or width % 3:
         raise InputError(f"{where}: unknown architecture, {width} inputs where a multiple of 3 was expected")
     return width // 6, width // 3 % 2 == 1

@@ -69,7 +69,7 @@ def import_checkpoint(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 1 with one line on stderr where the input is bad, or 2 for wrong usage."""
+    """Run the command; return 0, 1 (with one line on stderr) for bad input, or 2 for wrong usage."""
     try:
         tyro.cli(import_checkpoint, args=arguments, prog=NAME)
     except SystemExit as stopped:  # the parser has printed its message

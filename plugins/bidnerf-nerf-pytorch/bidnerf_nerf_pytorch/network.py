@@ -22,10 +22,10 @@ class NetworkConfig(Settings):
     skips: tuple[int, ...] = ()  # number of layers before each one that takes the position once more
     # number of frequencies of the position's sines and cosines
     position_frequencies: Annotated[int, Range(0, 64)] = 10
-    position_input: bool = True  # feed the position itself in, beside its sines
+    position_input: bool = True  # feed in the position itself, besides its sines
     # number of frequencies of the direction's sines and cosines
     direction_frequencies: Annotated[int, Range(0, 64)] = 4
-    direction_input: bool = True  # feed the direction itself in, beside its sines
+    direction_input: bool = True  # feed in the direction itself, besides its sines
     octaves: bool = True  # frequencies 1, 2, 4 ... 2^(n-1); otherwise n in equal steps between the same ends
     view_dependent: bool = True  # whether colour depends on the direction
 
@@ -33,8 +33,8 @@ class NetworkConfig(Settings):
 class Network(nn.Module):
     """Maps positions (world) and unit directions to raw density and colour.
 
-    As in the original, the first layer has no activation. Unlike there, density is initially a thin fog: where a ReLU makes
-    it zero everywhere, there would be no gradient to recover from that.
+    As in the original, the first layer has no activation. Unlike in the original, the density is initially a thin fog: if a
+    ReLU made it zero everywhere, there would be no gradient by which to recover.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -72,7 +72,7 @@ class Network(nn.Module):
 
 
 def encoded_width(frequencies: int, include_input: bool) -> int:
-    """Return how many numbers encode a point."""
+    """Return the length of a point's encoding."""
     return 3 * (2 * frequencies + include_input)
 
 

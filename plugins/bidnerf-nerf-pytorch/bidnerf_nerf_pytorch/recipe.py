@@ -25,9 +25,9 @@ class NerfPytorchConfig(FieldConfig):
     """Architecture and training. The defaults are those of the checkpoints that nerf-pytorch offers."""
 
     steps: Count = 200_000  # steps of the optimizer
-    rays_per_step: Count = 1024  # number of rays a step
+    rays_per_step: Count = 1024  # number of rays per step
     learning_rate: NotNegative = 5e-3  # initial learning rate
-    depth_weight: NotNegative = 0.1  # weight of the depth term beside the colour term; 0 leaves depth out
+    depth_weight: NotNegative = 0.1  # weight of the depth term relative to colour; 0 leaves depth out
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
     checkpoint: str = ""  # file with the initial weights; "" for random ones
 

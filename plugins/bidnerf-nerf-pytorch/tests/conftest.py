@@ -22,7 +22,7 @@ SMALL = NetworkConfig(layers=3, width=16, position_frequencies=3, direction_freq
 
 @pytest.fixture
 def nerf_pytorch_data() -> Path:
-    """Checkpoints that others trained."""
+    """Checkpoints trained by others."""
     folder = os.environ.get("BIDNERF_DATA")
     if not folder:
         pytest.skip("BIDNERF_DATA is not set")
@@ -47,7 +47,7 @@ def contents(config: NetworkConfig = SMALL) -> dict[str, Any]:
 
 @pytest.fixture
 def write(tmp_path: Path) -> Writer:
-    """Writes a checkpoint, by default a good one, and says where."""
+    """A function that writes a checkpoint, by default a valid one, and returns its path."""
 
     def writer(found: Any = None, name: str = "checkpoint00099.ckpt") -> Path:
         torch.save(contents() if found is None else found, tmp_path / name)

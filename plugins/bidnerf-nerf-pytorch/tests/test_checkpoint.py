@@ -1,4 +1,4 @@
-"""Reading checkpoints: what is found, and how it is refused."""
+"""Reading checkpoints: what is found in valid ones, and the errors for others."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_code_is_refused_and_not_run(write: Writer, tmp_path: Path) -> None:
 
 
 def changed(**shapes: tuple[int, ...] | None) -> dict[str, Any]:
-    """A checkpoint whose fine network has tensors of other shapes (None: not at all)."""
+    """Return a checkpoint whose fine network has tensors of other shapes, or lacks those given as None."""
     found = contents()
     for name, shape in shapes.items():
         found["model_fine_state_dict"].pop(name.replace("__", "."), None)

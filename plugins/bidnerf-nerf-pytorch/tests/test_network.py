@@ -1,4 +1,4 @@
-"""The network against the original's words, written out."""
+"""The network, compared with the original's formulas written out."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_colour_without_directions() -> None:
 
 @pytest.mark.parametrize("view_dependent", [True, False])
 def test_an_untrained_network_is_fog_everywhere(view_dependent: bool) -> None:
-    """What begins without density has no gradient by which to get any."""
+    """A network that begins without density would have no gradient by which to gain any."""
     net = Network(NetworkConfig(view_dependent=view_dependent))
     density, rgb = net(torch.rand(500, 3) * 4 - 2, torch.randn(500, 3))
     assert float(density.detach().min()) > 0

@@ -1,4 +1,4 @@
-"""Checkpoints that others trained, against the images that they were trained for."""
+"""Checkpoints trained by others, compared with the images that they were trained on."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bidnerf_nerf_pytorch.network import NetworkConfig
 
 BOUNDS = SceneBounds((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5), 2.0, 6.0, (1.0, 1.0, 1.0))
 FILES = ("lego-lowres/checkpoint199999.ckpt", "chair-lowres/checkpoint155000.ckpt")
-SPACING = 4  # every so many pixels of a row and column are looked at
+SPACING = 4  # every fourth pixel of a row and column is compared
 
 
 def field_of(path: Path) -> NerfPytorchField:

@@ -25,9 +25,9 @@ class TemplateConfig:
     resolution: int = 96  # grid points along each axis of the modelled space
     samples: int = 96  # samples along a ray
     steps: int = 1500  # steps of the optimizer
-    rays_per_step: int = 2048  # number of rays a step
+    rays_per_step: int = 2048  # number of rays per step
     learning_rate: float = 0.1  # initial learning rate
-    depth_weight: float = 0.1  # weight of the depth term beside the colour term
+    depth_weight: float = 0.1  # weight of the depth term relative to the colour term
 
 
 class TemplateField(nn.Module):

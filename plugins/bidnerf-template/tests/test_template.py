@@ -1,4 +1,4 @@
-"""The contract tests all that is required of a backend. A small config keeps it fast."""
+"""The contract, which tests all that is required of a backend. A small config keeps it fast."""
 
 from __future__ import annotations
 
