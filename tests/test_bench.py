@@ -477,7 +477,7 @@ def test_shards_joined_are_the_whole(tmp_path: Path, evaluate: Evaluate) -> None
 def test_a_trial_that_fails_ends_the_run_and_keeps_the_others(tmp_path: Path) -> None:
     good, bad = blob_trial(0), Trial(BLOBS, BLOBS, ("0000",), "none", (), "bid")
     with ResultsFile(tmp_path / "r.jsonl") as file, pytest.raises(InputError, match="needs a start"):
-        run_trials([good, bad, blob_trial(1)], file, InThisProcess(), without_motion=1)
+        run_trials([good, bad, blob_trial(1)], file, InThisProcess(), at_once=1)
     assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == [0]
 
 

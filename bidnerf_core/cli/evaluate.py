@@ -141,13 +141,9 @@ def _evaluate(trials: list[Trial], out: Path, workers: int | None, dask: str | N
         if len(todo) < len(trials):
             say(f"{out}: {len(trials) - len(todo)} of {len(trials)} trials are already there")
         if todo:
-            with _executor(workers, dask, len(todo), todo[0].device == "cpu") as (
-                executor,
-                without_motion,
-                what,
-            ):
+            with _executor(workers, dask, len(todo), todo[0].device == "cpu") as (executor, at_once, what):
                 note_run(out, provenance(command, what))
-                _run(todo, file, executor, without_motion)
+                _run(todo, file, executor, at_once)
         file.put_in_order(trials)
     show(f"{amount(len(trials), 'trial')} in {out}; 'bidnerf report {out}' shows them")
 
@@ -160,13 +156,13 @@ def _note_unchecked(trials: list[Trial], file: ResultsFile, out: Path) -> None:
         say(f"{out}: {count} results of an earlier version do not record their images and are kept unchecked")
 
 
-def _run(todo: list[Trial], file: ResultsFile, executor: Executor, without_motion: int) -> None:
-    with TrialProgress(len(todo), without_motion) as progress:
+def _run(todo: list[Trial], file: ResultsFile, executor: Executor, at_once: int) -> None:
+    with TrialProgress(len(todo), at_once) as progress:
         try:
-            run_trials(todo, file, executor, without_motion, progress.done, lambda: progress.stopping)
+            run_trials(todo, file, executor, at_once, progress.done, lambda: progress.stopping)
         except BrokenProcessPool as error:
             raise InputError(
-                f"a worker process ended by itself (is there enough memory for {without_motion} of them?); "
+                f"a worker process ended by itself (is there enough memory for {at_once} of them?); "
                 f"finished trials are kept in {file.path}, the same command goes on"
             ) from error
     if progress.count < len(todo):

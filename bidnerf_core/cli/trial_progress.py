@@ -25,10 +25,10 @@ class TrialProgress(StoppableBar):
     As a context manager, it makes Ctrl-C wait for the running trials, and a second Ctrl-C stop them.
     """
 
-    def __init__(self, total: int, without_motion: int) -> None:
+    def __init__(self, total: int, at_once: int) -> None:
         self.total, self.count, self.right = total, 0, 0
         self.stopping = False
-        self._at_once = without_motion
+        self._at_once = at_once
         self._began = self._spoke = time.monotonic()
         self._bar = Progress(
             TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[numbers]}"),

@@ -135,19 +135,19 @@ def run_trials(
     trials: Sequence[Trial],
     file: ResultsFile,
     executor: Executor,
-    without_motion: int,
+    at_once: int,
     finished: Callable[[TrialResult], None] = lambda result: None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> None:
     """Run the trials whose results ``file`` does not hold, and store each result when it is done.
 
-    At most ``without_motion`` trials are under way at once, so that a kill loses little. No trial begins once ``stopping``
+    At most ``at_once`` trials are under way at once, so that a kill loses little. No trial begins once ``stopping``
     returns True. A trial that fails ends the run with its error, after the results of the trials under way have been stored.
     """
     waiting, under_way = iter(left_to_do(trials, file)), set[Future[TrialResult]]()
     failed: BaseException | None = None
     while True:
-        while len(under_way) < without_motion and failed is None and not stopping():
+        while len(under_way) < at_once and failed is None and not stopping():
             trial = next(waiting, None)
             if trial is None:
                 break
