@@ -20,7 +20,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.observations import Observations
-from bidnerf_core.rolling_shutter import exposure_moments, poses_of_rows
+from bidnerf_core.rolling_shutter import exposure_times, poses_of_rows
 
 
 @runtime_checkable
@@ -64,7 +64,7 @@ def observe(
         depth = frame.depth[rows.to(frame.depth.device), columns.to(frame.depth.device)].to(length)
     T = view.T_ref_camera.to(length)
     if view.motion is not None and bool(view.motion.any()):
-        T = T @ poses_of_rows(exposure_moments(pixels.to(ray) + 0.5, frame.intrinsics), view.motion)
+        T = T @ poses_of_rows(exposure_times(pixels.to(ray) + 0.5, frame.intrinsics), view.motion)
     directions = T.rotate(ray / length[:, None])
     origins = T.translation.expand_as(directions)
     there = frame.rgb.device if device is None else device

@@ -12,7 +12,7 @@ from typing import Any
 from bidnerf_core.errors import InputError
 from bidnerf_core.files import read_file
 
-LARGEST_FILE = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
+LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Record:
 
     def checked_number(self, found: Any, what: str) -> float:
         is_number = isinstance(found, int | float) and not isinstance(found, bool)
-        if not is_number or not abs(found) < LARGEST_FILE:
+        if not is_number or not abs(found) < LARGEST_NUMBER:
             raise self.error(f"{what} is {_short(found)}, expected a finite number")
         return float(found)
 

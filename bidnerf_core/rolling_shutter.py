@@ -47,43 +47,43 @@ STILL = MotionPrior()
 """The prior of a camera that does not move, or whose rows are all exposed at once."""
 
 
-def exposure_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
+def exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
     """Return the time at which each pixel was exposed, as a share of the readout time: -0.5 to 0.5, zero at the middle row.
 
     Sensors are wider than they are high, so the sensor's rows are the columns of a portrait image; square images count as
     landscape. The direction of the readout does not matter: reversing it reverses the motion.
     """
-    return _moments_along(pixels, camera, 0 if camera.height > camera.width else 1)
+    return _times_along(pixels, camera, 0 if camera.height > camera.width else 1)
 
 
-def turned_moments(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
-    """Return ``exposure_moments`` for rows along the other axis, as in a portrait crop of a landscape image."""
-    return _moments_along(pixels, camera, 1 if camera.height > camera.width else 0)
+def transposed_exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
+    """Return ``exposure_times`` for rows along the other axis, as in a portrait crop of a landscape image."""
+    return _times_along(pixels, camera, 1 if camera.height > camera.width else 0)
 
 
-def _moments_along(pixels: Float[Tensor, "m 2"], camera: Intrinsics, axis: int) -> Float[Tensor, "m"]:
+def _times_along(pixels: Float[Tensor, "m 2"], camera: Intrinsics, axis: int) -> Float[Tensor, "m"]:
     return pixels[:, axis].double() / (camera.width, camera.height)[axis] - 0.5
 
 
-def poses_of_rows(moments: Float[Tensor, "m"], motion: Float[Tensor, "6"]) -> SE3:
+def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "6"]) -> SE3:
     """Return T_middle_row, the pose of the camera at each moment in the frame of the camera at the middle row."""
-    return SE3.exp(moments[:, None] * motion.to(moments))
+    return SE3.exp(times[:, None] * motion.to(times))
 
 
 def moved_points(
-    points: Float[Tensor, "m 3"], moments: Float[Tensor, "m"], motion: Float[Tensor, "6"]
+    points: Float[Tensor, "m 3"], times: Float[Tensor, "m"], motion: Float[Tensor, "6"]
 ) -> Float[Tensor, "m 3"]:
-    """Return points in the frame of the camera at their moments, given in the camera's frame at the middle row."""
-    found = moved_array(points.double().numpy(), moments.numpy(), motion.numpy())
+    """Return points in the frame of the camera at their times of exposure, given in the camera's frame at the middle row."""
+    found = moved_array(points.double().numpy(), times.numpy(), motion.numpy())
     return torch.from_numpy(found).to(points.dtype)
 
 
 def moved_array(
-    points: Float[np.ndarray, "m 3"], moments: Float[np.ndarray, "m"], motion: Float[np.ndarray, "6"]
+    points: Float[np.ndarray, "m 3"], times: Float[np.ndarray, "m"], motion: Float[np.ndarray, "6"]
 ) -> Float[np.ndarray, "m 3"]:
     """Return ``moved_points`` for NumPy arrays, with the inverse of the exponential map to second order."""
     turning = cross_matrix(motion[3:]).T
     velocity = motion[:3] + points @ turning
-    times = moments[:, None]
-    moved: np.ndarray = points - times * velocity + 0.5 * times**2 * (velocity @ turning)
+    share = times[:, None]
+    moved: np.ndarray = points - share * velocity + 0.5 * share**2 * (velocity @ turning)
     return moved

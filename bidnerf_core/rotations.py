@@ -20,7 +20,7 @@ def cross_matrix(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def rotation_of(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def rotation_matrix(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return the rotation by the vector ``phi`` (radians; Rodrigues' formula)."""
     cross, angle = cross_matrix(phi), math.sqrt(float(phi @ phi))
     if angle < SERIES_ANGLE:
@@ -29,7 +29,7 @@ def rotation_of(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + math.sin(angle) / angle * cross + 2 * half**2 * cross @ cross
 
 
-def vector_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+def rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
     """Return the rotation vector (radians) of a rotation, of angle 0 to pi."""
     skew = 0.5 * (rotation - rotation.T)
     axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])

@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 
 from bidnerf_adanerf import AdaNerfConfig, AdaNerfField, backend
 from bidnerf_adanerf.bins import Bins, chosen
-from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_student
+from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_weights
 from bidnerf_adanerf.oracle_loss import ENOUGH, by_depth, by_weight, oracle_loss
 from bidnerf_adanerf.recipe import Phase, phase_at, room_for_matter, sparsity
 from bidnerf_core.camera import Intrinsics
@@ -189,12 +189,12 @@ def test_a_score_weighs_the_opacity_of_its_bin(rays: Rays) -> None:
 
 def test_bins_that_will_be_shaded_count_fully_in_the_soft_phase() -> None:
     scores = torch.tensor([[0.0, 0.05, 0.1, 0.2, 0.7, 1.0]], requires_grad=True)
-    counted = soft_student(scores, 0.2)
+    counted = soft_weights(scores, 0.2)
     torch.testing.assert_close(counted.detach(), torch.tensor([[0.0, 0.25, 0.5, 1.0, 1.0, 1.0]]))
     counted.sum().backward()
     assert scores.grad is not None
     assert bool((scores.grad[0, :3] > 0).all())  # what a picture lacks, the oracle can call back
-    assert torch.equal(soft_student(scores.detach(), 0.0)[0, 1:], torch.ones(5))
+    assert torch.equal(soft_weights(scores.detach(), 0.0)[0, 1:], torch.ones(5))
 
 
 def test_opacity_is_that_of_the_bins_asked_about(rays: Rays) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.cli.camera_options import depth_registration
-from bidnerf_core.datasets import DepthSensor, TimedFrame, open_dataset, open_sequence
+from bidnerf_core.datasets import DepthCamera, TimedFrame, open_dataset, open_sequence
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.se3 import SE3
@@ -30,7 +30,7 @@ T_COLOUR_DEPTH = SE3(
     torch.from_numpy(Rotation.from_rotvec([0.01, -0.008, 0.003]).as_matrix()),
     torch.tensor([-0.15, 0.01, 0.004], dtype=torch.float64),
 )
-SENSOR = DepthSensor(DEPTH, T_COLOUR_DEPTH)
+SENSOR = DepthCamera(DEPTH, T_COLOUR_DEPTH)
 WALL = 2.0
 BOX = torch.tensor([[-0.3, -0.2, 0.9], [0.2, 0.25, 1.2]], dtype=torch.float64)
 """The wall is the plane z = 2 m of the depth camera, the box lies before it (metres)."""
@@ -75,7 +75,7 @@ def test_registered_depth_is_what_the_colour_camera_would_measure(
     camera: Intrinsics, size: tuple[int, int]
 ) -> None:
     """Occlusions included: depth of the wall never shows through the box, and what the box hides stays empty."""
-    sensor = DepthSensor(DEPTH.resized(*size), T_COLOUR_DEPTH)
+    sensor = DepthCamera(DEPTH.resized(*size), T_COLOUR_DEPTH)
     measured = seen(sensor.camera, SE3.identity())
     found, expected = sensor.registered(measured, camera, "depth"), seen(camera, T_COLOUR_DEPTH.inverse())
     known, radius = visible(expected, camera), 320 // size[0]
@@ -108,7 +108,7 @@ def test_a_lens_does_not_fold_points_beside_the_image_into_it() -> None:
     wide = Intrinsics(30.0, 30.0, 80.0, 60.0, 160, 120)
     depth = torch.zeros(120, 160)
     depth[60, 150:160] = 1.0
-    assert not bool(DepthSensor(wide, SE3.identity()).registered(depth, folding, "depth").any())
+    assert not bool(DepthCamera(wide, SE3.identity()).registered(depth, folding, "depth").any())
     far = folding.project(torch.tensor([[1.55, 0.0, 1.0]], dtype=torch.float64))
     assert 0 < float(far[0, 0]) < 100  # it would be in the image
 
@@ -201,11 +201,11 @@ def test_broken_files_of_sensors_are_refused(
     changes: dict[str, object], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=message):
-        DepthSensor.read(write_sensor(tmp_path / "sensor.json", **changes))
+        DepthCamera.read(write_sensor(tmp_path / "sensor.json", **changes))
 
 
 def test_depth_of_another_shape_than_its_sensors_is_refused(recording: Path) -> None:
-    square = DepthSensor(Intrinsics(50.0, 50.0, 30.0, 30.0, 60, 60), SE3.identity())
+    square = DepthCamera(Intrinsics(50.0, 50.0, 30.0, 30.0, 60, 60), SE3.identity())
     with pytest.raises(
         InputError, match=r"depth is 160x120, expected the aspect ratio of its camera's 60x60"
     ):
@@ -221,4 +221,4 @@ def test_a_transform_that_loses_all_depth_is_named() -> None:
     there = SE3(torch.eye(3, dtype=torch.float64), torch.tensor([500.0, 0.0, 0.0], dtype=torch.float64))
     depth = seen(DEPTH, SE3.identity())
     with pytest.raises(InputError, match=r"d\.png: nothing that was measured falls .* 500 m from"):
-        DepthSensor(DEPTH, there).registered(depth, COLOUR, "d.png")
+        DepthCamera(DEPTH, there).registered(depth, COLOUR, "d.png")

@@ -18,7 +18,7 @@ from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.reprojection import ReprojectionErrors, State
 from bidnerf_core.mapping.resection import log_likelihood_ratio, resect
-from bidnerf_core.rolling_shutter import STILL, MotionPrior, exposure_moments
+from bidnerf_core.rolling_shutter import STILL, MotionPrior, exposure_times
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
 FOCAL, WIDTH, HEIGHT = 400.0, 640.0, 480.0
@@ -156,14 +156,16 @@ def observed_while_moving(motion: Tensor, noise: float = 0.0, seed: int = 0) -> 
     """The same points as a camera sees them whose pose at each row is that of the exponential of the motion so far."""
     data = observed(seed=seed)
     local = TRUE.inverse().apply(data.points)
-    moments = data.moments
+    times = data.exposure_times
     for _ in range(20):  # the row on which a point appears depends on the pose at that row
-        there = SE3.exp(-moments[:, None] * motion).apply(local)
+        there = SE3.exp(-times[:, None] * motion).apply(local)
         image = there[:, :2] / there[:, 2:]
-        moments = image[:, 1] * FOCAL / HEIGHT
+        times = image[:, 1] * FOCAL / HEIGHT
     random = torch.Generator().manual_seed(seed + 1)
     off = noise / FOCAL * torch.randn(image.shape, generator=random, dtype=torch.float64)
-    return replace(data, image=image + off, moments=moments, turned_moments=image[:, 0] * FOCAL / WIDTH)
+    return replace(
+        data, image=image + off, exposure_times=times, transposed_exposure_times=image[:, 0] * FOCAL / WIDTH
+    )
 
 
 @pytest.mark.parametrize(("moved", "tolerance"), [(0.0, 2e-3), (1.0, 0.02)])
@@ -217,7 +219,9 @@ def test_rows_that_may_run_the_other_way_are_part_of_the_doubt() -> None:
     """A shear along the columns looks like one along the rows of a camera that rolled, with another motion."""
     for motion in (MOTION, 2 * MOTION):
         data = observed_while_moving(motion, 0.3)
-        data = replace(data, moments=data.turned_moments, turned_moments=data.moments)
+        data = replace(
+            data, exposure_times=data.transposed_exposure_times, transposed_exposure_times=data.exposure_times
+        )
         found = evident_motion(data, resect(data, TRUE, 0.5), 1.0)
         fit = resect(data, TRUE, 0.5, motion=found.prior)
         off = (fit.T_world_rig.inverse() @ TRUE).log()
@@ -259,8 +263,8 @@ def test_rows_of_upright_images_are_their_columns() -> None:
     pixels = torch.tensor([[0.0, 0.0], [320.0, 120.0], [640.0, 480.0]])
     wide = Intrinsics(400.0, 400.0, 320.0, 240.0, 640, 480)
     upright = Intrinsics(400.0, 400.0, 240.0, 320.0, 480, 640)
-    assert exposure_moments(pixels, wide).tolist() == [-0.5, -0.25, 0.5]
-    assert exposure_moments(pixels.flip(-1), upright).tolist() == [-0.5, -0.25, 0.5]
+    assert exposure_times(pixels, wide).tolist() == [-0.5, -0.25, 0.5]
+    assert exposure_times(pixels.flip(-1), upright).tolist() == [-0.5, -0.25, 0.5]
 
 
 def test_a_change_of_the_calibration_moves_the_pose_by_its_slope_if_the_motion_follows() -> None:

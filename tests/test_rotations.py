@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.rotations import cross_matrix, left_jacobian, rotation_of, vector_of
+from bidnerf_core.rotations import cross_matrix, left_jacobian, rotation_matrix, rotation_vector
 from bidnerf_core.se3 import SE3
 
 ANGLES = [0.0, 1e-9, 9e-5, 1.1e-4, 1e-2, 1.0, 2.49, 2.51, 3.1, math.pi - 1e-7]
@@ -24,8 +24,8 @@ def vector(angle: float) -> np.ndarray:
 def test_rotations_are_scipys(angle: float) -> None:
     phi = vector(angle)
     expected = Rotation.from_rotvec(phi).as_matrix()
-    np.testing.assert_allclose(rotation_of(phi), expected, atol=1e-15)
-    np.testing.assert_allclose(vector_of(expected), phi, atol=1e-8 if angle > 3 else 1e-14)
+    np.testing.assert_allclose(rotation_matrix(phi), expected, atol=1e-15)
+    np.testing.assert_allclose(rotation_vector(expected), phi, atol=1e-8 if angle > 3 else 1e-14)
 
 
 @pytest.mark.parametrize("angle", ANGLES)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
-from bidnerf_core.datasets.depth_registration import DepthSensor, register_depth
+from bidnerf_core.datasets.depth_registration import DepthCamera, register_depth
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH, SevenScenesReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.se3 import SE3
@@ -226,7 +226,7 @@ def test_depth_of_another_size_is_refused(scene: Path) -> None:
 
 def test_another_calibration_moves_depth_and_poses(scene: Path) -> None:
     """A sensor at the colour camera's place: depth and poses are then those of the files."""
-    same = DepthSensor(COLOUR_CAMERA, SE3.identity())
+    same = DepthCamera(COLOUR_CAMERA, SE3.identity())
     found = open_dataset(scene, camera=COLOUR_CAMERA, register_depth=same).views("test")
     stored = open_dataset(scene, camera=COLOUR_CAMERA, register_depth=False).views("test")
     for view, other in zip(found, stored, strict=True):

@@ -33,7 +33,7 @@ def dense_samples(
     return replace(samples, valid=samples.valid & held | probed), probed
 
 
-def soft_student(scores: Float[Tensor, "r n"], threshold: float) -> Float[Tensor, "r n"]:
+def soft_weights(scores: Float[Tensor, "r n"], threshold: float) -> Float[Tensor, "r n"]:
     """Return the weights of bins in the soft phase: 1 above the threshold, as afterwards, and proportional to the score below.
 
     In the paper the weight is the score itself. Where scores are intermediate, the density is then driven too high, and it

@@ -11,7 +11,7 @@ from torch import Generator
 
 from bidnerf_adanerf.bins import ray_logits
 from bidnerf_adanerf.config import AdaNerfConfig
-from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_student
+from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_weights
 from bidnerf_adanerf.field import AdaNerfField
 from bidnerf_adanerf.oracle_loss import oracle_loss
 from bidnerf_core.carving import occupied_voxels
@@ -89,7 +89,7 @@ def dense_step(
     logits = ray_logits(field.oracle, field.bins, batch.rays)
     scores = logits.sigmoid()
     soft = phase_at(step, config) is Phase.SOFT
-    counted = soft_student(scores, config.threshold) if soft else torch.ones_like(scores)
+    counted = soft_weights(scores, config.threshold) if soft else torch.ones_like(scores)
     rendering = render_softly(values, samples, counted, batch.background)
     loss, mse = supervision.loss(rendering, batch)
     loss = loss + config.empty_weight * opacity(values, samples, empty)

@@ -14,7 +14,7 @@ from bidnerf_core.frames import View
 
 HULL = (64, 64, 64)
 CARVING_ROUNDS = 3  # each within the box that the previous one found
-HULL_WITNESSES = (0.5, 0.25, 0.1, 0.0)
+HULL_VOTES = (0.5, 0.25, 0.1, 0.0)
 """Thresholds on the number of views that see something at a cell, as fractions of the largest such number. Cells below it are
 periphery, which so few views see that hardly any could have emptied it."""
 EXPLAINED = 0.999  # fraction of the pixels with matter whose rays must meet the box
@@ -29,7 +29,7 @@ def has_outline(view: View) -> bool:
 def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
     """Return the box of the cells that no two views see through and at which many views see something.
 
-    The threshold on that number is the largest of ``HULL_WITNESSES`` for which the box still explains the silhouettes.
+    The threshold on that number is the largest of ``HULL_VOTES`` for which the box still explains the silhouettes.
     """
     origins, directions = _rays_to_matter(views)
     for _ in range(CARVING_ROUNDS):
@@ -38,8 +38,8 @@ def carved_box(box: AxisBox, views: Sequence[View]) -> AxisBox:
         kept = occupied_cells(views, corner(lower), corner(upper), HULL).nonzero()
         if len(kept) == 0:
             return box
-        witnesses = _witnesses(views, lower + (kept + 0.5) * cell)
-        for share in HULL_WITNESSES:
+        witnesses = _votes(views, lower + (kept + 0.5) * cell)
+        for share in HULL_VOTES:
             cells = kept[witnesses >= share * witnesses.amax()]
             box = grown(lower + cells.amin(dim=0) * cell, lower + (cells.amax(dim=0) + 1) * cell)
             if met(box, origins, directions) >= EXPLAINED:
@@ -58,7 +58,7 @@ def _rays_to_matter(views: Sequence[View]) -> tuple[Float[Tensor, "n 3"], Float[
     return torch.cat(origins), torch.cat(directions)
 
 
-def _witnesses(views: Sequence[View], points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+def _votes(views: Sequence[View], points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
     """Return how many views see something (alpha over 0) at each point (metres, world)."""
     return torch.stack([_shows_something(view, points) for view in views]).sum(dim=0)
 

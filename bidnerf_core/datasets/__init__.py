@@ -10,7 +10,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.colmap_project import ColmapReader
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
-from bidnerf_core.datasets.depth_registration import DepthSensor
+from bidnerf_core.datasets.depth_registration import DepthCamera
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.image_folders import open_images
 from bidnerf_core.datasets.scanner_app import ScannerAppReader
@@ -34,8 +34,8 @@ __all__ = [
     "Background",
     "CameraReader",
     "Dataset",
+    "DepthCamera",
     "DepthRegistration",
-    "DepthSensor",
     "DepthSensorReader",
     "FileSequence",
     "FrameSequence",
@@ -89,14 +89,14 @@ class DepthSensorReader(Protocol):
     """A reader of a format whose depth may not be registered to its colour images."""
 
     @property
-    def sensor(self) -> DepthSensor | None:
+    def sensor(self) -> DepthCamera | None:
         """The sensor from which depth is registered, unless another is given."""
         ...
 
-    def with_depth_sensor(self, sensor: DepthSensor | None) -> Reader: ...
+    def with_depth_sensor(self, sensor: DepthCamera | None) -> Reader: ...
 
 
-DepthRegistration: TypeAlias = bool | DepthSensor | str | Path
+DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
 """The registration of depth to colour images: from a sensor or a file of one, from the format's own (True), or none (False)."""
 
 READERS: list[Reader] = [
@@ -177,10 +177,10 @@ def open_sequence(
     return sequence_of(reader.open(place, background))
 
 
-def given_sensor(place: Path | str, register: DepthRegistration | None) -> DepthSensor | None:
+def given_sensor(place: Path | str, register: DepthRegistration | None) -> DepthCamera | None:
     """Return the sensor from which depth is registered, or None where depth is used as it is.
 
-    Raises ``InputError``, which begins with ``place``, for the format's own sensor (True), and as ``DepthSensor.read`` does.
+    Raises ``InputError``, which begins with ``place``, for the format's own sensor (True), and as ``DepthCamera.read`` does.
     """
     if register is True:
         raise InputError(
@@ -188,7 +188,7 @@ def given_sensor(place: Path | str, register: DepthRegistration | None) -> Depth
         )
     if register is None or register is False:
         return None
-    return register if isinstance(register, DepthSensor) else DepthSensor.read(Path(register))
+    return register if isinstance(register, DepthCamera) else DepthCamera.read(Path(register))
 
 
 def _with_sensor(reader: Reader, folder: Path, register: DepthRegistration | None) -> Reader:

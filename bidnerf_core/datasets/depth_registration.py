@@ -25,14 +25,14 @@ EXTRINSICS = "T_colour_depth"
 
 
 @dataclass(frozen=True, eq=False)
-class DepthSensor:
+class DepthCamera:
     """A depth camera next to a colour camera, to whose images its depth is registered."""
 
     camera: Intrinsics
     T_colour_depth: SE3  # metres, OpenCV axes
 
     @staticmethod
-    def read(path: Path) -> DepthSensor:
+    def read(path: Path) -> DepthCamera:
         """Read a JSON file with the intrinsics as in ``transforms.json``, with ``w`` and ``h``, and ``T_colour_depth`` (4x4).
 
         Raises ``InputError`` where one of them is missing or not usable.
@@ -45,7 +45,7 @@ class DepthSensor:
             raise record.error(
                 f"no {EXTRINSICS}, expected the 4x4 pose of the depth camera in the colour camera"
             )
-        return DepthSensor(read_camera(path, (0, 0)), rigid_of_rows(record, EXTRINSICS, rows))
+        return DepthCamera(read_camera(path, (0, 0)), rigid_of_rows(record, EXTRINSICS, rows))
 
     def registered(
         self, depth: Float[Tensor, "dh dw"], colour: Intrinsics, file: Path | str

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.camera_sources import WAYS, CameraSource, Raster, find_camera
-from bidnerf_core.datasets.depth_registration import DepthSensor
+from bidnerf_core.datasets.depth_registration import DepthCamera
 from bidnerf_core.depth_images import read_depth_image
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.exif import Exif
@@ -28,7 +28,7 @@ class GivenCamera:
     camera: Intrinsics | str | Path | None = None
     focal: float | None = None
     hfov: float | None = None
-    sensor: DepthSensor | None = None
+    sensor: DepthCamera | None = None
     assumed: tuple[Intrinsics, ...] = ()
 
     @property

@@ -27,7 +27,7 @@ import torch
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.depth_registration import DepthSensor
+from bidnerf_core.datasets.depth_registration import DepthCamera
 from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.pose_files import read_pose_matrix
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -56,7 +56,7 @@ T_COLOUR_DEPTH = SE3(
     ),
 ).normalized()
 """https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html, as used by ACE's ``setup_7scenes.py``."""
-SEVEN_SCENES_KINECT = DepthSensor(DEPTH_CAMERA, T_COLOUR_DEPTH)
+SEVEN_SCENES_KINECT = DepthCamera(DEPTH_CAMERA, T_COLOUR_DEPTH)
 
 COLOUR = re.compile(r"(frame-\d+)\.color\.(?:png|jpe?g)", re.IGNORECASE)
 SEQUENCE = re.compile(r"seq(?:uence)?-?0*(\d+)", re.IGNORECASE)
@@ -92,7 +92,7 @@ class SceneFrame:
 class SevenScenesReader:
     """The reader of folders of 7-Scenes; poses and depth are moved from ``sensor`` to the colour camera, if there is one."""
 
-    sensor: DepthSensor | None = SEVEN_SCENES_KINECT
+    sensor: DepthCamera | None = SEVEN_SCENES_KINECT
     camera: Intrinsics | Path | None = None
     expected = "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)"
 
@@ -102,7 +102,7 @@ class SevenScenesReader:
     def with_camera(self, camera: Intrinsics | Path) -> SevenScenesReader:
         return replace(self, camera=camera)
 
-    def with_depth_sensor(self, sensor: DepthSensor | None) -> SevenScenesReader:
+    def with_depth_sensor(self, sensor: DepthCamera | None) -> SevenScenesReader:
         return replace(self, sensor=sensor)
 
     def open(self, path: Path, background: Background | None) -> Dataset:
@@ -138,7 +138,7 @@ class SevenScenesDataset(OpaqueDataset[SceneFrame]):
         self,
         frames: Splits[SceneFrame],
         camera: FolderCamera,
-        sensor: DepthSensor | None,
+        sensor: DepthCamera | None,
         background: Background | None,
     ) -> None:
         super().__init__(frames, background)

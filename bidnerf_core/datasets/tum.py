@@ -29,7 +29,7 @@ import numpy as np
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.depth_registration import DepthSensor
+from bidnerf_core.datasets.depth_registration import DepthCamera
 from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
@@ -91,7 +91,7 @@ class TumReader:
     """
 
     camera: Intrinsics | Path | None = None
-    sensor: DepthSensor | None = None
+    sensor: DepthCamera | None = None
     expected = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
 
     def recognises(self, path: Path) -> bool:
@@ -101,7 +101,7 @@ class TumReader:
         """Return a reader with this camera; a path may also be the name of one of the benchmark's sensors."""
         return replace(self, camera=_named_camera(camera) or camera)
 
-    def with_depth_sensor(self, sensor: DepthSensor | None) -> TumReader:
+    def with_depth_sensor(self, sensor: DepthCamera | None) -> TumReader:
         return replace(self, sensor=sensor)
 
     def open(self, path: Path, background: Background | None) -> Dataset:
@@ -141,7 +141,7 @@ class TumDataset(OpaqueDataset[TumFrame]):
         self,
         frames: Splits[TumFrame],
         camera: FolderCamera,
-        sensor: DepthSensor | None,
+        sensor: DepthCamera | None,
         background: Background | None,
     ) -> None:
         super().__init__(frames, background)

@@ -28,7 +28,7 @@ from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface
 from bidnerf_core.localization.by_image_search import localized_by_images
 from bidnerf_core.localization.by_landmarks import (
-    MOSTLY,
+    MOSTLY_ON_SURFACE,
     LandmarkAnswer,
     answer_by_landmarks,
     corrected,
@@ -53,7 +53,7 @@ surface goes wrong too.
 """
 UNSURE = (Outcome.IMPRECISE, Outcome.UNCERTAIN)
 """Outcomes of a pose that landmarks determine, but not accurately enough or not with enough confidence."""
-FEWER = 0.05
+MOST_POINTS_LOST = 0.05
 """Largest share of the measured points that landmarks may move off the surface."""
 IN_FRONT = 0.9
 """Least share of the points of an occluder that must lie before the surface."""
@@ -61,7 +61,7 @@ WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=math.inf)
 """Thresholds for landmarks that match near a pose found by other means."""
 MISLEADING = 0.5
 """Probability of wrong intrinsics, estimated from the landmarks near a pose by colour alone, above which that is rejected."""
-SUPPORTED, MOVING = 0.5, 0.8
+LEAST_SUPPORT, LEAST_TO_MOVE = 0.5, 0.8
 """Least confidence with which landmarks support a pose accepted on the surface, and with which they may move one by depth."""
 
 
@@ -151,7 +151,7 @@ def _is_settled(found: Localization) -> bool:
     said = found.diagnostics
     if not found.converged or not isinstance(said, LandmarkDiagnostics) or said.on_surface is None:
         return found.converged
-    return (found.confidence or 0.0) >= TRUSTED and said.on_surface >= MOSTLY
+    return (found.confidence or 0.0) >= TRUSTED and said.on_surface >= MOSTLY_ON_SURFACE
 
 
 def _is_doubtful(problem: Problem, answer: LandmarkAnswer) -> bool:
@@ -193,7 +193,7 @@ def _compared_with_landmarks(
     """Refine a pose found on the surface by the landmarks that match there, or reject it if they should match and do not.
 
     ``start`` is what the user gave.
-    Landmarks with less confidence than ``MOVING`` confirm an accepted pose by depth, but do not move it if the measured points
+    Landmarks with less confidence than ``LEAST_TO_MOVE`` confirm an accepted pose by depth, but do not move it if the measured points
     determine it better.
     """
     near = confirm(matcher, problem.views, found.T_world_camera, seek_twin=True)
@@ -201,7 +201,7 @@ def _compared_with_landmarks(
     if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
         confidence = answer.confidence or 0.0
-        supported = found.converged and confidence >= SUPPORTED
+        supported = found.converged and confidence >= LEAST_SUPPORT
         answer = replace(answer, verdict=verdict) if supported else answer
         refined = localization_by_landmarks(problem, answer, began)
         here, evidence = corrected(problem, near.pose), near.pose.log10_nfa
@@ -213,7 +213,7 @@ def _compared_with_landmarks(
             return found
         if (
             supported
-            and confidence < MOVING
+            and confidence < LEAST_TO_MOVE
             and _is_surer(found, answer)
             and _keeps_points(problem, near.pose)
         ):
@@ -259,7 +259,7 @@ def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswe
         return False
     before = share_on_surface(problem, problem.surface, found.T_world_camera)
     after = share_on_surface(corrected(problem, answer.found, answer.depth_factor), problem.surface, answer.T)
-    return after < before - FEWER
+    return after < before - MOST_POINTS_LOST
 
 
 def _is_surer(found: Localization, answer: LandmarkAnswer) -> bool:

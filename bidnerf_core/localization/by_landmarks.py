@@ -56,7 +56,7 @@ THOROUGHLY = 4
 """Factor by which poses that landmarks leave doubtful get more rays; the weight of each ray grows by the same factor."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
-MOSTLY = 0.5
+MOSTLY_ON_SURFACE = 0.5
 """Least share of the measured points on the surface with which a scene is not taken to be partly hidden."""
 
 
@@ -261,7 +261,7 @@ def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: f
     there = answer.diagnostics.on_surface
     if answer.left_out:
         fused += f", without {answer.left_out}"
-    elif there is not None and there < MOSTLY:
+    elif there is not None and there < MOSTLY_ON_SURFACE:
         fused += f", although only {there:.0%} of the measured points lie on the surface"
     return Localization(
         T_world_camera=answer.T,

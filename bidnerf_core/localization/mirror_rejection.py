@@ -14,7 +14,7 @@ from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence, mirror_image
 from bidnerf_core.se3 import SE3
 
-TOLD_FROM_MIRROR = 3.0
+MIRROR_LOG_ODDS = 3.0
 """Log odds beyond which renderings decide between an image and its mirror image."""
 HARDLY_MATCHED = -60.0
 """Logarithm of the number of false alarms above which renderings are compared even if the mirror image is not recognised."""
@@ -39,8 +39,8 @@ def mirror_rejection(
         return rejection
     image, mirror = replace(problem, views=problem.views[-1:]), replace(problem, views=(last,))
     odds = log_odds_by_rendering(image, corrected(mirror, mirrored), seed)
-    if odds > TOLD_FROM_MIRROR:
+    if odds > MIRROR_LOG_ODDS:
         return None
-    if odds < -TOLD_FROM_MIRROR and rejection is None:
+    if odds < -MIRROR_LOG_ODDS and rejection is None:
         return Verdict(Outcome.MIRRORED, "renderings agree better with the mirror image")
     return rejection

@@ -17,7 +17,7 @@ from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.se3 import SE3
 
-TOLD_FROM_TWIN = 10.0
+TWIN_LOG_ODDS = 10.0
 """Log odds beyond which renderings decide between two places.
 
 Even at exact copies the odds are not 0, since keypoints determine the pose at one of them better.
@@ -46,9 +46,9 @@ def between_twins(
     if found.twin is None or not answer.verdict.accepted:
         return answer
     odds = _log_odds(problem, found, found.twin, start, rays, seed)
-    if _is_told(odds, found.twin):
+    if _is_distinguished(odds, found.twin):
         return answer
-    if odds < -TOLD_FROM_TWIN:
+    if odds < -TWIN_LOG_ODDS:
         there = _at_twin(problem, matcher, found, found.twin)
         verdict = None if there is None else landmark_verdict(there)
         if there is not None and verdict is not None and verdict.accepted:
@@ -60,7 +60,9 @@ def twin_rejection(
     problem: Problem, found: LandmarkPose, start: SE3 | None, rays: int, seed: int
 ) -> Verdict | None:
     """Return a rejection of a pose whose twin fits about as well, else None; ``start`` and ``rays`` as in ``between_twins``."""
-    if found.twin is None or _is_told(_log_odds(problem, found, found.twin, start, rays, seed), found.twin):
+    if found.twin is None or _is_distinguished(
+        _log_odds(problem, found, found.twin, start, rays, seed), found.twin
+    ):
         return None
     return _rejection(found.twin)
 
@@ -85,9 +87,9 @@ def _rejection(twin: Twin) -> Verdict:
     )
 
 
-def _is_told(log_odds: float, twin: Twin) -> bool:
+def _is_distinguished(log_odds: float, twin: Twin) -> bool:
     """Return whether a pose is distinguished from its twin: without other evidence, by clearly more landmarks."""
-    return log_odds > TOLD_FROM_TWIN or (log_odds == 0 and twin.share < NEARLY_AS_MANY)
+    return log_odds > TWIN_LOG_ODDS or (log_odds == 0 and twin.share < NEARLY_AS_MANY)
 
 
 def _log_odds(

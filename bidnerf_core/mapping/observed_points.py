@@ -25,8 +25,8 @@ class ObservedPoints:
     depth: Float[Tensor, "m"]  # metres, 0 where none was measured
     rotation: Float[Tensor, "m 3 3"]  # R_camera_rig
     translation: Float[Tensor, "m 3"]  # t_camera_rig, metres
-    moments: Float[Tensor, "m"]  # of exposure, see ``exposure_moments``
-    turned_moments: Float[Tensor, "m"]  # the same if the rows run along the other axis
+    exposure_times: Float[Tensor, "m"]  # see the function ``exposure_times``
+    transposed_exposure_times: Float[Tensor, "m"]  # the same if the rows run along the other axis
 
     def __len__(self) -> int:
         return len(self.points)
@@ -44,7 +44,7 @@ class ObservedPoints:
         if not bool(motion.any()):
             return self
         rig = T_world_rig.inverse().apply(self.points)
-        return replace(self, points=T_world_rig.apply(moved_points(rig, self.moments, motion)))
+        return replace(self, points=T_world_rig.apply(moved_points(rig, self.exposure_times, motion)))
 
     def in_camera(self, T_world_rig: SE3) -> Float[Tensor, "m 3"]:
         """Return each point in the frame of the camera that observed it."""

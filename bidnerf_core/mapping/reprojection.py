@@ -17,7 +17,7 @@ from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.robust_equations import RobustEquations, robust_spread
 from bidnerf_core.rolling_shutter import AT_REST, moved_array
-from bidnerf_core.rotations import rotation_of
+from bidnerf_core.rotations import rotation_matrix
 from bidnerf_core.se3 import SE3
 
 Array = np.ndarray
@@ -57,7 +57,7 @@ class State:
         camera[free] += step[6:]
         # To first order, moving along the camera's axes equals the exponential map's translation.
         position = self.position + self.rotation @ step[:3]
-        return State(self.rotation @ rotation_of(step[3:6]), position, camera)
+        return State(self.rotation @ rotation_matrix(step[3:6]), position, camera)
 
     def pose(self) -> SE3:
         return SE3(torch.from_numpy(self.rotation), torch.from_numpy(self.position)).normalized()
@@ -79,7 +79,7 @@ class ReprojectionErrors:
     def __init__(self, data: ObservedPoints, start: SE3) -> None:
         self._points = data.points.numpy()
         self._rotation, self._translation = data.rotation.numpy(), data.translation.numpy()
-        self._moments = data.moments.numpy()
+        self._exposure_times = data.exposure_times.numpy()
         self._turned = bool((self._rotation != np.eye(3)).any())
         self._focal = data.focal.numpy()[:, None]
         self._observed = data.image.numpy() * self._focal
@@ -90,7 +90,7 @@ class ReprojectionErrors:
         rig = (self._points - state.position) @ state.rotation
         motion = state.camera[4:]
         if motion.any():
-            rig = moved_array(rig, self._moments, motion)
+            rig = moved_array(rig, self._exposure_times, motion)
         turned = np.einsum("mij,mj->mi", self._rotation, rig) if self._turned else rig
         local = turned + self._translation
         front = local[:, 2] > 1e-9
@@ -143,7 +143,7 @@ class ReprojectionErrors:
             np.stack([zero, focal], axis=1),
             flat * (flat**2).sum(1, keepdims=True) * scale,
         ]
-        by_motion = np.moveaxis(by_pose * self._moments[:, None, None], -1, 0)
+        by_motion = np.moveaxis(by_pose * self._exposure_times[:, None, None], -1, 0)
         by_camera = [*by_calibration, *by_motion]
         return np.concatenate([by_pose, np.stack([by_camera[i] for i in free], axis=-1)], axis=-1)
 

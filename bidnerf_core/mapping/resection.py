@@ -112,13 +112,13 @@ def resect(
     moving = 6 + len(prior.deviations.nonzero())  # where the motion begins, if it is free
     return ReprojectionFit(
         state.pose(), state.calibration, state.motion, noise, covariance[:6, :6].clone(), of_calibration[:4].clone(),
-        _by_last(system.hessian, covariance, moving),
+        _marginal_of_last(system.hessian, covariance, moving),
         torch.from_numpy(system.inverse_curvature())[moving:, moving:].clone(),
         _slope(errors, state, noise, correlation, motion),
     )  # fmt: skip
 
 
-def _by_last(hessian: Array, covariance: Float[Tensor, "p p"], first: int) -> Float[Tensor, "6 6"]:
+def _marginal_of_last(hessian: Array, covariance: Float[Tensor, "p p"], first: int) -> Float[Tensor, "6 6"]:
     """Return the part of the pose's covariance due to the unknowns from number ``first`` on, to which the others adapt."""
     follows = torch.from_numpy(-damped_solution(hessian[:first, :first], 1e-9, hessian[:first, first:])[:6])
     by_last = follows @ covariance[first:, first:] @ follows.mT

@@ -23,7 +23,7 @@ def likely_pairs_of_poses(poses: Sequence[SE3], neighbours: int) -> Int[Tensor, 
     Half of the neighbours are those with the most similar poses. The others are spread over the next ones, every third,
     because successive images of a video have too little baseline for triangulation.
     """
-    order = _unlikeness(poses).argsort(dim=1, stable=True)
+    order = _dissimilarity(poses).argsort(dim=1, stable=True)
     ranks = _ranks(neighbours, len(poses) - 1)
     chosen = order[:, ranks]
     own = torch.arange(len(poses))[:, None].expand_as(chosen)
@@ -38,7 +38,7 @@ def _ranks(count: int, others: int) -> list[int]:
     return [rank for rank in ranks if rank < others] or list(range(others))
 
 
-def _unlikeness(poses: Sequence[SE3]) -> Float[Tensor, "v v"]:
+def _dissimilarity(poses: Sequence[SE3]) -> Float[Tensor, "v v"]:
     """Return how dissimilar two poses are: relative distance of the centres plus 1 - cosine between the optical axes.
 
     It is infinite between a view and itself.

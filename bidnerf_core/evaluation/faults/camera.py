@@ -14,7 +14,7 @@ from bidnerf_core.evaluation.faults.fault import random_direction
 from bidnerf_core.evaluation.faults.warp import nearest, warped
 from bidnerf_core.evaluation.protocols import random_units
 from bidnerf_core.frames import Frame
-from bidnerf_core.rolling_shutter import exposure_moments, poses_of_rows
+from bidnerf_core.rolling_shutter import exposure_times, poses_of_rows
 
 
 def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
@@ -87,8 +87,8 @@ def rolling_shutter(frame: Frame, degrees: float, generator: Generator) -> Frame
     """
     camera = frame.intrinsics
     axis = random_units(1, generator)[0] * math.radians(degrees)
-    moments = exposure_moments(camera.pixel_centres(torch.float64).reshape(-1, 2), camera)
-    turns = poses_of_rows(moments, torch.cat([torch.zeros_like(axis), axis]))
+    times = exposure_times(camera.pixel_centres(torch.float64).reshape(-1, 2), camera)
+    turns = poses_of_rows(times, torch.cat([torch.zeros_like(axis), axis]))
     seen = turns.rotate(_rays(camera).reshape(-1, 3)).reshape(camera.height, camera.width, 3)
     pixels = camera.project(seen)
     turned = warped(frame, pixels.nan_to_num(-1.0))

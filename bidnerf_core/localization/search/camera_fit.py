@@ -31,7 +31,7 @@ focal length.
 """
 LEAST_STRETCH = math.log(1.03)
 """Smallest stretch, as a logarithm, that is distinguished from the errors of lenses and landmarks."""
-MORE, FURTHER = 1.1, 5
+SUPPORT_RATIO, LEAST_EXTRA_INLIERS = 1.1, 5
 """Factor by which, and number of exact matches by which, the support of another camera has to exceed that of the one found."""
 DEVIATIONS = np.array([ANY.log_focal, ANY.shift, ANY.shift, ANY.log_focal])
 """Standard deviations of the logarithm of the focal length, of the principal point and of the logarithm of the stretch."""
@@ -82,7 +82,10 @@ def better_camera(
     """
     here = _Projection(data, T_world_rig, calibration.radial)
     start = _unknowns(calibration)
-    before, enough = here.agreeing(start, limit), MORE * here.support(start, limit) + FURTHER
+    before, enough = (
+        here.agreeing(start, limit),
+        SUPPORT_RATIO * here.support(start, limit) + LEAST_EXTRA_INLIERS,
+    )
     if not 0 < before < unsuspected * len(data):
         return None
     fits = [_fitted(here, start, limit)]
@@ -107,7 +110,7 @@ def _fitted(
     for scale in scales:
         found = project.descended(found, scale * limit, MOST_EVALUATIONS)
     focal, u, v, log_stretch = found[6:].tolist()
-    stretch, log_focal = told_apart(log_stretch, focal)
+    stretch, log_focal = split_stretch(log_stretch, focal)
     corrected = Calibration(log_focal, u / stretch.across, v / stretch.down, project.radial)
     within = torch.from_numpy(project.distances(found) <= limit)
     return CameraFit(project.pose(found), stretch, corrected, within), project.support(found, limit)
@@ -144,7 +147,7 @@ def _from_far(
     return _fitted(project, found, limit)
 
 
-def told_apart(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
+def split_stretch(log_stretch: float, log_focal: float) -> tuple[Stretch, float]:
     """Return the stretch, if it is more than the errors of lenses, and what remains of the change of the focal length."""
     if abs(log_stretch) <= LEAST_STRETCH:
         return UNSTRETCHED, log_focal

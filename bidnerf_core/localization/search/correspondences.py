@@ -15,7 +15,7 @@ from bidnerf_core.mapping.features import Features, Keypoints
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.rolling_shutter import exposure_moments, turned_moments
+from bidnerf_core.rolling_shutter import exposure_times, transposed_exposure_times
 from bidnerf_core.se3 import SE3
 
 
@@ -103,6 +103,6 @@ def observed_points(
         T_camera_rig.translation[found.view],
         *(
             torch.cat([of(image.keypoints.pixels, image.intrinsics) for image in images])[number]
-            for of in (exposure_moments, turned_moments)
+            for of in (exposure_times, transposed_exposure_times)
         ),
     )

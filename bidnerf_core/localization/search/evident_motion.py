@@ -16,7 +16,7 @@ from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
 ENOUGH_POINTS = 20
 """Least number of points that determine a motion: with fewer, the noise is as uncertain as the motion itself."""
-MOVING = 1 / 30
+SHARE_MOVING = 1 / 30
 """Prior probability that an image shows a motion.
 
 It is low because lens stabilisers, and lenses that the intrinsics do not describe, distort images in similar ways.
@@ -56,17 +56,17 @@ def evident_motion(
         resect(data, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, prior)
         for prior in (STILL, motion)
     )
-    turned_data = replace(data, moments=data.turned_moments)
-    turned = resect(turned_data, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, motion)
+    transposed = replace(data, exposure_times=data.transposed_exposure_times)
+    turned = resect(transposed, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, motion)
     log_odds = [
         _log_evidence(points, found, still, motion, correlation) + math.log(share)
         if found.motion_in_deviations(motion) <= LARGEST
         else -math.inf
         for points, found, share in (
-            (data, moving, MOVING * (1 - TURNED)), (turned_data, turned, MOVING * TURNED)
+            (data, moving, SHARE_MOVING * (1 - TURNED)), (transposed, turned, SHARE_MOVING * TURNED)
         )
     ]  # fmt: skip
-    of_still, of_moving, of_turned = torch.tensor([math.log(1 - MOVING), *log_odds]).softmax(0).tolist()
+    of_still, of_moving, of_turned = torch.tensor([math.log(1 - SHARE_MOVING), *log_odds]).softmax(0).tolist()
     if not all(map(math.isfinite, (of_still, of_moving, of_turned))):
         return EvidentMotion()
     if max(of_moving, of_turned) < NEGLIGIBLE:
@@ -77,7 +77,7 @@ def evident_motion(
         for points, found, prior in (
             (data, still, STILL),
             (data, moving, motion),
-            (turned_data, turned, motion),
+            (transposed, turned, motion),
         )
     )
     chosen = moving if of_moving > of_still else still

@@ -16,7 +16,7 @@ from bidnerf_core.localization.search.correspondences import LandmarkMatches, Qu
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.rolling_shutter import AT_REST, exposure_moments, moved_points
+from bidnerf_core.rolling_shutter import AT_REST, exposure_times, moved_points
 from bidnerf_core.se3 import SE3
 
 CANDIDATES = 6
@@ -83,8 +83,8 @@ class ProjectedLandmarks:
         local = local[self._index]
         self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
         if bool(motion.any()):
-            moments = exposure_moments(_image_pixels(self._pixels, image), image.intrinsics)
-            local = moved_points(local, moments, motion)
+            times = exposure_times(_image_pixels(self._pixels, image), image.intrinsics)
+            local = moved_points(local, times, motion)
             self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
         self._tree = cKDTree(self._pixels.numpy()) if len(self._pixels) else None
         self._sizes = landmarks.sizes[self._index] * focal / local[:, 2]

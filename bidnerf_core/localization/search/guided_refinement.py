@@ -51,11 +51,11 @@ LOOSE = 1.3
 """Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
 DEPTH_OFF = 0.1
 """Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
-CERTAIN, CERTAIN_BY_OTHERS = 0.999, 0.98
+CERTAIN, CERTAIN_WITH_EVIDENCE = 0.999, 0.98
 """Probability that the given intrinsics are wrong above which the estimated ones are taken: by keypoints alone, and where other
 measurements provide evidence too.
 """
-POSSIBLE, PROBABLE = 0.1, 0.5
+POSSIBLE_CROP, PROBABLE_CROP = 0.1, 0.5
 """Probabilities that an image is a crop: thresholds for its principal point.
 
 Above the first, the principal point is free in the fit that judges the intrinsics, which are then doubtful; above the second,
@@ -132,7 +132,7 @@ def _settled(
     fit, found = _guided(query, prior, fit, found, most, RADII)
     open_camera = prior.log_focal > 0
     free, crop = _with_free_camera(query, fit, found, open_camera)
-    evident = _evident_motion(query, free, found, ANY if crop > POSSIBLE else NOMINAL)
+    evident = _evident_motion(query, free, found, ANY if crop > POSSIBLE_CROP else NOMINAL)
     motion, correlation = evident.prior, query.landmarks.correlation_of(len(found))
     if motion != STILL:
         data = query.observed(found)
@@ -145,13 +145,13 @@ def _settled(
     taken = taken_intrinsics(free, query.landmarks, camera, approximate, evidence.map_camera)
     right = query.prior if approximate and taken.camera is None else CALIBRATED
     wrong = Miscalibration.of(free, query.landmarks, taken, evidence.mistaken, right)
-    certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_BY_OTHERS
-    if approximate and crop > POSSIBLE:
+    certain = CERTAIN if evidence == NO_EVIDENCE else CERTAIN_WITH_EVIDENCE
+    if approximate and crop > POSSIBLE_CROP:
         taken = TakenIntrinsics()
         fit, found = _guided(query, ANY, free, found, most, RADII[1:], motion)
-    elif wrong.worst[1] > certain and not POSSIBLE < crop < PROBABLE:
+    elif wrong.worst[1] > certain and not POSSIBLE_CROP < crop < PROBABLE_CROP:
         taken = TakenIntrinsics()
-        prior = wrong.prior(query.prior if approximate else DOUBTED, crop >= PROBABLE)
+        prior = wrong.prior(query.prior if approximate else DOUBTED, crop >= PROBABLE_CROP)
         fit, found = _guided(query, prior, free, found, most, RADII[1:], motion)
     elif taken.camera is not None:
         query = query.seen_by([taken.camera.intrinsics] * len(query.images))
@@ -196,7 +196,7 @@ def _with_free_camera(
     )
     ratio = log_likelihood_ratio(data, part, whole, correlation)
     probability = probability_of_crop(part, whole, query.landmarks, ratio, open_camera)
-    return (part if probability > POSSIBLE else whole), probability
+    return (part if probability > POSSIBLE_CROP else whole), probability
 
 
 def _guided(

@@ -35,7 +35,7 @@ UNUSUAL = 0.03
 """Share of the map's images up to which an agreeing camera is taken for an extreme of one that focuses, not for another one."""
 GRID = 7
 """Rows and columns of pixels at which cameras are compared."""
-TOLD_APART = 2.0
+DISTINGUISHABLE_DEVIATIONS = 2.0
 """Standard deviations of a good calibration by which cameras must differ to be told apart."""
 SAME_CAMERA = 0.9
 """Share of queries with nearly the map's intrinsics that are from the map's camera."""
@@ -61,7 +61,7 @@ class MapCamera:
     @property
     def differs(self) -> Bool[Tensor, "4"]:
         """Which parameters of the intrinsics differ."""
-        return self.correction.abs() > TOLD_APART * self.deviations
+        return self.correction.abs() > DISTINGUISHABLE_DEVIATIONS * self.deviations
 
     @property
     def calibration(self) -> Calibration:
@@ -159,7 +159,7 @@ def _agree(a: Intrinsics, b: Intrinsics) -> bool:
     ]  # fmt: skip
     bends = (camera.distortion + (0.0,) * (size - len(camera.distortion)) for camera in (a, b))
     parts += [(x - y, known.radial) for x, y in zip(*bends, strict=True)]
-    return all(abs(difference) <= TOLD_APART * deviation for difference, deviation in parts)
+    return all(abs(difference) <= DISTINGUISHABLE_DEVIATIONS * deviation for difference, deviation in parts)
 
 
 def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "4"] | None:

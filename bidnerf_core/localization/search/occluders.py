@@ -24,7 +24,7 @@ LEAST_PIXELS = 50
 """Least number of measured pixels in both."""
 PROBED_POINTS = 300
 """Largest number of points of an occluder that are compared with the surface."""
-CLEARLY_BEFORE = 0.02
+CLEARLY_IN_FRONT = 0.02
 """Distance in front of the surface (share of the scene's extent) up to which a point still lies on it."""
 
 
@@ -44,7 +44,7 @@ class Occluder:
         lines = (ends - T.translation).float()
         length = torch.linalg.vector_norm(lines, dim=-1)
         met = cast(surface, T.translation.float().expand_as(lines), lines / length[:, None])
-        before = ~met.met | (length < met.along - CLEARLY_BEFORE * surface.extent)
+        before = ~met.met | (length < met.along - CLEARLY_IN_FRONT * surface.extent)
         return float(before.float().mean())
 
 

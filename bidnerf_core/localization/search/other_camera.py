@@ -10,12 +10,12 @@ import torch
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.camera_shapes import median_camera, stretched_cameras
 from bidnerf_core.localization.search.camera_fit import (
-    FURTHER,
-    MORE,
+    LEAST_EXTRA_INLIERS,
+    SUPPORT_RATIO,
     SUSPECTED,
     CameraFit,
     least_change,
-    told_apart,
+    split_stretch,
 )
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import LEAST_GUIDED_MATCHES, refined_pose
@@ -53,7 +53,7 @@ def with_other_camera(
         found = estimated or found
         return _like_map_camera(query, matches, found, clock) or found
     if found.agreeing < SUSPECTED * found.matches and not found.takes_map_camera:
-        enough = MORE * found.agreeing + FURTHER
+        enough = SUPPORT_RATIO * found.agreeing + LEAST_EXTRA_INLIERS
         return sampled_with_map_camera(query, matches, enough, clock) or found
     return found
 
@@ -136,7 +136,7 @@ def _with_map_camera(
 def _correction(given: Intrinsics, camera: Intrinsics) -> tuple[Stretch, Calibration] | None:
     """Return how a camera differs from the given one; None if ``Calibration`` does not describe that."""
     across, down = math.log(camera.fx / given.fx), math.log(camera.fy / given.fy)
-    for split in (told_apart, least_change):  # without a stretch, if that describes it
+    for split in (split_stretch, least_change):  # without a stretch, if that describes it
         stretch, _ = split(across - down, 0.5 * (across + down))
         correction = correction_between(stretch.applied(given), camera)
         if correction is not None:

@@ -14,7 +14,7 @@ import torch
 
 from bidnerf_core.camera_shapes import stretched_cameras
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.evident_motion import MOVING
+from bidnerf_core.localization.search.evident_motion import SHARE_MOVING
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.map_camera import ALIKE_SHAPES
@@ -91,7 +91,7 @@ class _Fit:
         data = query.seen_by(cameras).observed(shared)
         motion = MotionPrior.usual(pose.distance) if pose.has_motion else STILL
         fit = resect(data, pose.T_world_camera, pose.noise, FIXED, correlation=correlation, motion=motion)
-        prior = MOVING if pose.has_motion else 1 - MOVING
+        prior = SHARE_MOVING if pose.has_motion else 1 - SHARE_MOVING
         occam = fit.log_occam_factor(motion) if pose.has_motion else 0.0
         if pose.estimates_calibration:
             prior *= WRONG_SHARE

@@ -18,7 +18,7 @@ from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, resect
-from bidnerf_core.rolling_shutter import STILL, exposure_moments, turned_moments
+from bidnerf_core.rolling_shutter import STILL, exposure_times, transposed_exposure_times
 from bidnerf_core.se3 import SE3
 
 LEAST_FOLLOWED = 6
@@ -81,8 +81,8 @@ class FollowedPoints:
             measured_depth(frame, self.pixels),
             torch.eye(3, dtype=torch.float64).expand(count, 3, 3),
             torch.zeros((count, 3), dtype=torch.float64),
-            exposure_moments(self.pixels, camera),
-            turned_moments(self.pixels, camera),
+            exposure_times(self.pixels, camera),
+            transposed_exposure_times(self.pixels, camera),
         )
 
 

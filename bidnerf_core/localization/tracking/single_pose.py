@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.rotations import left_jacobian, rotation_of, vector_of
+from bidnerf_core.rotations import left_jacobian, rotation_matrix, rotation_vector
 from bidnerf_core.se3 import SE3
 
 
@@ -16,12 +16,12 @@ def retracted(T: SE3, tangent: Float[Tensor, "6"]) -> SE3:
     step = tangent.numpy()
     rotation, translation = T.rotation.numpy(), T.translation.numpy()
     moved = translation + rotation @ (left_jacobian(step[3:]) @ step[:3])
-    return SE3(torch.from_numpy(rotation @ rotation_of(step[3:])), torch.from_numpy(moved))
+    return SE3(torch.from_numpy(rotation @ rotation_matrix(step[3:])), torch.from_numpy(moved))
 
 
 def update_between(a: SE3, b: SE3) -> Float[Tensor, "6"]:
     """Return the right update that leads from ``a`` to ``b``: ``(a.inverse() @ b).log()``; float64, without derivatives."""
     back = a.rotation.numpy().T
-    phi = vector_of(back @ b.rotation.numpy())
+    phi = rotation_vector(back @ b.rotation.numpy())
     rho = np.linalg.solve(left_jacobian(phi), back @ (b.translation - a.translation).numpy())
     return torch.from_numpy(np.concatenate([rho, phi]))
