@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from bidnerf_core.frames import View
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.by_landmarks import LandmarkAnswer, corrected, fused_answer
 from bidnerf_core.localization.problem import Problem
@@ -71,13 +72,31 @@ def _at_twin(
     problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, twin: Twin
 ) -> LandmarkPose | None:
     """Return the pose at the twin, without the matches by descriptors that agree with the pose itself."""
-    there = confirm(matcher, problem.views, twin.T_world_rig).pose
-    if there is None or there.unguided is None:
+    there = confirm(matcher, _views_seen_by(problem, found), twin.T_world_rig).pose
+    if there is None:
+        return None
+    if there.unguided is not None:
+        data, limit = there.unguided.matches, there.unguided.limit
+        off = data.without_motion(found.T_world_camera, found.motion).residuals(found.T_world_camera)
+        elsewhere = torch.linalg.vector_norm(off, dim=-1) <= limit
+        there = replace(there, unguided=Unguided(data[~elsewhere], limit))
+    if found.intrinsics_of(problem.views[-1].frame.intrinsics) is None:
         return there
-    data, limit = there.unguided.matches, there.unguided.limit
-    off = data.without_motion(found.T_world_camera, found.motion).residuals(found.T_world_camera)
-    elsewhere = torch.linalg.vector_norm(off, dim=-1) <= limit
-    return replace(there, unguided=Unguided(data[~elsewhere], limit))
+    if there.changes_camera:  # of two corrections, one after the other, nothing keeps account
+        return None
+    return replace(
+        there, calibration=found.calibration, calibration_deviations=found.calibration_deviations,
+        intrinsics=found.intrinsics, stretch=found.stretch, has_other_camera=found.has_other_camera,
+    )  # fmt: skip
+
+
+def _views_seen_by(problem: Problem, found: LandmarkPose) -> list[View]:
+    """Return the views with the intrinsics of a pose."""
+    cameras = [view.frame.intrinsics for view in problem.views]
+    return [
+        replace(view, frame=replace(view.frame, intrinsics=found.intrinsics_of(camera) or camera))
+        for view, camera in zip(problem.views, cameras, strict=True)
+    ]
 
 
 def _rejection(twin: Twin) -> Verdict:

@@ -173,7 +173,7 @@ def _evident_motion(
     query: LandmarkQuery, free: ReprojectionFit, found: LandmarkMatches, camera: CalibrationPrior
 ) -> EvidentMotion:
     """Return the motion of a single image's camera; a rig, whose views may be from different moments, counts as still."""
-    if not query.moving or len(query.images) > 1:
+    if not query.may_move:
         return EvidentMotion()
     return evident_motion(query.observed(found), free, query.landmarks.correlation_of(len(found)), camera)
 

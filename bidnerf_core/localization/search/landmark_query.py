@@ -34,6 +34,11 @@ class LandmarkQuery:
     moving: bool = True  # whether the camera of a single image may have moved while its rows were exposed
 
     @property
+    def may_move(self) -> bool:
+        """Whether a motion is estimated: the views of a rig may be from different moments, and count as still."""
+        return self.moving and len(self.images) == 1
+
+    @property
     def threshold(self) -> float:
         """The largest reprojection error of an inlier, pixels."""
         return pixel_threshold(self.images[-1].intrinsics)

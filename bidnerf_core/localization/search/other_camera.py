@@ -54,7 +54,7 @@ def with_other_camera(
         return _like_map_camera(query, matches, found, clock) or found
     if found.agreeing < SUSPECTED * found.matches and not found.takes_map_camera:
         enough = SUPPORT_RATIO * found.agreeing + LEAST_EXTRA_INLIERS
-        return sampled_with_map_camera(query, matches, enough, clock) or found
+        return sampled_with_map_camera(query, matches, enough, enough, clock) or found
     return found
 
 
@@ -94,9 +94,12 @@ def _like_map_camera(
 
 
 def sampled_with_map_camera(
-    query: LandmarkQuery, matches: LandmarkMatches, enough: float, clock: Stopwatch
+    query: LandmarkQuery, matches: LandmarkMatches, consensus: float, enough: float, clock: Stopwatch
 ) -> LandmarkPose | None:
-    """Return the pose by minimal samples with the map's camera, resized to the image whatever its shape, if ``enough`` matches agree."""
+    """Return the pose by minimal samples with the map's camera, resized to the image whatever its shape.
+
+    None unless at least ``consensus`` matches agree with the samples, and ``enough`` with the refined pose.
+    """
     given = query.images[-1].intrinsics
     groups = stretched_cameras(query.landmarks.cameras, given.width, given.height)
     best = None
@@ -106,7 +109,7 @@ def sampled_with_map_camera(
         data = query.seen_by([camera] * len(query.images)).observed(matches)
         first = sample_consensus(data, matches.view, query.threshold, seed=0)
         agreeing = 0 if first is None else int(first.inliers.sum())
-        if first is not None and agreeing >= (enough if best is None else best[2]):
+        if first is not None and agreeing >= (consensus if best is None else best[2]):
             best = (camera, first, agreeing)
     return None if best is None else _with_map_camera(query, matches, best[0], best[1], enough, clock)
 

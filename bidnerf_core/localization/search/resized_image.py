@@ -26,6 +26,8 @@ from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood, resect
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
+CONSENSUS = 0.6
+"""Share of the matches required in the end that have to agree with minimal samples: these are inexact, and know no motion."""
 RESIZED = 0.05
 """Share of resized images among those whose pixels have another aspect ratio than the map's images at their size would have."""
 
@@ -38,37 +40,48 @@ def with_resized_map_camera(
     ``matches`` are those by descriptors alone. What is left of doubt is part of the covariance. Images of different cameras are
     taken as they are given.
     """
-    if found.takes_map_camera or not _may_be_resized(query):
+    if not _may_be_resized(query, found):
         return found
-    other = sampled_with_map_camera(query, matches, AS_MANY * found.agreeing, clock)
-    if other is None:
+    enough = AS_MANY * found.agreeing
+    other = sampled_with_map_camera(query, matches, CONSENSUS * enough, enough, clock)
+    odds = -math.inf if other is None else log_odds(query, other, found)
+    clock.lap("map's camera")
+    if other is None or not math.isfinite(odds):
         return found
-    odds = _log_odds(query, other, found)
     chosen, rejected = (other, found) if odds > 0 else (found, other)
     shift = (chosen.T_world_camera.inverse() @ rejected.T_world_camera).log()
     doubt = torch.outer(shift, shift) / (1 + math.exp(min(abs(odds), 100.0)))
-    clock.lap("map's camera")
     return replace(chosen, covariance=chosen.covariance + doubt)
 
 
-def _may_be_resized(query: LandmarkQuery) -> bool:
-    """Return whether the aspect ratio of the given pixels differs from those of all the map's images, resized to this size."""
+def _may_be_resized(query: LandmarkQuery, found: LandmarkPose) -> bool:
+    """Return whether the pixels of the camera that was found have another aspect ratio than those of all the map's images would have,
+    resized to this size.
+    """
     given, *others = {image.intrinsics for image in query.images}
     if others or not query.landmarks.cameras:
         return False
     groups = stretched_cameras(query.landmarks.cameras, given.width, given.height)
-    ratio = given.fx / given.fy
+    own = found.intrinsics_of(given) or given
+    ratio = own.fx / own.fy
     return all(abs(math.log(c.fx / c.fy / ratio)) > ALIKE_SHAPES for group in groups for c in group)
 
 
-def _log_odds(query: LandmarkQuery, other: LandmarkPose, found: LandmarkPose) -> float:
-    """Return the logarithm of the odds that the image was resized, so that ``other`` is its pose, and not ``found``."""
+def log_odds(query: LandmarkQuery, other: LandmarkPose, found: LandmarkPose) -> float:
+    """Return the log odds that the image was resized, so that ``other`` is its pose, against ``found``.
+
+    Each camera may have been at rest or, if the query allows for it, have moved while the rows were exposed: the evidence for it is
+    the sum of both, whatever was evident when its pose was found.
+    """
     shared = _union(found.correspondences, other.correspondences)
+    resized, given = (_fits(query, shared, pose) for pose in (other, found))
+    noise = min(each.fit.noise for each in (*resized, *given))
     correlation = query.landmarks.correlation_of(len(shared))
-    fits = [_Fit.of(query, shared, pose, correlation) for pose in (other, found)]
-    noise = min(each.fit.noise for each in fits)
-    resized, given = (each.log_evidence(noise, correlation) for each in fits)
-    return resized - given + math.log(RESIZED / (1 - RESIZED))
+    evidence = [
+        float(torch.tensor([each.log_evidence(noise, correlation) for each in fits]).logsumexp(0))
+        for fits in (resized, given)
+    ]
+    return evidence[0] - evidence[1] + math.log(RESIZED / (1 - RESIZED))
 
 
 def _union(one: LandmarkMatches, other: LandmarkMatches) -> LandmarkMatches:
@@ -79,24 +92,28 @@ def _union(one: LandmarkMatches, other: LandmarkMatches) -> LandmarkMatches:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A pose refined with its intrinsics, and with its motion if it has one, on given matches."""
+    """A pose refined on given matches, with its intrinsics fixed."""
 
     data: ObservedPoints
     fit: ReprojectionFit
-    log_prior: float  # without that of the camera
-
-    @staticmethod
-    def of(query: LandmarkQuery, shared: LandmarkMatches, pose: LandmarkPose, correlation: float) -> _Fit:
-        cameras = [pose.intrinsics_of(image.intrinsics) or image.intrinsics for image in query.images]
-        data = query.seen_by(cameras).observed(shared)
-        motion = MotionPrior.usual(pose.distance) if pose.has_motion else STILL
-        fit = resect(data, pose.T_world_camera, pose.noise, FIXED, correlation=correlation, motion=motion)
-        prior = SHARE_MOVING if pose.has_motion else 1 - SHARE_MOVING
-        occam = fit.log_occam_factor(motion) if pose.has_motion else 0.0
-        if pose.estimates_calibration:
-            prior *= WRONG_SHARE
-        return _Fit(data, fit, math.log(prior) + occam)
+    log_prior: float  # of the motion and of the need to estimate intrinsics
 
     def log_evidence(self, noise: float, correlation: float) -> float:
-        """Return the logarithm of the evidence, up to a constant; ``noise`` (pixels) is that of the better fit."""
+        """Return the logarithm of the evidence, up to a constant; ``noise`` (pixels) is that of the best fit."""
         return log_likelihood(self.data, self.fit, noise, correlation) + self.log_prior
+
+
+def _fits(query: LandmarkQuery, shared: LandmarkMatches, pose: LandmarkPose) -> list[_Fit]:
+    """Return the fits of a pose at rest and, if the query allows for it, with a motion."""
+    cameras = [pose.intrinsics_of(image.intrinsics) or image.intrinsics for image in query.images]
+    data = query.seen_by(cameras).observed(shared)
+    correlation = query.landmarks.correlation_of(len(shared))
+    unexpected = pose.estimates_calibration and query.prior == FIXED
+    camera = math.log(WRONG_SHARE) if unexpected else 0.0
+    fits = []
+    for motion in (STILL, MotionPrior.usual(pose.distance)) if query.may_move else (STILL,):
+        fit = resect(data, pose.T_world_camera, pose.noise, FIXED, correlation=correlation, motion=motion)
+        moved = motion != STILL
+        prior = math.log(SHARE_MOVING) + fit.log_occam_factor(motion) if moved else math.log(1 - SHARE_MOVING)
+        fits.append(_Fit(data, fit, camera + prior))
+    return fits
