@@ -25,7 +25,8 @@ It is low because lens stabilisers, and lenses that the intrinsics do not descri
 LARGEST = 22.5
 """Largest squared motion, in standard deviations of its prior (chi-squared at 99.9 %, six degrees of freedom).
 
-A larger motion would stand in for the camera of an image that was resized to another shape.
+A larger motion more probably makes up for another camera, such as that of an image resized to another shape. It is not taken, and
+the shift of the pose that it would bring counts as doubt.
 """
 NEGLIGIBLE = 1e-3
 """Probability of a motion below which it adds nothing to the doubt about a pose."""
@@ -60,8 +61,6 @@ def evident_motion(
     turned = resect(transposed, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, motion)
     log_odds = [
         _log_evidence(points, found, still, motion, correlation) + math.log(share)
-        if found.motion_in_deviations(motion) <= LARGEST
-        else -math.inf
         for points, found, share in (
             (data, moving, SHARE_MOVING * (1 - TURNED)), (transposed, turned, SHARE_MOVING * TURNED)
         )
@@ -71,6 +70,7 @@ def evident_motion(
         return EvidentMotion()
     if max(of_moving, of_turned) < NEGLIGIBLE:
         return EvidentMotion()
+    takes_motion = of_moving > of_still and moving.motion_in_deviations(motion) <= LARGEST
     # The pose is found with known intrinsics, so the doubt about it follows from fits with the same ones.
     still, moving, turned = (
         resect(points, fit.T_world_rig, found.noise, FIXED, fit.calibration, correlation, prior)
@@ -80,9 +80,9 @@ def evident_motion(
             (transposed, turned, motion),
         )
     )
-    chosen = moving if of_moving > of_still else still
+    chosen = moving if takes_motion else still
     doubt = of_turned * _square(chosen, turned)
-    if chosen is moving:
+    if takes_motion:
         return EvidentMotion(motion, doubt + of_still * _square(chosen, still))
     return EvidentMotion(STILL, doubt + of_moving * (_square(chosen, moving) + moving.covariance_by_motion))
 
