@@ -184,7 +184,9 @@ def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> 
         focal = exif.focal_mm * exif.pixels_per_mm[0] * exif.digital_zoom * scale
         zoom = f" and digital zoom {exif.digital_zoom:g}" if exif.digital_zoom != 1 else ""
         return _from_focal(where, raster, focal, f"{exif.focal_mm:g} mm, pixel size{zoom} in EXIF")
-    raise InputError(f"{where}: no focal length in EXIF, expected a camera: {WAYS}")
+    raise InputError(
+        f"{where}: no focal length in EXIF, expected a camera: {WAYS}, or assumed= with a map's cameras"
+    )
 
 
 def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource | None:

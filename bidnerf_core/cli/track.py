@@ -147,6 +147,11 @@ def run(arguments: list[str]) -> None:
                 path.plot(plot, stored.surface)
             if not follow and path.frames:
                 print_table(path.table(seconds))
+                if path.lost and path.without_times:
+                    say(
+                        f"the frames have no time stamps, so the first ones count as {config.frame_seconds:.3g} s apart; "
+                        "if they were taken farther apart, set --frame-seconds"
+                    )
                 if not path.accepted:
                     question = question_about_scene([frame.found for frame in path.frames])
                     say(f"no pose of {amount(len(path.frames), 'frame')} was accepted{question}")

@@ -109,6 +109,11 @@ class TrackedPath:
         )
         plot_path(path, surface, file)
 
+    @property
+    def without_times(self) -> bool:
+        """Whether no frame has a time stamp."""
+        return all(frame.posed.time is None for frame in self.frames)
+
     def errors(self) -> TrajectoryErrors | None:
         """Return the errors of the accepted poses whose truth is known, or None if there are none."""
         known = [(f.posed.T_world_camera, f.truth) for f in self.accepted if f.truth is not None]

@@ -106,9 +106,9 @@ def _is_hopeless(problem: Problem) -> bool:
 
 def _unrecognised(problem: Problem) -> Verdict:
     """Return why an image without recognised landmarks is rejected in a blurred field."""
-    advice = "; give the camera's calibration instead of an approximate focal length"
-    focal = advice if problem.focal_is_approximate else ""
-    why = f"too few landmarks were recognised, and the field is too blurred to compare images with its renderings{focal}"
+    causes = "the image may show another place, or be too dark, too blurred or taken from too far away"
+    focal = ", or its focal length may be too far off" if problem.focal_is_approximate else ""
+    why = f"too few landmarks were recognised, and the field is not sharp enough to compare images with it: {causes}{focal}"
     return Verdict(Outcome.TOO_FEW_MATCHES, why)
 
 
