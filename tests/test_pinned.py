@@ -37,10 +37,25 @@ def all_cases():
     return {case.name: case for case in pinned_poses.cases(pinned_poses.blobs())}
 
 
-@pytest.mark.parametrize("name", RECORD)
+SEARCHED = ("blobs/one/rgb/auto/none", "blobs/rig/rgb/auto/none")
+"""Cases of a search by colour among hundreds of poses. Which of nearly equal hypotheses are kept depends on rounding, and with it
+the number of steps: an Intel processor takes 40 for the 41 of the AMD one of the record, and ends 9.3e-5 away.
+"""
+SEARCH_TOLERANCE = 3e-4
+
+
+@pytest.mark.parametrize("name", [name for name in RECORD if name not in SEARCHED])
 def test_the_answer_is_the_recorded_one(name: str) -> None:
     found = pinned_poses.row(all_cases()[name].run())
     assert pinned_poses.differences(RECORD[name], found) == []
+
+
+@pytest.mark.parametrize("name", SEARCHED)
+def test_the_answer_of_a_search_is_about_the_recorded_one(name: str) -> None:
+    found = pinned_poses.row(all_cases()[name].run())
+    known = RECORD[name]
+    assert pinned_poses.differences(known, {**found, "steps": known["steps"]}, SEARCH_TOLERANCE) == []
+    assert abs(found["steps"] - known["steps"]) <= 5
 
 
 def test_every_case_is_recorded() -> None:
