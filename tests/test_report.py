@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import json
 import re
+import sys
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,7 +20,7 @@ from bidnerf_core.cli import main
 from bidnerf_core.evaluation.errors import success_rate
 from bidnerf_core.evaluation.groups import grouped, situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
-from bidnerf_core.evaluation.provenance import note_run, provenance
+from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
 from bidnerf_core.evaluation.results import result_line
 from bidnerf_core.evaluation.significance import compare_pair, pairwise_tests
 from bidnerf_core.evaluation.summary import NEVER, median, steps_of, summarize
@@ -302,3 +303,18 @@ def test_a_damaged_side_file_is_named(
     (tmp_path / "r.meta.json").write_text(json.dumps({"runs": 3}))
     assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
     assert "no list of runs" in capsys.readouterr().err
+
+
+def test_a_recorded_command_has_no_local_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = [
+        "/a/run.py",
+        "map:/data/lego",
+        "/b/map:/data/room",
+        "--out=/c/d",
+        "/e/f",
+        "g/h",
+        "--size",
+        "0.5:10",
+    ]
+    monkeypatch.setattr(sys, "argv", words)
+    assert script_command() == "python run.py map:lego map:room --out=d f g/h --size 0.5:10"

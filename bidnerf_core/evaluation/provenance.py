@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -154,8 +155,10 @@ def write_record(path: Path, results: dict[str, Any], seed: int) -> Path:
 
 
 def _without_local_path(argument: str, root: Path) -> str:
-    option, equals, value = argument.rpartition("=")
-    path = Path(value)
-    if path.is_absolute():
-        value = str(path.relative_to(root)) if path.is_relative_to(root) else path.name
-    return option + equals + value
+    """Return an argument with its paths shortened, also in words such as ``--out=PATH`` and ``MAP:DATA``."""
+    parts = re.split(r"([=:])", argument)
+    return "".join(_shortened(Path(part), root) if Path(part).is_absolute() else part for part in parts)
+
+
+def _shortened(path: Path, root: Path) -> str:
+    return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
