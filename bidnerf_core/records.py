@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import Any
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.files import read_file
-
-LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
+from bidnerf_core.serialization import LARGEST_NUMBER
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,7 @@ OPEN = MotionPrior(move=0.05, turn=0.02)
 
 
 def observed_while_moving(motion: Tensor, noise: float = 0.0, seed: int = 0) -> ObservedPoints:
-    """The same points as a camera sees them whose pose at each row is that of the exponential of the motion so far."""
+    """Return the same points as seen by a camera whose pose at each row is the exponential of the motion so far."""
     data = observed(seed=seed)
     local = TRUE.inverse().apply(data.points)
     times = data.exposure_times

@@ -49,7 +49,7 @@ def found_with(landmarks: LandmarkMap, view: View, stated: Intrinsics) -> Landma
 def test_an_image_of_the_maps_camera_that_was_resized_is_recognised(
     landmarks: LandmarkMap, across: float, pose: SE3
 ) -> None:
-    """By 3 and 5 %, motions between the rows, focal lengths and other poses explain it nearly as well."""
+    """Motions between the rows, focal lengths and other poses explain stretches of 3 and 5 % nearly as well."""
     stated = replace(PINHOLE, fx=PINHOLE.fx / across)
     found = found_with(landmarks, POINTS.view(pose, PINHOLE), stated)
     assert landmark_verdict(found).accepted
@@ -111,8 +111,8 @@ def test_evidence_favours_the_true_camera(
         assert sign * odds(landmarks, view, one, other) > 2
 
 
-def test_what_each_camera_costs(landmarks: LandmarkMap) -> None:
-    """With keypoints that hardly count, the priors alone are left: of resized images, and of cameras that have to be estimated."""
+def test_the_prior_decides_where_keypoints_do_not(landmarks: LandmarkMap) -> None:
+    """The prior of resized images alone is left if keypoints hardly count."""
     view = POINTS.view(POSES[0], PINHOLE)
     vague = replace(landmarks, correlation=1e9)
     stated = replace(PINHOLE, fx=PINHOLE.fx / 1.03)
@@ -120,7 +120,7 @@ def test_what_each_camera_costs(landmarks: LandmarkMap) -> None:
 
 
 def test_the_doubt_between_two_cameras_is_part_of_the_covariance(landmarks: LandmarkMap) -> None:
-    """With keypoints that count for little, the evidence is weak, and the covariance covers both hypotheses."""
+    """The evidence is weak if keypoints count for little, and the covariance then covers both hypotheses."""
     pose = POSES[0]
     view, stated = POINTS.view(pose, PINHOLE), replace(PINHOLE, fx=PINHOLE.fx / 1.05)
     vague = replace(landmarks, correlation=1000.0)

@@ -15,12 +15,10 @@ from torch import Tensor
 
 from bidnerf_core.mapping.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.robust_equations import RobustEquations, robust_spread
+from bidnerf_core.mapping.robust_equations import Array, RobustEquations, robust_spread
 from bidnerf_core.rolling_shutter import AT_REST, moved_array
 from bidnerf_core.rotations import rotation_matrix
 from bidnerf_core.se3 import SE3
-
-Array = np.ndarray
 
 SCALE = 2.0
 """Scale of the Cauchy loss: the residual, in standard deviations, whose weight is one half."""
@@ -64,7 +62,7 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class Linearization:
+class LinearizedErrors:
     """Reprojection errors in pixels about a state; they do not depend on the noise, which may change without them."""
 
     state: State
@@ -85,7 +83,7 @@ class ReprojectionErrors:
         self._observed = data.image.numpy() * self._focal
         self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
 
-    def linearized(self, state: State, free: Array) -> Linearization:
+    def linearized(self, state: State, free: Array) -> LinearizedErrors:
         """Return the errors at a state, and their Jacobian with respect to the pose and the camera's ``free`` parameters."""
         rig = (self._points - state.position) @ state.rotation
         motion = state.camera[4:]
@@ -101,9 +99,9 @@ class ReprojectionErrors:
         scale = self._focal * math.exp(log_focal)
         projected = flat * (1 + bend) * scale + self._focal * shift
         jacobian = self._jacobian(rig, flat, z, scale, radial, bend, free)
-        return Linearization(state, front, projected - self._observed, jacobian)
+        return LinearizedErrors(state, front, projected - self._observed, jacobian)
 
-    def system(self, here: Linearization, noise: float) -> RobustEquations:
+    def system(self, here: LinearizedErrors, noise: float) -> RobustEquations:
         """Return the normal equations for keypoints of this noise (pixels)."""
         deviation = np.sqrt(noise**2 + self._variance)[:, None]
         residual = np.where(here.front[:, None], here.off / deviation, BEHIND)

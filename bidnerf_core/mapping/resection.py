@@ -15,12 +15,10 @@ from torch import Tensor
 
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.reprojection import Linearization, ReprojectionErrors, State
-from bidnerf_core.mapping.robust_equations import RobustEquations, damped_solution
+from bidnerf_core.mapping.reprojection import LinearizedErrors, ReprojectionErrors, State
+from bidnerf_core.mapping.robust_equations import Array, RobustEquations, damped_solution
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.se3 import SE3
-
-Array = np.ndarray
 
 RESECTION_STEPS = 20
 """Largest number of steps; from a good start, four or five suffice."""
@@ -82,7 +80,7 @@ def resect(
     deviations = torch.cat([prior.deviations, motion.deviations]).numpy()
     free = deviations.nonzero()[0]
 
-    def equations(here: Linearization, noise: float) -> RobustEquations:
+    def equations(here: LinearizedErrors, noise: float) -> RobustEquations:
         system = errors.system(here, noise).weighted(1 / correlation)
         return system.with_prior(here.state.camera[free], deviations[free])
 

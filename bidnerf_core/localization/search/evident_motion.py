@@ -22,7 +22,7 @@ SHARE_MOVING = 1 / 30
 It is low because lens stabilisers, and lenses that the intrinsics do not describe, distort images in similar ways.
 """
 
-LARGEST = 22.5
+LARGEST_MOTION = 22.5
 """Largest squared motion, in standard deviations of its prior (chi-squared at 99.9 %, six degrees of freedom).
 
 A larger motion more probably makes up for another camera, such as that of an image resized to another shape. It is not taken, and
@@ -70,7 +70,7 @@ def evident_motion(
         return EvidentMotion()
     if max(of_moving, of_turned) < NEGLIGIBLE:
         return EvidentMotion()
-    takes_motion = of_moving > of_still and moving.motion_in_deviations(motion) <= LARGEST
+    takes_motion = of_moving > of_still and moving.motion_in_deviations(motion) <= LARGEST_MOTION
     # The pose is found with known intrinsics, so the doubt about it follows from fits with the same ones.
     still, moving, turned = (
         resect(points, fit.T_world_rig, found.noise, FIXED, fit.calibration, correlation, prior)

@@ -74,9 +74,9 @@ def log_odds(query: LandmarkQuery, other: LandmarkPose, found: LandmarkPose) -> 
     the sum of both, whatever was evident when its pose was found.
     """
     shared = _union(found.correspondences, other.correspondences)
-    resized, given = (_fits(query, shared, pose) for pose in (other, found))
-    noise = min(each.fit.noise for each in (*resized, *given))
     correlation = query.landmarks.correlation_of(len(shared))
+    resized, given = (_fits(query, shared, pose, correlation) for pose in (other, found))
+    noise = min(each.fit.noise for each in (*resized, *given))
     evidence = [
         float(torch.tensor([each.log_evidence(noise, correlation) for each in fits]).logsumexp(0))
         for fits in (resized, given)
@@ -103,11 +103,12 @@ class _Fit:
         return log_likelihood(self.data, self.fit, noise, correlation) + self.log_prior
 
 
-def _fits(query: LandmarkQuery, shared: LandmarkMatches, pose: LandmarkPose) -> list[_Fit]:
+def _fits(
+    query: LandmarkQuery, shared: LandmarkMatches, pose: LandmarkPose, correlation: float
+) -> list[_Fit]:
     """Return the fits of a pose at rest and, if the query allows for it, with a motion."""
     cameras = [pose.intrinsics_of(image.intrinsics) or image.intrinsics for image in query.images]
     data = query.seen_by(cameras).observed(shared)
-    correlation = query.landmarks.correlation_of(len(shared))
     unexpected = pose.estimates_calibration and query.prior == FIXED
     camera = math.log(WRONG_SHARE) if unexpected else 0.0
     fits = []
