@@ -8,7 +8,8 @@ exposure of a photo that it was not trained on: PSNR is measured as rendered, an
 channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
 measured at poses of the test frames that are refined with the map's landmarks, and on training frames at the poses in the map.
 Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the selection of samples that
-makes it fast, is compared with that on every fifth frame. ``--without-depth`` withholds the measured depth of a
+makes it fast, is compared with that on every fifth frame. ``--test-frames-only`` leaves out all but the quality on the test
+frames, for backends that take minutes to render an image. ``--without-depth`` withholds the measured depth of a
 ``transforms_train.json`` from the training, and uses that of the test split for judging.
 """
 
@@ -176,6 +177,11 @@ def main() -> None:
     parser.add_argument(
         "--without-depth", action="store_true", help="train on the colours of transforms_train.json alone"
     )
+    parser.add_argument(
+        "--test-frames-only",
+        action="store_true",
+        help="judge the test frames at their given poses, and nothing else",
+    )
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the record")
     parser.add_argument(
         "--device", default="cpu", help="where images are rendered; to train there too: -- --device"
@@ -199,13 +205,14 @@ def main() -> None:
             for level in levels(stored.field)
         ],
     }
-    results["at_landmark_poses"] = at_landmark_poses(stored, views)
-    results["training_frames"] = on_training_frames(stored, given.data)
+    if not given.test_frames_only:
+        results["at_landmark_poses"] = at_landmark_poses(stored, views)
+        results["training_frames"] = on_training_frames(stored, given.data)
     if stored.info.pose_refinement is not None:
         moved = [camera.moved for camera in stored.info.cameras if camera.moved is not None]
         results["pose_refinement"] = to_plain(stored.info.pose_refinement)
         results["pixels_moved_median"] = statistics.median(m.pixels for m in moved) if moved else 0.0
-    if compared := beside_dense(stored.field, stored.bounds, views):
+    if not given.test_frames_only and (compared := beside_dense(stored.field, stored.bounds, views)):
         results["beside_dense"] = compared
     print(write_record(given.results / f"{given.name}.json", results, seed=stored.info.config.get("seed", 0)))
     print({k: v for k, v in results.items() if k != "config"})

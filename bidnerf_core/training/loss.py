@@ -39,11 +39,16 @@ def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor,
     the camera. Where the distance comes from a landmark, the mean is also taken over its normal distribution, so that weight
     within its standard deviation is hardly moved.
     """
-    distance, measured = batch.observed.distance, batch.observed.measured
-    off = rendering.samples.middles - distance[:, None]
-    away = (rendering.weights * expected_distance(off, batch.deviation[:, None])).sum(-1)
-    missing = (1 - rendering.opacity) * distance
-    return torch.where(measured, away + missing, 0).sum() / measured.sum().clamp(min=1)
+    measured = batch.observed.measured.nonzero()[:, 0]  # few rays have a landmark
+    distance, deviation, weights, middles, opacity = (
+        part.index_select(0, measured)
+        for part in (
+            batch.observed.distance, batch.deviation, rendering.weights, rendering.samples.middles, rendering.opacity
+        )
+    )  # fmt: skip
+    away = (weights * expected_distance(middles - distance[:, None], deviation[:, None])).sum(-1)
+    missing = (1 - opacity) * distance
+    return (away + missing).sum() / max(len(measured), 1)
 
 
 def expected_distance(offset: Float[Tensor, "*p"], deviation: Float[Tensor, "*#p"]) -> Float[Tensor, "*p"]:
