@@ -43,6 +43,11 @@ class RaySamples:
     def middles(self) -> Float[Tensor, "*r s"]:
         return (self.starts + self.ends) / 2
 
+    def unflattened(self, shape: torch.Size) -> RaySamples:
+        """Return the samples of rays that were flattened, in their former ``shape``."""
+        width = self.starts.shape[-1]
+        return RaySamples(*(part.reshape(*shape, width) for part in (self.starts, self.ends, self.valid)))
+
 
 @dataclass(frozen=True, eq=False)
 class FieldValues:

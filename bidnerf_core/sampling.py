@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -98,7 +98,7 @@ OfRays = TypeVar("OfRays", Rays, RaySamples)
 
 def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
     """Return the rays, or the samples of the rays, at these (flattened) indices."""
-    leading = (of.near if isinstance(of, Rays) else of.starts[..., 0]).dim()
+    leading = of.near.dim() if isinstance(of, Rays) else of.starts.dim() - 1
     parts = (getattr(of, field.name) for field in fields(of))
     return type(of)(*(part.reshape(-1, *part.shape[leading:]).index_select(0, index) for part in parts))
 
@@ -144,6 +144,34 @@ LARGEST_THICKNESS = 0.5
 which only a part is dense; what lies behind the other part must be found as well."""
 
 
+@runtime_checkable
+class SplittingSampler(Protocol):
+    """A sampler that returns rays with many intervals apart, so that short rows are not padded to the length of long ones."""
+
+    def split(
+        self, rays: Rays, count: int, jitter: Generator | None = None
+    ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
+        """Return the samples of all rays, the (flattened) indices of rays with more than ``count``, and the samples of these.
+
+        In the first, rows are at most ``count`` long. What they hold for the rays with more has no meaning.
+        """
+        ...
+
+
+def _split(
+    sampler: RaySampler, rays: Rays, count: int, jitter: Generator | None
+) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
+    """Return any sampler's intervals, gathered, as a ``SplittingSampler`` does."""
+    if isinstance(sampler, SplittingSampler):
+        few, many, rest = sampler.split(rays, count, jitter)
+        return _gathered(few), many, _gathered(rest)
+    rough = _gathered(sampler(rays, jitter))
+    if rough.starts.shape[-1] <= count:
+        return rough, torch.zeros(0, dtype=torch.long, device=rough.valid.device), rough
+    many = (rough.valid.sum(-1) > count).reshape(-1).nonzero()[:, 0]
+    return _first(rough, count), many, rows_of(rough, many)
+
+
 @dataclass(frozen=True)
 class Concentrated:
     """At most ``count`` intervals of each ray, short where the field ``guide`` has its weight and long elsewhere.
@@ -158,20 +186,25 @@ class Concentrated:
 
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
+        if not may_wait(rays.near.device):
+            return self._of_known_shape(rays, jitter)
+        few, many, rough = _split(self.guide.sampler, rays, self.count, jitter)
+        if not len(many):
+            return few
+        found = self._concentrated(rows_of(rays, many), rough, jitter)
+        merged = (
+            pad(old, (0, self.count - old.shape[-1])).reshape(-1, self.count).index_copy(0, many, new)
+            for old, new in zip(_parts(few), _parts(found), strict=True)
+        )
+        return RaySamples(*merged).unflattened(rays.near.shape)
+
+    def _of_known_shape(self, rays: Rays, jitter: Generator | None) -> RaySamples:
+        """Return the intervals without waiting for the device: all rays are concentrated, also those that keep theirs."""
         rough = _gathered(self.guide.sampler(rays, jitter))
         if rough.starts.shape[-1] <= self.count:
             return rough
-        kept = RaySamples(*(part[..., : self.count] for part in _parts(rough)))
         few = rough.valid.sum(-1) <= self.count
-        if not may_wait(few.device):
-            return _either(few, kept, self._concentrated(rays, rough, jitter))
-        many = (~few).reshape(-1).nonzero()[:, 0]
-        found = self._concentrated(rows_of(rays, many), rows_of(rough, many), jitter)
-        merged = (
-            old.reshape(-1, self.count).index_copy(0, many, new).reshape(old.shape)
-            for old, new in zip(_parts(kept), _parts(found), strict=True)
-        )
-        return RaySamples(*merged)
+        return _either(few, _first(rough, self.count), self._concentrated(rays, rough, jitter))
 
     def _concentrated(self, rays: Rays, rough: RaySamples, jitter: Generator | None) -> RaySamples:
         length = (rough.ends - rough.starts).clamp(min=torch.finfo(rough.ends.dtype).tiny)
@@ -181,6 +214,11 @@ class Concentrated:
 
 def _parts(samples: RaySamples) -> tuple[Tensor, Tensor, Tensor]:
     return samples.starts, samples.ends, samples.valid
+
+
+def _first(samples: RaySamples, count: int) -> RaySamples:
+    """Return the first ``count`` intervals of each ray."""
+    return RaySamples(*(part[..., :count] for part in _parts(samples)))
 
 
 def concentrated(

@@ -11,12 +11,13 @@ from torch import Tensor
 
 import tiny
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.rendering import render
+from bidnerf_core.sampling import Concentrated, SplittingSampler
 from bidnerf_core.voxel_grid import VoxelGrid
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
-from bidnerf_hashgrid.occupancy import OccupancyGrid
+from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
 from voxels import cell_centres, cells_of
 
 BOUNDS = SceneBounds((-1.2, -0.4, 0.1), (0.8, 0.7, 1.3), 0.1, 8.0, (0.3, 0.6, 0.9))
@@ -100,6 +101,35 @@ def test_samples_are_sorted_disjoint_and_within_the_limits(jitter: bool, dtype: 
     assert bool((samples.starts[:, 1:] >= samples.ends[:, :-1] - tolerance)[both].all())
     assert bool((samples.starts >= rays.near[:, None])[samples.valid].all())
     assert bool((samples.ends <= rays.far[:, None])[samples.valid].all())
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+def test_rays_with_many_samples_are_concentrated_as_without_splitting(jitter: bool) -> None:
+    @dataclass(frozen=True)
+    class Whole:
+        """The same density, with a sampler that cannot split."""
+
+        inner: GridDensity
+
+        def sampler(self, rays: Rays, jitter: torch.Generator | None = None) -> RaySamples:
+            return self.inner.sampler(rays, jitter)
+
+        def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
+            return self.inner.query(positions, directions)
+
+    grid, rays = grid_of(random_cells(0.6, 3)), random_rays()
+    grid.density.uniform_(0, 30, generator=torch.Generator().manual_seed(4))
+    density = GridDensity(grid)
+    found = []
+    for guide in (density, Whole(density)):
+        assert isinstance(guide.sampler, SplittingSampler) == (guide is density)
+        draws = torch.Generator().manual_seed(5) if jitter else None
+        found.append(Concentrated(guide, 8)(rays, draws))
+    assert 0.1 < float((grid(rays).valid.sum(-1) > 8).double().mean()) < 0.9
+    valid = found[1].valid
+    assert torch.equal(found[0].valid, valid)
+    for name in ("starts", "ends"):
+        assert torch.equal(*(getattr(samples, name)[valid] for samples in found))
 
 
 def test_samples_are_in_occupied_cells() -> None:

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from bidnerf_core.contraction import RaySpacing
 from bidnerf_core.field import FieldValues, Rays, RaySamples, SceneBounds
+from bidnerf_core.sampling import rows_of
 from bidnerf_core.voxel_grid import VoxelGrid
 from bidnerf_core.waiting import may_wait
 
@@ -87,44 +88,57 @@ class OccupancyGrid(nn.Module):
     @torch.no_grad()
     def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples:
         """Return the intervals of the rays in occupied cells, equally long in the coordinate of ``SceneBounds.spacing``."""
-        shape = rays.near.shape
-        flat = Rays(*(part.detach().reshape(-1, *part.shape[len(shape) :]) for part in
+        march = self._march(rays, jitter)
+        if not may_wait(rays.near.device):
+            return self._of_known_shape(march).unflattened(rays.near.shape)
+        place, ray = self._occupied_steps(march)
+        return self._padded(march, place, _counts(ray, march)).unflattened(rays.near.shape)
+
+    @torch.no_grad()
+    def split(
+        self, rays: Rays, count: int, jitter: Generator | None = None
+    ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
+        """Return the intervals that ``__call__`` returns, apart for rays with many of them, see ``SplittingSampler``."""
+        march = self._march(rays, jitter)
+        place, ray = self._occupied_steps(march)
+        counts = _counts(ray, march)
+        many = counts > count
+        numbers, of_many = many.nonzero()[:, 0], many.index_select(0, ray)
+        few = self._padded(march, place[~of_many], torch.where(many, 0, counts))
+        rest = self._padded(march.rows(numbers), place[of_many], counts.index_select(0, numbers))
+        return few.unflattened(rays.near.shape), numbers, rest
+
+    def _march(self, rays: Rays, jitter: Generator | None) -> _March:
+        leading = rays.near.dim()
+        flat = Rays(*(part.detach().reshape(-1, *part.shape[leading:]) for part in
                       (rays.origins, rays.directions, rays.near, rays.far)))  # fmt: skip
         spacing = self.bounds.spacing(flat)
-        limits = spacing.place(torch.stack([flat.near, flat.far], dim=-1))
-        near, far = limits.unbind(-1)
+        near, far = spacing.place(torch.stack([flat.near, flat.far], dim=-1)).unbind(-1)
         offset = torch.full_like(near, 0.5)
         if jitter is not None:
             offset = torch.rand(near.shape, generator=jitter, device=jitter.device).to(near)
-        if not may_wait(near.device):
-            samples = self._of_known_shape(flat, spacing, near, far, offset)
-            starts, ends = (spacing.distance(x).reshape(*shape, MOST) for x in (samples.starts, samples.ends))
-            return RaySamples(starts, ends, samples.valid.reshape(*shape, MOST))
-        ray, start = self._busy_blocks(flat, spacing, near, far)
-        steps = torch.arange(BLOCK, dtype=near.dtype, device=near.device) * self.step
-        offsets, exits, ends = (part.index_select(0, ray) for part in (offset, spacing.exit, far))
-        place = start[:, None] + steps + (offsets * self.step)[:, None]
-        positions = _at(flat, RaySpacing(exits, spacing.radius).distance(place), ray)
-        block, step = (self._occupied_at(positions) & (place < ends[:, None])).nonzero(as_tuple=True)
-        kept = place.view(-1).index_select(0, block * BLOCK + step)
-        samples = self._padded(kept, ray.index_select(0, block), near, far)
-        width = samples.valid.shape[-1]
-        starts, ends = (
-            spacing.distance(part).reshape(*shape, width) for part in (samples.starts, samples.ends)
-        )
-        return RaySamples(starts, ends, samples.valid.reshape(*shape, width))
+        return _March(flat, spacing.exit, spacing.radius, near, far, offset)
 
-    def _of_known_shape(
-        self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor, offset: Tensor
-    ) -> RaySamples:
+    def _occupied_steps(self, march: _March) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
+        """Return the coordinates of all steps in occupied cells, and the numbers of their rays in ascending order."""
+        ray, start = self._busy_blocks(march)
+        steps = torch.arange(BLOCK, dtype=start.dtype, device=start.device) * self.step
+        offset, far, exits = (part.index_select(0, ray) for part in (march.offset, march.far, march.exit))
+        place = start[:, None] + steps + (offset * self.step)[:, None]
+        positions = _at(march.rays, RaySpacing(exits, march.radius).distance(place), ray)
+        block, step = (self._occupied_at(positions) & (place < far[:, None])).nonzero(as_tuple=True)
+        return place.view(-1).index_select(0, block * BLOCK + step), ray.index_select(0, block)
+
+    def _of_known_shape(self, march: _March) -> RaySamples:
         """Return the first ``MOST`` intervals of each ray in occupied cells, without waiting for the device."""
-        box = self.grid.rays(rays.origins, rays.directions)
+        near, far = march.near, march.far
+        box = self.grid.rays(march.rays.origins, march.rays.directions)
         # Steps are counted from ``near``, as everywhere, and those before the grid are skipped; contracted space has none.
         skipped = ((box.near - near) / self.step).floor().clamp(min=0) * (not self.bounds.contracted)
         count = math.ceil(2 * self.bounds.side / self.step) + 1  # a cube's diagonal is shorter
         steps = torch.arange(count, dtype=near.dtype, device=near.device)
-        place = near[:, None] + (skipped[:, None] + steps + offset[:, None]) * self.step
-        positions = rays.at(spacing.distance(place))
+        place = near[:, None] + (skipped[:, None] + steps + march.offset[:, None]) * self.step
+        positions = march.rays.at(march.spacing.distance(place))
         kept = self._occupied_at(positions) & (place < far[:, None])
         order = (~kept).sort(dim=-1, stable=True).indices[:, :MOST]
         place, kept = place.gather(-1, order), kept.gather(-1, order)
@@ -133,7 +147,7 @@ class OccupancyGrid(nn.Module):
             missing = MOST - middles.shape[-1]
             middles = torch.cat([middles, far[:, None].expand(-1, missing)], dim=-1)
             kept = pad(kept, (0, missing))
-        return self._intervals(middles, kept, kept.sum(-1), near, far)
+        return self._intervals(march, middles, kept, kept.sum(-1))
 
     def _occupied_at(self, positions: Float[Tensor, "*p 3"]) -> Bool[Tensor, "*p"]:
         """Return whether positions (metres, world) are within the grid, in an occupied cell."""
@@ -143,40 +157,37 @@ class OccupancyGrid(nn.Module):
             grid = replace(grid, contracted=None)
         return grid.at(self.occupied, positions) & grid.contains(positions)
 
-    def _busy_blocks(
-        self, rays: Rays, spacing: RaySpacing, near: Tensor, far: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _busy_blocks(self, march: _March) -> tuple[Tensor, Tensor]:
         """Return the ray and the start of each block of ``BLOCK`` steps that passes near an occupied cell, in order."""
+        near, far = march.near, march.far
         length = BLOCK * self.step
         count = int(((far - near).amax() / length).ceil()) if near.numel() else 0
         starts = near[:, None] + length * torch.arange(count, dtype=near.dtype, device=near.device)
-        positions = _at(rays, spacing.distance(starts + length / 2))
+        positions = _at(march.rays, march.spacing.distance(starts + length / 2))
         near_matter = self.grid.at(self.near_occupied, positions)
         ray, block = ((starts < far[:, None]) & near_matter).nonzero(as_tuple=True)
         return ray, starts.view(-1).index_select(0, ray * count + block)
 
-    def _padded(self, place: Tensor, ray: Tensor, near: Tensor, far: Tensor) -> RaySamples:
+    def _padded(self, march: _March, place: Float[Tensor, "n"], counts: Int[Tensor, "r"]) -> RaySamples:
         """Return the samples, packed at the front of their ray's row; rows are padded to the length of the longest."""
-        counts = torch.bincount(ray, minlength=len(near))
-        width = int(counts.amax()) if len(near) else 0
-        valid = torch.arange(width, device=ray.device) < counts[:, None]
-        middles = far[:, None].expand(-1, width).masked_scatter(valid, place)
-        return self._intervals(middles, valid, counts, near, far)
+        width = int(counts.amax()) if len(counts) else 0
+        valid = torch.arange(width, device=counts.device) < counts[:, None]
+        middles = march.far[:, None].expand(-1, width).masked_scatter(valid, place)
+        return self._intervals(march, middles, valid, counts)
 
     def _intervals(
-        self, middles: Tensor, valid: Tensor, counts: Tensor, near: Tensor, far: Tensor
-    ) -> RaySamples:
-        """Return intervals one step long around ``middles`` (r s), clipped to the rays; the first ``counts`` (r) are valid."""
-        number = torch.arange(middles.shape[-1], device=middles.device)
+        self, march: _March, middles: Float[Tensor, "r s"], valid: Bool[Tensor, "r s"], counts: Int[Tensor, "r"]
+    ) -> RaySamples:  # fmt: skip
+        """Return intervals one step long around ``middles``, clipped to the rays; the first ``counts`` are valid."""
+        near, far = march.near[:, None], march.far[:, None]
         half = self.step / 2
-        starts = torch.where(valid, torch.maximum(middles - half, near[:, None]), middles)
-        ends = torch.where(valid, torch.minimum(middles + half, far[:, None]), middles)
-        if (
-            self.bounds.contracted
-        ):  # the remainder of a step at the far end is short in the coordinate, but long in metres
-            rest = (number == counts[:, None] - 1) & (far[:, None] - ends < self.step)
-            ends = torch.where(rest, far[:, None], ends)
-        return RaySamples(starts, ends, valid)
+        starts = torch.where(valid, torch.maximum(middles - half, near), middles)
+        ends = torch.where(valid, torch.minimum(middles + half, far), middles)
+        if self.bounds.contracted:
+            # The remainder of a step at the far end is short in the coordinate, but long in metres.
+            last = torch.arange(middles.shape[-1], device=middles.device) == counts[:, None] - 1
+            ends = torch.where(last & (far - ends < self.step), far, ends)
+        return RaySamples(march.spacing.distance(starts), march.spacing.distance(ends), valid)
 
     def _loaded(self) -> None:
         self.observed = self.bounds.contracted or bool(self.density.any())
@@ -184,6 +195,31 @@ class OccupancyGrid(nn.Module):
 
     def _refresh(self) -> None:
         self.near_occupied.copy_(_dilated(self.occupied, self._reach))
+
+
+@dataclass(frozen=True, eq=False)
+class _March:
+    """Rays, and where steps along them begin and end in the coordinate of ``RaySpacing``."""
+
+    rays: Rays
+    exit: Float[Tensor, "r"]  # of their ``RaySpacing``, as is ``radius``
+    radius: float
+    near: Float[Tensor, "r"]
+    far: Float[Tensor, "r"]
+    offset: Float[Tensor, "r"]  # of the middle of the first step from ``near``, in steps
+
+    @property
+    def spacing(self) -> RaySpacing:
+        return RaySpacing(self.exit, self.radius)
+
+    def rows(self, numbers: Int[Tensor, "m"]) -> _March:
+        parts = (part.index_select(0, numbers) for part in (self.exit, self.near, self.far, self.offset))
+        exits, near, far, offset = parts
+        return _March(rows_of(self.rays, numbers), exits, self.radius, near, far, offset)
+
+
+def _counts(ray: Int[Tensor, "n"], march: _March) -> Int[Tensor, "r"]:
+    return torch.bincount(ray, minlength=len(march.near))
 
 
 @dataclass(frozen=True)
