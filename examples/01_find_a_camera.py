@@ -1,6 +1,6 @@
 """Train a small map in memory, and find one camera in it from a bad start.
 
-python examples/01_find_a_camera.py [--backend hashgrid] [--steps 200]
+python examples/01_find_a_camera.py [--backend hashgrid] [--steps 600]
 """
 
 import argparse
@@ -16,7 +16,7 @@ from bidnerf_core.training import Silent
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--backend", default="hashgrid")
-parser.add_argument("--steps", type=int, default=200)
+parser.add_argument("--steps", type=int, default=600)
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 given = parser.parse_args()
 

@@ -1,6 +1,6 @@
 """Several images whose poses are known relative to each other (from odometry, say) are localized together.
 
-    python examples/02_rig_of_views.py [--backend hashgrid] [--steps 200]
+    python examples/02_rig_of_views.py [--backend hashgrid] [--steps 600]
 
 The rays are divided among the images, so a step costs the same; the pose found is that of the last camera.
 """
@@ -18,7 +18,7 @@ from bidnerf_core.training import Silent
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--backend", default="hashgrid")
-parser.add_argument("--steps", type=int, default=200)
+parser.add_argument("--steps", type=int, default=600)
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 given = parser.parse_args()
 

@@ -1,6 +1,6 @@
 """Compare all installed backends on one scene, from the same starts: success, steps, time, memory, as a table and a picture.
 
-    python examples/05_compare_backends.py [--out compare-out] [--steps 300] [--trials 4]
+    python examples/05_compare_backends.py [--out compare-out] [--steps 600] [--trials 4]
     python examples/05_compare_backends.py --data DATA --maps MAP MAP ...
 
 Without maps, each backend is trained briefly on a scene in closed form, which is written to --out as a dataset.
@@ -20,7 +20,7 @@ parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.R
 parser.add_argument("--out", type=Path, default=Path("compare-out"))
 parser.add_argument("--maps", type=Path, nargs="+", default=[])
 parser.add_argument("--data", type=Path, help="dataset of what the maps show")
-parser.add_argument("--steps", type=int, default=300, help="of each training")
+parser.add_argument("--steps", type=int, default=600, help="of each training")
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 parser.add_argument("--trials", type=int, default=4, help="starts")
 given = parser.parse_args()

@@ -23,8 +23,9 @@ from bidnerf_hashgrid.occupancy import OccupancyGrid
 class HashGridConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
-    steps: Count = 1600  # steps of the optimizer
-    samples_per_step: Count = 65536  # approximate number of samples per step, which sets the number of rays
+    steps: Count = 6400  # steps of the optimizer
+    # approximate number of samples per step, which sets the number of rays; many small steps learn more than few large ones
+    samples_per_step: Count = 16384
     learning_rate: Positive = 1e-2  # learning rate of the tables; the networks have a quarter of it
     # steps from one update of the coarse field to the next; 0: it is not trained
     coarse_every: Annotated[int, Range(0)] = 4
