@@ -23,10 +23,10 @@ from bidnerf_hashgrid.occupancy import OccupancyGrid
 class HashGridConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
-    steps: Count = 6400  # steps of the optimizer
+    steps: Count = 4800  # steps of the optimizer
     # approximate number of samples per step, which sets the number of rays; many small steps learn more than few large ones
     samples_per_step: Count = 16384
-    learning_rate: Positive = 1e-2  # learning rate of the tables; the networks have a quarter of it
+    learning_rate: Positive = 2e-2  # learning rate of the tables; the networks have a quarter of it
     # steps from one update of the coarse field to the next; 0: it is not trained
     coarse_every: Annotated[int, Range(0)] = 4
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
