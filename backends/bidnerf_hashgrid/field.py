@@ -27,7 +27,7 @@ class FieldConfig(Settings):
     """Size of the field."""
 
     encoding: HashEncodingConfig = field(
-        default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=19, finest_resolution=768)
+        default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=18, finest_resolution=512)
     )
     width: Count = 64  # units of a hidden layer
     colour_layers: Count = 2  # hidden layers of the colour network

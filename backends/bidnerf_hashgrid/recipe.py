@@ -24,7 +24,7 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
     steps: Count = 4800  # steps of the optimizer
-    # approximate number of samples per step, which sets the number of rays; many small steps learn more than few large ones
+    # approximate number of samples per step, which sets the number of rays
     samples_per_step: Count = 16384
     learning_rate: Positive = 2e-2  # learning rate of the tables; the networks have a quarter of it
     # steps from one update of the coarse field to the next; 0: it is not trained
