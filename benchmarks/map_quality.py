@@ -8,8 +8,8 @@ exposure of a photo that it was not trained on: PSNR is measured as rendered, an
 channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
 measured at poses of the test frames that are refined with the map's landmarks, and on training frames at the poses in the map.
 Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the selection of samples that
-makes it fast, is compared with that on every fifth frame. ``--test-frames-only`` leaves out all but the quality on the test
-frames, for backends that take minutes to render an image. ``--without-depth`` withholds the measured depth of a
+makes it fast, is compared with that on every fifth frame. ``--test-frames-only`` leaves out training frames, poses by landmarks and
+``dense``, for backends that take minutes to render an image. ``--without-depth`` withholds the measured depth of a
 ``transforms_train.json`` from the training, and uses that of the test split for judging.
 """
 
@@ -180,7 +180,7 @@ def main() -> None:
     parser.add_argument(
         "--test-frames-only",
         action="store_true",
-        help="judge the test frames at their given poses, and nothing else",
+        help="judge the levels on test frames at their given poses only",
     )
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the record")
     parser.add_argument(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -100,7 +101,13 @@ def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
     """Return the rays, or the samples of the rays, at these (flattened) indices."""
     leading = of.near.dim() if isinstance(of, Rays) else of.starts.dim() - 1
     parts = (getattr(of, field.name) for field in fields(of))
-    return type(of)(*(part.reshape(-1, *part.shape[leading:]).index_select(0, index) for part in parts))
+    # A count instead of -1, which reshape cannot tell where the samples are none.
+    return type(of)(
+        *(
+            part.reshape(math.prod(part.shape[:leading]), *part.shape[leading:]).index_select(0, index)
+            for part in parts
+        )
+    )
 
 
 def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:
@@ -145,15 +152,16 @@ which only a part is dense; what lies behind the other part must be found as wel
 
 
 @runtime_checkable
-class SplittingSampler(Protocol):
+class SplittingSampler(RaySampler, Protocol):
     """A sampler that returns rays with many intervals apart, so that short rows are not padded to the length of long ones."""
 
-    def split(
+    def split_by_count(
         self, rays: Rays, count: int, jitter: Generator | None = None
     ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
         """Return the samples of all rays, the (flattened) indices of rays with more than ``count``, and the samples of these.
 
-        In the first, rows are at most ``count`` long. What they hold for the rays with more has no meaning.
+        The intervals are those of ``__call__`` with the same ``jitter``. In the first part, rows are at most ``count`` long,
+        and what they hold for the rays with more has no meaning. Called only where the host may wait for the device.
         """
         ...
 
@@ -163,11 +171,9 @@ def _split(
 ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
     """Return any sampler's intervals, gathered, as a ``SplittingSampler`` does."""
     if isinstance(sampler, SplittingSampler):
-        few, many, rest = sampler.split(rays, count, jitter)
+        few, many, rest = sampler.split_by_count(rays, count, jitter)
         return _gathered(few), many, _gathered(rest)
     rough = _gathered(sampler(rays, jitter))
-    if rough.starts.shape[-1] <= count:
-        return rough, torch.zeros(0, dtype=torch.long, device=rough.valid.device), rough
     many = (rough.valid.sum(-1) > count).reshape(-1).nonzero()[:, 0]
     return _first(rough, count), many, rows_of(rough, many)
 

@@ -96,6 +96,28 @@ def test_rays_without_depth_do_not_count() -> None:
     assert supervised_loss(rendering, batch, 2.0, 0.0)[0] == 0
 
 
+def test_the_loss_is_the_mean_over_measured_rays() -> None:
+    densities = torch.rand(3, 10, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    parts = [ray(density, measured) for density, measured in zip(densities, (3.25, 0.0, 1.5), strict=True)]
+    first, none, last = (float(ray_termination(*part)) for part in parts)
+    assert none == 0
+    renderings, batches = zip(*parts, strict=True)
+    samples = RaySamples(
+        *(torch.cat([getattr(r.samples, name) for r in renderings]) for name in ("starts", "ends", "valid"))
+    )
+    names = ("rgb", "distance", "opacity", "weights")
+    together = Rendering(*(torch.cat([getattr(r, name) for r in renderings]) for name in names), samples)
+    distance = torch.cat([batch.observed.distance for batch in batches])
+    rays = Rays(
+        *(
+            torch.cat([getattr(b.rays, name) for b in batches])
+            for name in ("origins", "directions", "near", "far")
+        )
+    )
+    found = ray_termination(together, tiny.black_batch(rays, distance))
+    assert float(found) == pytest.approx((first + last) / 2)
+
+
 @dataclass(frozen=True)
 class Few:
     """How much of a depth image is kept."""

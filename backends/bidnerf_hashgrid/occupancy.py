@@ -95,7 +95,7 @@ class OccupancyGrid(nn.Module):
         return self._padded(march, place, _counts(ray, march)).unflattened(rays.near.shape)
 
     @torch.no_grad()
-    def split(
+    def split_by_count(
         self, rays: Rays, count: int, jitter: Generator | None = None
     ) -> tuple[RaySamples, Int[Tensor, "m"], RaySamples]:
         """Return the intervals that ``__call__`` returns, apart for rays with many of them, see ``SplittingSampler``."""
@@ -117,15 +117,17 @@ class OccupancyGrid(nn.Module):
         offset = torch.full_like(near, 0.5)
         if jitter is not None:
             offset = torch.rand(near.shape, generator=jitter, device=jitter.device).to(near)
-        return _March(flat, spacing.exit, spacing.radius, near, far, offset)
+        return _March(flat, spacing, near, far, offset)
 
     def _occupied_steps(self, march: _March) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
         """Return the coordinates of all steps in occupied cells, and the numbers of their rays in ascending order."""
         ray, start = self._busy_blocks(march)
         steps = torch.arange(BLOCK, dtype=start.dtype, device=start.device) * self.step
-        offset, far, exits = (part.index_select(0, ray) for part in (march.offset, march.far, march.exit))
+        exits, far, offset = (
+            part.index_select(0, ray) for part in (march.spacing.exit, march.far, march.offset)
+        )
         place = start[:, None] + steps + (offset * self.step)[:, None]
-        positions = _at(march.rays, RaySpacing(exits, march.radius).distance(place), ray)
+        positions = _at(march.rays, RaySpacing(exits, march.spacing.radius).distance(place), ray)
         block, step = (self._occupied_at(positions) & (place < far[:, None])).nonzero(as_tuple=True)
         return place.view(-1).index_select(0, block * BLOCK + step), ray.index_select(0, block)
 
@@ -199,23 +201,20 @@ class OccupancyGrid(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class _March:
-    """Rays, and where steps along them begin and end in the coordinate of ``RaySpacing``."""
+    """Rays, and where steps along them begin and end."""
 
     rays: Rays
-    exit: Float[Tensor, "r"]  # of their ``RaySpacing``, as is ``radius``
-    radius: float
-    near: Float[Tensor, "r"]
+    spacing: RaySpacing
+    near: Float[Tensor, "r"]  # in the coordinate of ``spacing``, unlike those of ``rays``
     far: Float[Tensor, "r"]
     offset: Float[Tensor, "r"]  # of the middle of the first step from ``near``, in steps
 
-    @property
-    def spacing(self) -> RaySpacing:
-        return RaySpacing(self.exit, self.radius)
-
     def rows(self, numbers: Int[Tensor, "m"]) -> _March:
-        parts = (part.index_select(0, numbers) for part in (self.exit, self.near, self.far, self.offset))
-        exits, near, far, offset = parts
-        return _March(rows_of(self.rays, numbers), exits, self.radius, near, far, offset)
+        exits, near, far, offset = (
+            part.index_select(0, numbers) for part in (self.spacing.exit, self.near, self.far, self.offset)
+        )
+        spacing = RaySpacing(exits, self.spacing.radius)
+        return _March(rows_of(self.rays, numbers), spacing, near, far, offset)
 
 
 def _counts(ray: Int[Tensor, "n"], march: _March) -> Int[Tensor, "r"]:
