@@ -26,7 +26,8 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
     steps: Count = 4800  # steps of the optimizer
     # approximate number of samples per step, which sets the number of rays
     samples_per_step: Count = 16384
-    learning_rate: Positive = 2e-2  # learning rate of the tables; the networks have a quarter of it
+    # learning rate of the tables, half of it in contracted scenes; the networks have a quarter of it
+    learning_rate: Positive = 2e-2
     # steps from one update of the coarse field to the next; 0: it is not trained
     coarse_every: Annotated[int, Range(0)] = 4
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
@@ -51,17 +52,17 @@ class HashGridConfig(FieldConfig, SupervisionConfig):
             )
 
 
-def pruning(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
-    """Return the config with slower pruning where the scene is contracted.
+def adapted(config: HashGridConfig, bounds: SceneBounds) -> HashGridConfig:
+    """Return the config with slower pruning, and half the learning rate, where the scene is contracted.
 
     There, a ray crosses many cells, hardly any of which depth or silhouettes have shown to be empty, and a cell that is
-    pruned too early is rarely found again.
+    pruned too early is rarely found again. At the full rate, matter appears in front of cameras that few others overlap.
     """
     if not bounds.contracted:
         return config
     return replace(
-        config, prune_fade=config.prune_fade**0.4, prune_threshold=config.prune_threshold / 5,
-        grow_until=max(config.grow_until, 0.9),
+        config, learning_rate=config.learning_rate / 2, prune_fade=config.prune_fade**0.4,
+        prune_threshold=config.prune_threshold / 5, grow_until=max(config.grow_until, 0.9),
     )  # fmt: skip
 
 
@@ -70,8 +71,8 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
     if config.carve and report.resume() is None:
         for grid in (field.occupancy, field.coarse_sampler):
             grid.restrict(occupied_voxels(views, grid.grid))
+    config = adapted(config, field.bounds)
     supervision = Supervision(views, field.bounds, config, device_of(field))
-    pruned = pruning(config, field.bounds)
     groups = [
         {"params": list(field.encoding.parameters()), "lr": config.learning_rate},
         {
@@ -89,7 +90,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         count = max(1, min(config.rays_at_most, affordable))
         batch = supervision.draw(count, generator)
         rendering = render(level, batch.rays, batch.background, generator)
-        _update(grid, batch, rendering, step, pruned)
+        _update(grid, batch, rendering, step, config)
         loss, mse = supervision.loss(rendering, batch)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
