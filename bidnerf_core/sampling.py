@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -101,13 +100,8 @@ def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
     """Return the rays, or the samples of the rays, at these (flattened) indices."""
     leading = of.near.dim() if isinstance(of, Rays) else of.starts.dim() - 1
     parts = (getattr(of, field.name) for field in fields(of))
-    # A count instead of -1, which reshape cannot tell where the samples are none.
-    return type(of)(
-        *(
-            part.reshape(math.prod(part.shape[:leading]), *part.shape[leading:]).index_select(0, index)
-            for part in parts
-        )
-    )
+    count = (of.near if isinstance(of, Rays) else of.starts).shape[:leading].numel()
+    return type(of)(*(part.reshape(count, *part.shape[leading:]).index_select(0, index) for part in parts))
 
 
 def _either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:
