@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 import tiny
+from bidnerf_core.concentrated import Concentrated, SplittingSampler
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.rendering import render
-from bidnerf_core.sampling import Concentrated, SplittingSampler
 from bidnerf_core.voxel_grid import VoxelGrid
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
