@@ -8,9 +8,9 @@ exposure of a photo that it was not trained on: PSNR is measured as rendered, an
 channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
 measured at poses of the test frames that are refined with the map's landmarks, and on training frames at the poses in the map.
 Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the selection of samples that
-makes it fast, is compared with that on every fifth frame. ``--test-frames-only`` leaves out training frames, poses by landmarks and
-``dense``, for backends that take minutes to render an image. ``--without-depth`` withholds the measured depth of a
-``transforms_train.json`` from the training, and uses that of the test split for judging.
+makes it fast, is compared with that on every fifth frame. ``--test-frames-only`` leaves out training frames, poses by
+landmarks and ``dense``, for backends that take minutes to render an image. ``--without-depth`` withholds the measured depth of
+a ``transforms_train.json`` from the training, and uses that of the test split for judging.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from torch.nn.functional import max_pool1d, pad
 
 from bidnerf_core.field import RadianceField, Rays, RaySampler, RaySamples
 from bidnerf_core.rendering import query_samples, rendering_weights
-from bidnerf_core.sampling import either, gathered, parts, rows_of
+from bidnerf_core.sampling import either, gathered, rows_of
 from bidnerf_core.waiting import may_wait
 
 EVEN_SHARE = 0.25
@@ -73,7 +73,7 @@ class Concentrated:
         found = self._concentrated(rows_of(rays, many), rough, jitter)
         merged = (
             pad(old, (0, self.count - old.shape[-1])).reshape(-1, self.count).index_copy(0, many, new)
-            for old, new in zip(parts(few), parts(found), strict=True)
+            for old, new in zip(few.parts, found.parts, strict=True)
         )
         return RaySamples(*merged).unflattened(rays.near.shape)
 
@@ -93,7 +93,7 @@ class Concentrated:
 
 def _first(samples: RaySamples, count: int) -> RaySamples:
     """Return the first ``count`` intervals of each ray."""
-    return RaySamples(*(part[..., :count] for part in parts(samples)))
+    return RaySamples(*(part[..., :count] for part in samples.parts))
 
 
 def concentrated(

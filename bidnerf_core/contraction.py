@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -36,6 +36,10 @@ class RaySpacing:
 
     exit: Float[Tensor, "*r"]  # metres along the ray
     radius: float  # metres: half the side of the uncontracted cube; infinite where nothing is contracted
+
+    def rows(self, numbers: Int[Tensor, "m"]) -> RaySpacing:
+        """Return the spacing of the rays with these numbers, of rays (r) along one axis."""
+        return RaySpacing(self.exit.index_select(0, numbers), self.radius)
 
     def place(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s"]:
         """Return the coordinate at a distance along the ray (metres)."""

@@ -43,10 +43,14 @@ class RaySamples:
     def middles(self) -> Float[Tensor, "*r s"]:
         return (self.starts + self.ends) / 2
 
+    @property
+    def parts(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The starts, the ends, and whether they are valid."""
+        return self.starts, self.ends, self.valid
+
     def unflattened(self, shape: torch.Size) -> RaySamples:
         """Return the samples of rays that were flattened, in their former ``shape``."""
-        width = self.starts.shape[-1]
-        return RaySamples(*(part.reshape(*shape, width) for part in (self.starts, self.ends, self.valid)))
+        return RaySamples(*(part.reshape(*shape, part.shape[-1]) for part in self.parts))
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,10 +98,10 @@ OfRays = TypeVar("OfRays", Rays, RaySamples)
 
 def rows_of(of: OfRays, index: Int[Tensor, "n"]) -> OfRays:
     """Return the rays, or the samples of the rays, at these (flattened) indices."""
-    leading = of.near.dim() if isinstance(of, Rays) else of.starts.dim() - 1
+    shape = of.near.shape if isinstance(of, Rays) else of.starts.shape[:-1]
     parts = (getattr(of, field.name) for field in fields(of))
-    count = (of.near if isinstance(of, Rays) else of.starts).shape[:leading].numel()
-    return type(of)(*(part.reshape(count, *part.shape[leading:]).index_select(0, index) for part in parts))
+    flat = (part.reshape(shape.numel(), *part.shape[len(shape) :]) for part in parts)
+    return type(of)(*(part.index_select(0, index) for part in flat))
 
 
 def either(which: Bool[Tensor, "*r"], yes: RaySamples, no: RaySamples) -> RaySamples:
@@ -136,11 +136,6 @@ class Importance:
             return _cut(rough, *inverse_transform(rough, weights, self.count, jitter))
 
 
-def parts(samples: RaySamples) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the starts and ends of the samples (*r s), and whether they are valid."""
-    return samples.starts, samples.ends, samples.valid
-
-
 def inverse_transform(
     samples: RaySamples, weights: Float[Tensor, "*r s"], count: int, jitter: Generator | None
 ) -> tuple[Float[Tensor, "*r n"], Int[Tensor, "*r n"]]:
@@ -167,7 +162,7 @@ def inverse_transform(
 
 def gathered(samples: RaySamples) -> RaySamples:
     """Return the samples with valid intervals first, and without overlaps from rounding."""
-    starts, ends, valid = parts(samples)
+    starts, ends, valid = samples.parts
     # Sorting costs more than all the rest; most samplers return the valid intervals first.
     if not (may_wait(valid.device) and bool((valid[..., 1:] <= valid[..., :-1]).all())):
         order = (~valid).sort(dim=-1, stable=True).indices

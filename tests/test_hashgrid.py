@@ -13,8 +13,9 @@ from torch import Tensor
 import tiny
 from bidnerf_core.concentrated import Concentrated, SplittingSampler
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, RaySamples, SceneBounds
+from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
 from bidnerf_core.rendering import render
+from bidnerf_core.sampling import Resampled
 from bidnerf_core.voxel_grid import VoxelGrid
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
@@ -112,18 +113,6 @@ def test_samples_are_sorted_disjoint_and_within_the_limits(jitter: bool, dtype: 
 def test_rays_with_many_samples_are_concentrated_as_without_splitting(
     jitter: bool, shape: tuple[int, ...], bounds: SceneBounds
 ) -> None:
-    @dataclass(frozen=True)
-    class Whole:
-        """The same density, with a sampler that cannot split."""
-
-        inner: GridDensity
-
-        def sampler(self, rays: Rays, jitter: torch.Generator | None = None) -> RaySamples:
-            return self.inner.sampler(rays, jitter)
-
-        def query(self, positions: Tensor, directions: Tensor) -> FieldValues:
-            return self.inner.query(positions, directions)
-
     every, count = random_rays(), math.prod(shape)
     rays = bounds.rays(*(part[:count].reshape(*shape, 3) for part in (every.origins, every.directions)))
     grid = OccupancyGrid(bounds, RESOLUTION)
@@ -131,8 +120,8 @@ def test_rays_with_many_samples_are_concentrated_as_without_splitting(
     grid.density.uniform_(0, 30, generator=torch.Generator().manual_seed(4))
     density = GridDensity(grid)
     found = []
-    for guide in (density, Whole(density)):
-        assert isinstance(guide.sampler, SplittingSampler) == (guide is density)
+    for guide, splits in ((density, True), (Resampled(density, grid.__call__), False)):
+        assert isinstance(guide.sampler, SplittingSampler) == splits
         draws = torch.Generator().manual_seed(5) if jitter else None
         found.append(Concentrated(guide, 8)(rays, draws))
     if shape:

@@ -102,19 +102,15 @@ def test_the_loss_is_the_mean_over_measured_rays() -> None:
     first, none, last = (float(ray_termination(*part)) for part in parts)
     assert none == 0
     renderings, batches = zip(*parts, strict=True)
-    samples = RaySamples(
-        *(torch.cat([getattr(r.samples, name) for r in renderings]) for name in ("starts", "ends", "valid"))
+    samples = RaySamples(*map(torch.cat, zip(*(r.samples.parts for r in renderings), strict=True)))
+    weights, distance = (
+        torch.cat([getattr(r, name) for r in renderings]) for name in ("weights", "distance")
     )
-    names = ("rgb", "distance", "opacity", "weights")
-    together = Rendering(*(torch.cat([getattr(r, name) for r in renderings]) for name in names), samples)
-    distance = torch.cat([batch.observed.distance for batch in batches])
-    rays = Rays(
-        *(
-            torch.cat([getattr(b.rays, name) for b in batches])
-            for name in ("origins", "directions", "near", "far")
-        )
-    )
-    found = ray_termination(together, tiny.black_batch(rays, distance))
+    together = Rendering(torch.zeros(3, 3), distance, weights.sum(-1), weights, samples)
+    measured = torch.cat([batch.observed.distance for batch in batches])
+    zero = measured.new_zeros(3, 3)
+    rays = Rays(zero, zero, zero[:, 0], zero[:, 0] + 5)
+    found = ray_termination(together, tiny.black_batch(rays, measured))
     assert float(found) == pytest.approx((first + last) / 2)
 
 

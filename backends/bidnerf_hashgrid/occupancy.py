@@ -123,11 +123,9 @@ class OccupancyGrid(nn.Module):
         """Return the coordinates of all steps in occupied cells, and the numbers of their rays in ascending order."""
         ray, start = self._busy_blocks(march)
         steps = torch.arange(BLOCK, dtype=start.dtype, device=start.device) * self.step
-        exits, far, offset = (
-            part.index_select(0, ray) for part in (march.spacing.exit, march.far, march.offset)
-        )
+        far, offset = (part.index_select(0, ray) for part in (march.far, march.offset))
         place = start[:, None] + steps + (offset * self.step)[:, None]
-        positions = _at(march.rays, RaySpacing(exits, march.spacing.radius).distance(place), ray)
+        positions = _at(march.rays, march.spacing.rows(ray).distance(place), ray)
         block, step = (self._occupied_at(positions) & (place < far[:, None])).nonzero(as_tuple=True)
         return place.view(-1).index_select(0, block * BLOCK + step), ray.index_select(0, block)
 
@@ -210,11 +208,9 @@ class _March:
     offset: Float[Tensor, "r"]  # of the middle of the first step from ``near``, in steps
 
     def rows(self, numbers: Int[Tensor, "m"]) -> _March:
-        exits, near, far, offset = (
-            part.index_select(0, numbers) for part in (self.spacing.exit, self.near, self.far, self.offset)
-        )
-        spacing = RaySpacing(exits, self.spacing.radius)
-        return _March(rows_of(self.rays, numbers), spacing, near, far, offset)
+        """Return the march along the rays with these numbers."""
+        near, far, offset = (part.index_select(0, numbers) for part in (self.near, self.far, self.offset))
+        return _March(rows_of(self.rays, numbers), self.spacing.rows(numbers), near, far, offset)
 
 
 def _counts(ray: Int[Tensor, "n"], march: _March) -> Int[Tensor, "r"]:

@@ -39,15 +39,13 @@ def ray_termination(rendering: Rendering, batch: TrainingBatch) -> Float[Tensor,
     the camera. Where the distance comes from a landmark, the mean is also taken over its normal distribution, so that weight
     within its standard deviation is hardly moved.
     """
-    index = batch.observed.measured.nonzero()[
-        :, 0
-    ]  # where no sensor measured depth, few rays have a landmark
-    distance, deviation, weights, middles, opacity = (
+    # Where no sensor measured depth, few rays have a landmark.
+    index = batch.observed.measured.nonzero()[:, 0]
+    distance, deviation = (part.index_select(0, index) for part in (batch.observed.distance, batch.deviation))
+    weights, middles, opacity = (
         part.index_select(0, index)
-        for part in (
-            batch.observed.distance, batch.deviation, rendering.weights, rendering.samples.middles, rendering.opacity
-        )
-    )  # fmt: skip
+        for part in (rendering.weights, rendering.samples.middles, rendering.opacity)
+    )
     away = (weights * expected_distance(middles - distance[:, None], deviation[:, None])).sum(-1)
     missing = (1 - opacity) * distance
     return (away + missing).sum() / max(len(index), 1)
