@@ -159,15 +159,16 @@ def _add_position_gradient(
         total += (slopes * scaled[:, :, None]).sum((0, 1))
 
 
-def _add_table_gradient(
+def _write_table_gradient(
     points: Float[Tensor, "3 n"],
     gradient: Float[Tensor, "k c w"],
     group: LevelGroup,
     smooth: bool,
     table: Float[Tensor, "t f"],
 ) -> None:
-    """Backpropagate the gradient of the levels' features to the table's entries, and add the result to ``table``."""
+    """Backpropagate the gradient of the levels' features to the table's entries, and write the result to ``table``."""
     unit = _unit(table.shape[1])
+    table.zero_()
     for chunk in _chunks(points, group):
         wide = slice(chunk.start * unit, chunk.stop * unit)
         terms, fraction = group.vertices(points[:, chunk])
@@ -239,8 +240,8 @@ class _Encode(torch.autograd.Function):
             if not any(needed[group.span]):
                 to_tables += [None] * len(group)
                 continue
-            table = points.new_zeros(sum(group.entries), ctx.features)
-            tasks.append(partial(_add_table_gradient, points, rows[group.span], group, ctx.smooth, table))
+            table = points.new_empty(sum(group.entries), ctx.features)
+            tasks.append(partial(_write_table_gradient, points, rows[group.span], group, ctx.smooth, table))
             to_tables += table.split(group.entries)
         concurrently(tasks, threads_for(points.shape[1], points.device))
         found = [part if wanted else None for part, wanted in zip(to_tables, needed, strict=True)]

@@ -17,6 +17,7 @@ from bidnerf_core.settings import Count, NotNegative, Positive, Range
 from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch, fit
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
+from bidnerf_hashgrid.threads import pools_only
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         loss, mse = supervision.loss(rendering, batch)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
-    fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
+    with pools_only():
+        fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
 
 
 def _update(
