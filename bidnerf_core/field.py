@@ -113,6 +113,9 @@ class SceneBounds:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour seen where a ray meets nothing
     # Whether there is matter beyond the box, as far as ``far``: fields contract what lies outside of the box's cube.
     contracted: bool = False
+    # Metres: width of what a pixel of the images shows at the usual distance, which nothing is worth modelling much finer than;
+    # 0: unknown.
+    footprint: float = 0.0
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
@@ -121,6 +124,8 @@ class SceneBounds:
             )
         if not 0 <= self.near < self.far:
             raise InputError(f"scene bounds: expected 0 <= near < far, got near {self.near}, far {self.far}")
+        if not self.footprint >= 0:
+            raise InputError(f"scene bounds: footprint is {self.footprint}, expected 0 or more")
         largest = max(map(abs, (*self.lower, *self.upper, self.far)))
         if not largest <= LARGEST_LENGTH:
             raise InputError(

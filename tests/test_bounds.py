@@ -71,6 +71,7 @@ def test_bounds_by_landmarks_have_no_unit() -> None:
     assert there.far == pytest.approx(50 * here.far, rel=1e-4)
     assert there.lower == pytest.approx([50 * x for x in here.lower], rel=1e-4)
     assert there.upper == pytest.approx([50 * x for x in here.upper], rel=1e-4)
+    assert there.footprint == pytest.approx(50 * here.footprint, rel=1e-4)
 
 
 def test_a_few_landmarks_give_no_box() -> None:
@@ -82,7 +83,34 @@ def test_a_few_landmarks_give_no_box() -> None:
         if view.landmarks is not None
     ]
     bare = [replace(view, landmarks=None) for view in few]
-    assert estimate_bounds(few) == estimate_bounds(bare)
+    found, without = estimate_bounds(few), estimate_bounds(bare)
+    assert replace(found, footprint=without.footprint) == without
+
+
+@pytest.mark.parametrize("rows", [48, 1])
+def test_measured_depth_tells_what_a_pixel_shows(rows: int) -> None:
+    """The focal length is 60 px, and the wall three metres away."""
+    assert estimate_bounds([wall(rows), wall(0)]).footprint == pytest.approx(3 / 60)
+
+
+def test_landmarks_tell_what_a_pixel_shows() -> None:
+    views = captured()
+    nearest = min(float(v.landmarks.distance.min()) for v in views if v.landmarks is not None)
+    farthest = max(float(v.landmarks.distance.max()) for v in views if v.landmarks is not None)
+    focal = views[0].frame.intrinsics.fx
+    assert nearest / focal < estimate_bounds(views).footprint < farthest / focal
+
+
+def test_without_distances_a_pixel_is_taken_to_show_the_middle_of_the_scene() -> None:
+    """The cameras are 3.5 from the origin, near which the middle of the scene lies."""
+    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views()]
+    assert estimate_bounds(bare).footprint == pytest.approx(3.5 / tiny.CAMERA.fx, rel=0.2)
+
+
+def test_a_camera_amid_the_scene_is_taken_to_show_its_walls() -> None:
+    seen = replace(wall(0), T_ref_camera=SE3.identity())
+    bounds = estimate_bounds([seen])
+    assert bounds.footprint >= bounds.side / 2 / CAMERA.fx
 
 
 def _larger(view: View, scale: float) -> View:

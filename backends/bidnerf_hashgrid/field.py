@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from bidnerf_core.concentrated import Concentrated
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.settings import Count, Range, Settings
+from bidnerf_core.settings import Count, NotNegative, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.networks import log_density_and_rgb
 from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
@@ -27,8 +27,10 @@ class FieldConfig(Settings):
     """Size of the field."""
 
     encoding: HashEncodingConfig = field(
-        default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=18, finest_resolution=512)
+        default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=18, finest_resolution=1024)
     )
+    # cells of the finest level across what a pixel shows, where finest_resolution allows as many; 0: finest_resolution
+    cells_per_pixel: NotNegative = 1.5
     width: Count = 64  # units of a hidden layer
     colour_layers: Count = 2  # hidden layers of the colour network
     # number of features that the density network passes on to the colour network
@@ -55,7 +57,7 @@ class HashGridField(nn.Module):
         self.config = config
         self.bounds = bounds
         self.side = max(bounds.size)
-        self.encoding = HashEncoding(_scaled(config.encoding, 2 if bounds.contracted else 1))
+        self.encoding = HashEncoding(_resolving(config, bounds))
         self.geometry = nn.Sequential(
             nn.Linear(self.encoding.width, config.width),
             nn.ReLU(),
@@ -113,9 +115,15 @@ class HashGridField(nn.Module):
         return encoded
 
 
-def _scaled(encoding: HashEncodingConfig, factor: int) -> HashEncodingConfig:
-    """Return an encoding whose finest level is ``factor`` times as fine, since the box is only part of a contracted cube."""
-    return replace(encoding, finest_resolution=factor * encoding.finest_resolution)
+def _resolving(config: FieldConfig, bounds: SceneBounds) -> HashEncodingConfig:
+    """Return an encoding that is as fine as the images: finer levels would collide in their tables to no purpose."""
+    encoding = config.encoding
+    finest = encoding.finest_resolution
+    if config.cells_per_pixel > 0 and bounds.footprint > 0:
+        wanted = config.cells_per_pixel * bounds.side / bounds.footprint
+        finest = max(encoding.base_resolution, min(finest, wanted))
+    # The box is only the middle half of a contracted cube.
+    return replace(encoding, finest_resolution=finest * (2 if bounds.contracted else 1))
 
 
 def _hidden(widths: Sequence[int]) -> list[nn.Module]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.carving.boxes import MARGIN, AxisBox, corner, grown, rays_of
+from bidnerf_core.carving.footprint import footprint
 from bidnerf_core.carving.hull import carved_box, has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
@@ -33,7 +34,8 @@ ONE_PLACE = 1.0  # extent (scene units) assumed for the positions where all of t
 def estimate_bounds(
     views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> SceneBounds:
-    """Return the box that holds what ``views`` (poses in the world) show, and its range of distances from their cameras.
+    """Return the box that holds what ``views`` (poses in the world) show, its range of distances from their cameras, and how
+    finely they resolve it.
 
     With depth (dense in half of the views, or any if there are no silhouettes) the box holds the middle 99.8 % of the
     measured points along each axis. With silhouettes (alpha) it is that of the visual hull. With colour only, it holds the
@@ -67,7 +69,7 @@ def _with_far(
 ) -> SceneBounds:
     """Return bounds that reach to the box's farthest corner or, where the scene is contracted, well beyond it."""
     far = _farthest(views, box) * (FAR_BEYOND if contracted else FAR_MARGIN)
-    return SceneBounds(corner(box[0]), corner(box[1]), near, far, background, contracted)
+    return _bounds(views, box, near, far, background, contracted)
 
 
 def _around_landmarks(views: Sequence[View], background: tuple[float, float, float]) -> SceneBounds:
@@ -80,7 +82,15 @@ def _around_landmarks(views: Sequence[View], background: tuple[float, float, flo
     box = grown(points[cut], points[last - cut], distances[0].item() / 100)
     near = distances[round(LANDMARKS_NEARER * last)].item() / 2
     far = max(distances[round((1 - OUTLIERS) * last)].item(), _farthest(views, box)) * FAR_BEYOND
-    return SceneBounds(corner(box[0]), corner(box[1]), near, far, background, True)
+    return _bounds(views, box, near, far, background, True)
+
+
+def _bounds(
+    views: Sequence[View], box: AxisBox, near: float, far: float, background: tuple[float, float, float], contracted: bool
+) -> SceneBounds:  # fmt: skip
+    return SceneBounds(
+        corner(box[0]), corner(box[1]), near, far, background, contracted, footprint(views, box)
+    )
 
 
 def _landmarks_of(view: View) -> int:
