@@ -58,10 +58,10 @@ def test_torch_has_its_threads_back_after_an_error() -> None:
 
 @pytest.mark.parametrize(
     ("footprint", "contracted", "finest"),
-    [(0.02, False, 150), (0.02, True, 300), (0.001, False, 1024), (1.0, False, 16), (0.0, False, 1024)],
+    [(0.02, False, 250), (0.02, True, 500), (0.001, False, 1024), (1.0, False, 16), (0.0, False, 1024)],
 )
 def test_the_finest_level_follows_the_images(footprint: float, contracted: bool, finest: int) -> None:
-    """The scene is 2 wide; 1.5 cells are as wide as what a pixel shows, from the coarsest level's 16 cells to 1024 at most."""
+    """The scene is 2 wide; 2.5 cells are as wide as what a pixel shows, from the coarsest level's 16 cells to 1024 at most."""
     bounds = replace(BOX, footprint=footprint, contracted=contracted)
     assert backend.build(HashGridConfig(), bounds).encoding.levels[-1].resolution == finest
     fixed = backend.build(HashGridConfig(cells_per_pixel=0), bounds)
