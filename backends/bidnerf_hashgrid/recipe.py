@@ -24,7 +24,7 @@ from bidnerf_hashgrid.threads import pools_only
 class HashGridConfig(FieldConfig, SupervisionConfig):
     """Size and training of the field. With the defaults, training takes a few minutes on a small CPU."""
 
-    steps: Count = 4800  # steps of the optimizer
+    steps: Count = 6400  # steps of the optimizer
     # approximate number of samples per step, which sets the number of rays
     samples_per_step: Count = 16384
     # learning rate of the tables, half of it in contracted scenes; the networks have a quarter of it
