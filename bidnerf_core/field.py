@@ -113,8 +113,7 @@ class SceneBounds:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour seen where a ray meets nothing
     # Whether there is matter beyond the box, as far as ``far``: fields contract what lies outside of the box's cube.
     contracted: bool = False
-    # Metres: width of what a pixel of the images shows at the usual distance, which nothing is worth modelling much finer than;
-    # 0: unknown.
+    # Metres: width of what a pixel of the images shows at the usual distance, which tells how fine a field needs to be; 0: unknown.
     footprint: float = 0.0
 
     def __post_init__(self) -> None:
@@ -126,7 +125,7 @@ class SceneBounds:
             raise InputError(f"scene bounds: expected 0 <= near < far, got near {self.near}, far {self.far}")
         if not self.footprint >= 0:
             raise InputError(f"scene bounds: footprint is {self.footprint}, expected 0 or more")
-        largest = max(map(abs, (*self.lower, *self.upper, self.far)))
+        largest = max(map(abs, (*self.lower, *self.upper, self.far, self.footprint)))
         if not largest <= LARGEST_LENGTH:
             raise InputError(
                 f"scene bounds: {largest:g} m is too large, expected at most {LARGEST_LENGTH:g} m"

@@ -1,5 +1,7 @@
 """Which scenes are contracted, and the bounds that landmarks give where images have colour only."""
 
+import math
+import statistics
 from dataclasses import replace
 
 import pytest
@@ -8,6 +10,7 @@ import torch
 import tiny
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.errors import InputError
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
 from landmark_scene import Points, ring
 
@@ -83,34 +86,59 @@ def test_a_few_landmarks_give_no_box() -> None:
         if view.landmarks is not None
     ]
     bare = [replace(view, landmarks=None) for view in few]
-    found, without = estimate_bounds(few), estimate_bounds(bare)
-    assert replace(found, footprint=without.footprint) == without
+    assert estimate_bounds(few) == estimate_bounds(bare)
+
+
+def walls(*distances: float, rows: int = 48) -> list[View]:
+    """Views of walls at these distances, each with a nearer object in a quarter of it, through a lens with unequal focal lengths."""
+    camera = replace(CAMERA, fx=50.0, fy=70.0)
+    views = []
+    for distance in distances:
+        depth = torch.full((48, 64), distance)
+        depth[:, :16] = distance / 2
+        depth[rows:] = 0
+        views.append(View(Frame(f"{distance}", torch.zeros(48, 64, 3), camera, depth), SE3.identity()))
+    return views
 
 
 @pytest.mark.parametrize("rows", [48, 1])
 def test_measured_depth_tells_what_a_pixel_shows(rows: int) -> None:
-    """The focal length is 60 px, and the wall three metres away."""
-    assert estimate_bounds([wall(rows), wall(0)]).footprint == pytest.approx(3 / 60)
+    """The mean focal length is 60 px, and the middle one of three walls is two metres away."""
+    assert estimate_bounds(walls(1.0, 2.0, 9.0, rows=rows)).footprint == pytest.approx(2 / 60)
 
 
 def test_landmarks_tell_what_a_pixel_shows() -> None:
     views = captured()
-    nearest = min(float(v.landmarks.distance.min()) for v in views if v.landmarks is not None)
-    farthest = max(float(v.landmarks.distance.max()) for v in views if v.landmarks is not None)
-    focal = views[0].frame.intrinsics.fx
-    assert nearest / focal < estimate_bounds(views).footprint < farthest / focal
+    medians = [float(v.landmarks.distance.median()) for v in views if v.landmarks is not None]
+    expected = statistics.median(medians) / views[0].frame.intrinsics.fx
+    assert estimate_bounds(views).footprint == pytest.approx(expected)
 
 
 def test_without_distances_a_pixel_is_taken_to_show_the_middle_of_the_scene() -> None:
-    """The cameras are 3.5 from the origin, near which the middle of the scene lies."""
     bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views()]
-    assert estimate_bounds(bare).footprint == pytest.approx(3.5 / tiny.CAMERA.fx, rel=0.2)
+    bounds = estimate_bounds(bare)
+    away = [math.dist(view.T_ref_camera.translation.tolist(), bounds.centre) for view in bare]
+    assert bounds.footprint == pytest.approx(statistics.median(away) / tiny.CAMERA.fx, rel=1e-4)
 
 
-def test_a_camera_amid_the_scene_is_taken_to_show_its_walls() -> None:
-    seen = replace(wall(0), T_ref_camera=SE3.identity())
-    bounds = estimate_bounds([seen])
+def test_a_camera_amid_the_scene_is_taken_to_show_what_is_half_its_side_away() -> None:
+    bounds = estimate_bounds([wall(0)])
     assert bounds.footprint >= bounds.side / 2 / CAMERA.fx
+
+
+def test_a_single_wrong_distance_does_not_tell_what_pixels_show() -> None:
+    """Silhouettes give the box, so they also tell the distance; and so do the cameras where there are too few landmarks."""
+    bare = [replace(view, frame=replace(view.frame, depth=None)) for view in tiny.views()]
+    far = torch.zeros(tiny.SIZE, tiny.SIZE)
+    far[0, 0] = 500.0
+    astray = replace(bare[0], frame=replace(bare[0].frame, depth=far))
+    assert estimate_bounds([astray, *bare[1:]]) == estimate_bounds(bare)
+
+
+@pytest.mark.parametrize("footprint", [-1.0, math.nan, math.inf])
+def test_a_footprint_that_is_no_length_is_refused(footprint: float) -> None:
+    with pytest.raises(InputError):
+        replace(estimate_bounds([wall(48)]), footprint=footprint)
 
 
 def _larger(view: View, scale: float) -> View:

@@ -440,6 +440,15 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
     assert_refused(bidnerf(*resume, interrupted), 1, str(interrupted), "'hashgird'", "installed: ")
 
 
+def test_settings_are_compared_one_by_one_with_those_of_the_interrupted_training(
+    bidnerf: Run, shared: Path, interrupted: Path
+) -> None:
+    """An option for one setting of the encoding says nothing about the others, whose defaults may have changed since."""
+    resume = ["train", shared / "data", "--resume", "--no-bake", "--out", interrupted]
+    assert_refused(bidnerf(*resume, "--levels", "4"), 2, "begun with levels 3, got 4")
+    assert bidnerf(*resume, "--levels", "3").status == 0
+
+
 # Places that cannot be written.
 
 

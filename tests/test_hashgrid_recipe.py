@@ -42,18 +42,26 @@ def test_the_number_of_threads_does_not_change_what_is_learned() -> None:
 
 def test_pools_keep_the_threads_that_torch_gives_up() -> None:
     torch.set_num_threads(3)
-    with pools_only():
+    with pools_only(CPU):
         assert torch.get_num_threads() == 1
         assert threads_for(THREADED, CPU) == 3
         assert threads_for(THREADED - 1, CPU) == 1
     assert torch.get_num_threads() == 3
 
 
-def test_torch_has_its_threads_back_after_an_error() -> None:
+def test_pools_follow_torch_again_after_an_error() -> None:
     torch.set_num_threads(3)
-    with pytest.raises(KeyboardInterrupt), pools_only():
+    with pytest.raises(KeyboardInterrupt), pools_only(CPU):
         raise KeyboardInterrupt
-    assert torch.get_num_threads() == threads_for(THREADED, CPU) == 3
+    assert torch.get_num_threads() == 3
+    torch.set_num_threads(2)
+    assert threads_for(THREADED, CPU) == 2
+
+
+def test_on_a_gpu_torch_keeps_its_threads() -> None:
+    torch.set_num_threads(3)
+    with pools_only(torch.device("cuda")):
+        assert torch.get_num_threads() == 3
 
 
 @pytest.mark.parametrize(

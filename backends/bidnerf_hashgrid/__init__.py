@@ -12,5 +12,5 @@ backend = RecipeBackend(
     HashGridField,
     train,
     # For small, simple scenes: about a minute on two cores.
-    quick=HashGridConfig(steps=400, colour_layers=1, coarse_every=8),
+    quick=HashGridConfig(steps=800, colour_layers=1, coarse_every=8),
 )

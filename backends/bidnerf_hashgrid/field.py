@@ -29,7 +29,7 @@ class FieldConfig(Settings):
     encoding: HashEncodingConfig = field(
         default_factory=lambda: HashEncodingConfig(levels=10, log2_table_size=18, finest_resolution=1024)
     )
-    # cells of the finest level across what a pixel shows, where finest_resolution allows as many; 0: finest_resolution
+    # cells of the finest level across what a pixel shows; finest_resolution limits them, and decides alone where this is 0
     cells_per_pixel: NotNegative = 2.5
     width: Count = 64  # units of a hidden layer
     colour_layers: Count = 2  # hidden layers of the colour network

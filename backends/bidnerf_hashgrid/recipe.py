@@ -96,7 +96,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         loss, mse = supervision.loss(rendering, batch)
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
-    with pools_only():
+    with pools_only(device_of(field)):
         fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
 
 

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.carving.boxes import MARGIN, AxisBox, corner, grown, rays_of
-from bidnerf_core.carving.footprint import footprint
 from bidnerf_core.carving.hull import carved_box, has_outline
+from bidnerf_core.carving.pixel_footprint import (
+    distance_of_middle,
+    landmark_distance,
+    measured_distance,
+    pixel_footprint,
+)
 from bidnerf_core.errors import InputError
 from bidnerf_core.field import SceneBounds
 from bidnerf_core.frames import View
@@ -43,8 +49,9 @@ def estimate_bounds(
     around the point they look at, as large as what an image shows there; for others (a room), the box of the cameras and of
     what they see within ``ROOM`` times the extent of their positions. Unless half of the views have dense depth or
     silhouettes, there may be matter beyond the box, and the scene is contracted. Images from exactly one place do not
-    determine a scale; the extent of their positions is then taken to be ``ONE_PLACE``. Raises ``InputError`` where there are
-    no views.
+    determine a scale; the extent of their positions is then taken to be ``ONE_PLACE``. The footprint of a pixel is that at
+    the median distance of what gave the box: of measured depth, of landmarks, or else of the box's middle, where at least half
+    its longest side is assumed. Raises ``InputError`` where there are no views.
     """
     if not views:
         raise InputError("scene bounds: no views to estimate them from")
@@ -53,7 +60,8 @@ def estimate_bounds(
     outlined = [view for view in views if has_outline(view)]
     if measured and (2 * len(dense) >= len(views) or not outlined):
         box, near = _measured_box(measured, MARGIN if dense else SPARSE_MARGIN)
-        return _with_far(views, box, near, background, 2 * len(dense) < len(views))
+        footprint = pixel_footprint(measured, measured_distance)
+        return _with_far(views, box, near, background, 2 * len(dense) < len(views), footprint)
     if 2 * len(outlined) < len(views) and sum(_landmarks_of(view) for view in views) >= LEAST_LANDMARKS:
         return _around_landmarks([view for view in views if _landmarks_of(view)], background)
     box = _guessed_box(views)
@@ -61,15 +69,17 @@ def estimate_bounds(
         box = carved_box(box, outlined)
     least = LEAST_NEAR * _farthest(views, box)
     near = max(_nearest(views, box) / 2, least)
-    return _with_far(views, box, near, background, 2 * len(outlined) < len(views))
+    footprint = pixel_footprint(views, partial(distance_of_middle, box=box))
+    return _with_far(views, box, near, background, 2 * len(outlined) < len(views), footprint)
 
 
 def _with_far(
-    views: Sequence[View], box: AxisBox, near: float, background: tuple[float, float, float], contracted: bool
-) -> SceneBounds:
+    views: Sequence[View], box: AxisBox, near: float, background: tuple[float, float, float], contracted: bool,
+    footprint: float,
+) -> SceneBounds:  # fmt: skip
     """Return bounds that reach to the box's farthest corner or, where the scene is contracted, well beyond it."""
     far = _farthest(views, box) * (FAR_BEYOND if contracted else FAR_MARGIN)
-    return _bounds(views, box, near, far, background, contracted)
+    return SceneBounds(corner(box[0]), corner(box[1]), near, far, background, contracted, footprint)
 
 
 def _around_landmarks(views: Sequence[View], background: tuple[float, float, float]) -> SceneBounds:
@@ -82,15 +92,8 @@ def _around_landmarks(views: Sequence[View], background: tuple[float, float, flo
     box = grown(points[cut], points[last - cut], distances[0].item() / 100)
     near = distances[round(LANDMARKS_NEARER * last)].item() / 2
     far = max(distances[round((1 - OUTLIERS) * last)].item(), _farthest(views, box)) * FAR_BEYOND
-    return _bounds(views, box, near, far, background, True)
-
-
-def _bounds(
-    views: Sequence[View], box: AxisBox, near: float, far: float, background: tuple[float, float, float], contracted: bool
-) -> SceneBounds:  # fmt: skip
-    return SceneBounds(
-        corner(box[0]), corner(box[1]), near, far, background, contracted, footprint(views, box)
-    )
+    footprint = pixel_footprint(views, landmark_distance)
+    return SceneBounds(corner(box[0]), corner(box[1]), near, far, background, True, footprint)
 
 
 def _landmarks_of(view: View) -> int:

@@ -41,6 +41,7 @@ from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.moving import moved, working_device
 from bidnerf_core.registry import load_backend
 from bidnerf_core.serialization import to_plain
+from bidnerf_core.settings import flattened
 from bidnerf_core.storage import MapInfo, build_field, load_info, load_state
 from bidnerf_core.training import TrainingStopped
 
@@ -213,7 +214,7 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
     """Raise ``UsageError`` for settings that differ from the interrupted training's, since they would be ignored."""
     if backend not in (None, info.backend):
         raise UsageError(f"{out}: is of backend {info.backend!r}, cannot resume it with {backend!r}")
-    stored, given, usual = info.config, to_plain(config), to_plain(default)
+    stored, given, usual = (flattened(plain) for plain in (info.config, to_plain(config), to_plain(default)))
     for key, value in given.items():
         if value not in (usual[key], stored.get(key)):
             raise UsageError(

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from bidnerf_core.datasets import Dataset, open_dataset
@@ -35,6 +32,7 @@ from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.settings import to_flat
 from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
+from bidnerf_core.threads import one_thread
 
 
 def run_trial(trial: Trial) -> TrialResult:
@@ -96,17 +94,6 @@ def parse_settings(method: str, config: str) -> Any:
             f"config: found a {type(plain).__name__}, expected an object of settings of {method}"
         )
     return settings_of(method, plain)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Compute on one thread, so that sums are the same everywhere; parallel trials are faster than parallel sums."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @lru_cache(maxsize=4)

@@ -1,0 +1,74 @@
+"""One thread for torch's operators, in one Python thread at a time."""
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
+import pytest
+import torch
+
+from bidnerf_core.threads import one_thread, set_threads_here
+
+
+@pytest.fixture(autouse=True)
+def three_threads() -> Iterator[None]:
+    usual = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(usual)
+
+
+def in_new_thread() -> int:
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(torch.get_num_threads).result()
+
+
+def test_the_usual_number_is_told_and_restored() -> None:
+    with one_thread() as usual:
+        assert (usual, torch.get_num_threads()) == (3, 1)
+    assert torch.get_num_threads() == 3
+
+
+def test_the_usual_number_is_restored_after_an_error() -> None:
+    with pytest.raises(KeyboardInterrupt), one_thread():
+        raise KeyboardInterrupt
+    assert torch.get_num_threads() == in_new_thread() == 3
+
+
+def test_threads_that_start_meanwhile_have_the_usual_number() -> None:
+    with one_thread():
+        assert in_new_thread() == 3
+    set_threads_here(2)
+    assert (torch.get_num_threads(), in_new_thread()) == (2, 3)
+
+
+def test_the_number_stays_in_a_thread_that_is_new_to_torch() -> None:
+    def set_and_computed() -> int:
+        set_threads_here(1)
+        torch.ones(10).sum()
+        return torch.get_num_threads()
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(set_and_computed).result() == 1
+
+
+def test_blocks_that_overlap_leave_no_trace() -> None:
+    """The second block begins during the first and ends after it."""
+    began, ended = Barrier(2), Barrier(2)
+
+    def first() -> int:
+        with one_thread():
+            began.wait()
+        ended.wait()
+        return torch.get_num_threads()
+
+    def second() -> tuple[int, int]:
+        began.wait()
+        with one_thread() as usual:
+            ended.wait()
+        return usual, torch.get_num_threads()
+
+    with ThreadPoolExecutor(2) as pool:
+        one, two = pool.submit(first), pool.submit(second)
+        assert (one.result(), two.result()) == (3, (3, 3))
+    assert torch.get_num_threads() == in_new_thread() == 3
