@@ -445,8 +445,8 @@ def test_settings_are_compared_one_by_one_with_those_of_the_interrupted_training
 ) -> None:
     """An option for one setting of the encoding says nothing about the others, whose defaults may have changed since."""
     resume = ["train", shared / "data", "--resume", "--no-bake", "--out", interrupted]
-    assert_refused(bidnerf(*resume, "--levels", "4"), 2, "begun with levels 3, got 4")
-    assert bidnerf(*resume, "--levels", "3").status == 0
+    assert_refused(bidnerf(*resume, "--base-resolution", "8"), 2, "begun with base_resolution 4.0, got 8.0")
+    assert bidnerf(*resume, "--base-resolution", "4").status == 0
 
 
 # Places that cannot be written.
