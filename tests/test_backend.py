@@ -67,7 +67,7 @@ def test_small_scenes_get_the_settings_that_a_backend_offers_and_else_its_defaul
     quick = quick_config(hashgrid)
     changed = {f.name for f in fields(quick) if getattr(quick, f.name) != getattr(HashGridConfig(), f.name)}
     assert changed == {"steps", "colour_layers", "coarse_every"}
-    assert quick.steps == 400
+    assert quick.steps == 800
     assert quick_config(vanilla) == vanilla.config_type()
     assert not isinstance(Plain(), QuickConfig)
     assert quick_config(Plain()) == Settings()

@@ -45,9 +45,8 @@ class HashEncodingConfig(Settings):
     features: Annotated[int, Range(1, 64)] = 2  # number of features of an entry; even numbers are faster
     log2_table_size: Annotated[int, Range(1, 30)] = 19  # entries of a level's table, as a power of two
     base_resolution: Annotated[float, Range(1, 2**20)] = 16  # cells along a side at the coarsest level
-    finest_resolution: Annotated[float, Range(1, 2**20)] = (
-        512  # cells along a side at the finest level, or their maximum
-    )
+    # cells along a side at the finest level, or their maximum
+    finest_resolution: Annotated[float, Range(1, 2**20)] = 512
     # how features are interpolated between the corners of a cell
     interpolation: Literal["linear", "smooth"] = "linear"
 
