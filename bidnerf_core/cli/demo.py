@@ -1,4 +1,4 @@
-"""``bidnerf demo``: training, localization and pictures of a closed-form scene, in about a minute."""
+"""``bidnerf demo``: training, localization and pictures of a closed-form scene, in a minute or two."""
 
 from __future__ import annotations
 
