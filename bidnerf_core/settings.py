@@ -129,14 +129,6 @@ def to_flat(settings: Any) -> dict[str, Any]:
     return flat
 
 
-def flattened(plain: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of nested settings, as ``to_plain`` makes them, by their flat names."""
-    flat: dict[str, Any] = {}
-    for name, value in plain.items():
-        flat |= flattened(value) if isinstance(value, dict) else {name: value}
-    return flat
-
-
 def from_flat(
     base: S | type[S], values: dict[str, Any], where: str, renamed: dict[str, str] | None = None
 ) -> S:

@@ -24,8 +24,8 @@ _for_pools: ContextVar[int | None] = ContextVar("for_pools", default=None)  # th
 def pools_only(device: torch.device) -> Iterator[None]:
     """Within the block, only ``concurrently`` uses several threads: torch's own operators use one. On a GPU, it does nothing.
 
-    A training step consists of hundreds of short operators, and to wake threads for each of them takes longer than these save. On
-    two cores, a step took 70 ms where operators and pools used both, 47 ms with the pools alone, and 53 ms on one thread.
+    A training step consists of hundreds of short operators. On two cores, waking threads for each of them took longer than these
+    saved.
     """
     if device.type != "cpu":
         yield

@@ -40,8 +40,8 @@ from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.moving import moved, working_device
 from bidnerf_core.registry import load_backend
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.settings import flattened
+from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.settings import to_flat
 from bidnerf_core.storage import MapInfo, build_field, load_info, load_state
 from bidnerf_core.training import TrainingStopped
 
@@ -214,11 +214,12 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
     """Raise ``UsageError`` for settings that differ from the interrupted training's, since they would be ignored."""
     if backend not in (None, info.backend):
         raise UsageError(f"{out}: is of backend {info.backend!r}, cannot resume it with {backend!r}")
-    stored, given, usual = (flattened(plain) for plain in (info.config, to_plain(config), to_plain(default)))
+    began = from_plain(type(config), info.config, f"{out}: config")
+    stored, given, usual = (to_flat(settings) for settings in (began, config, default))
     for key, value in given.items():
-        if value not in (usual[key], stored.get(key)):
+        if value not in (usual[key], stored[key]):
             raise UsageError(
-                f"{out}: was begun with {key} {stored.get(key)}, got {value}; --resume keeps settings"
+                f"{out}: was begun with {key} {stored[key]}, got {value}; --resume keeps settings"
             )
 
 
