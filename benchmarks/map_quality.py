@@ -6,7 +6,8 @@ Records wall time, CPU time and peak memory of ``bidnerf train`` as a process, t
 PSNR of images, the absolute error of depth where depth was measured, and the number of samples per ray. A map cannot know the
 exposure of a photo that it was not trained on: PSNR is measured as rendered, and after the gain and the offset per colour
 channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
-measured at poses of the test frames that are refined with the map's landmarks, and on training frames at the poses in the map.
+measured at poses of the test frames that are refined with the map's landmarks, and on training frames at the poses in the map;
+both with the motion of a rolling shutter, where one was found.
 Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the selection of samples that
 makes it fast, is compared with that on every fifth frame. ``--test-frames-only`` leaves out training frames, poses by
 landmarks and ``dense``, for backends that take minutes to render an image. ``--without-depth`` withholds the measured depth of
@@ -83,7 +84,7 @@ def judge(field: RadianceField, bounds: SceneBounds, views: list[View]) -> dict[
     """
     quality, fitted, likeness, errors, ratios, missing, measured = [], [], [], [], [], 0, 0
     for view in views:
-        image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds)
+        image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds, motion=view.motion)
         quality.append(float(psnr(image.rgb, view.frame.rgb, 1.0)))
         fitted.append(float(psnr(fitted_colours(image.rgb, view.frame.rgb).clamp(0, 1), view.frame.rgb, 1.0)))
         pair = [i.permute(2, 0, 1)[None] for i in (image.rgb, view.frame.rgb)]
@@ -135,7 +136,7 @@ def at_landmark_poses(stored: Map, views: list[View]) -> dict[str, Any] | None:
         found = confirm(matcher, [View(view.frame, SE3.identity())], T).pose
         if found is not None and found.inliers >= LEAST_LANDMARKS:
             given.append(view)
-            placed.append(View(view.frame, found.T_world_camera))
+            placed.append(View(view.frame, found.T_world_camera, motion=found.motion))
             updates.append((T.inverse() @ found.T_world_camera).log())
     if not placed:
         return None

@@ -17,6 +17,8 @@ from bidnerf_core.se3 import SE3
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
+RowMotion = tuple[float, float, float, float, float, float]
+"""The motion of a camera while its rows were exposed, see ``rolling_shutter``: metres, then radians."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,9 @@ class StoredCamera:
     T_world_camera: MatrixRows
     given_T_world_camera: MatrixRows | None = None  # the dataset's pose, where training refined it
     moved_pixels: float | None = None  # median motion (pixels) of the image's points by the refinement
+    motion: RowMotion | None = (
+        None  # of the camera from the first row to the last, where refinement estimated it
+    )
 
     @property
     def pose(self) -> SE3:
@@ -43,6 +48,11 @@ class StoredCamera:
         ]
         return all(len(part) == 4 and bool(_pose(part).is_rigid()) for part in rows)
 
+    def posed(self, view: View) -> View:
+        """Return the view at this pose, and with this motion."""
+        motion = None if self.motion is None else torch.tensor(self.motion, dtype=torch.float64)
+        return replace(view, T_ref_camera=self.pose, motion=motion)
+
     @property
     def update(self) -> Float[Tensor, "6"] | None:
         """The right update (translation in metres first) from the given to the refined pose; None where the pose was kept."""
@@ -56,7 +66,7 @@ class StoredCamera:
         if (update := self.update) is None:
             return None
         metres, radians = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
-        return MovedCamera(self.name, metres, math.degrees(radians), self.moved_pixels or 0.0)
+        return MovedCamera(self.name, metres, math.degrees(radians), self.moved_pixels or 0.0, self.motion)
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,7 @@ class MovedCamera:
     translation: float  # metres
     rotation_deg: float
     pixels: float  # median distance by which points move in the image
+    motion: RowMotion | None = None  # of the camera from the first row of the image to the last
 
 
 @dataclass(frozen=True)
@@ -92,7 +103,10 @@ class PoseRefinement(PoseConsistency):
 
 def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
     """Return the cameras of training views in the form that ``map.json`` holds."""
-    return tuple(StoredCamera(v.frame.name, v.frame.intrinsics, _rows(v.T_ref_camera)) for v in views)
+    return tuple(
+        StoredCamera(v.frame.name, v.frame.intrinsics, _rows(v.T_ref_camera), motion=_six(v.motion))
+        for v in views
+    )
 
 
 def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
@@ -121,10 +135,22 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
     error = f"errors of the given poses add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
     refined = found.refined and moved
     lines = [f"{error}; {_typical_motion(moved)}" if refined else f"{error}; the poses are kept"]
+    if motions := [m.motion for m in moved if m.motion is not None]:
+        metres, degrees = _sizes(motions)
+        lines.append(
+            f"the rows of the images were exposed one after another, while the camera moved by {metres:.2g} and"
+            f" {degrees:.2g}° (median)"
+        )
     if wrong:
         listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in wrong)
         lines.append(f"moved to where the landmarks of the other images place them: {listed}")
     return lines
+
+
+def _sizes(motions: Sequence[RowMotion]) -> tuple[float, float]:
+    """Return the median translation (metres) and rotation (degrees)."""
+    lengths = torch.linalg.vector_norm(torch.tensor(motions).unflatten(-1, (2, 3)), dim=-1)
+    return median(lengths[:, 0].tolist()), math.degrees(median(lengths[:, 1].tolist()))
 
 
 def _typical_motion(moved: Sequence[MovedCamera]) -> str:
@@ -140,9 +166,16 @@ def _typical_motion(moved: Sequence[MovedCamera]) -> str:
 
 def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
     """Return the views at their refined poses; a view keeps its pose unless ``cameras`` records a refinement of that pose."""
-    known = {(c.name, c.given_T_world_camera): c.pose for c in cameras if c.given_T_world_camera}
-    poses = [known.get((view.frame.name, _rows(view.T_ref_camera)), view.T_ref_camera) for view in views]
-    return [replace(view, T_ref_camera=T) for view, T in zip(views, poses, strict=True)]
+    known = {(c.name, c.given_T_world_camera): c for c in cameras if c.given_T_world_camera}
+    found = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]
+    return [view if c is None else c.posed(view) for view, c in zip(views, found, strict=True)]
+
+
+def _six(motion: Float[Tensor, "6"] | None) -> RowMotion | None:
+    if motion is None:
+        return None
+    a, b, c, d, e, f = motion.tolist()
+    return a, b, c, d, e, f
 
 
 def _rows(T: SE3) -> MatrixRows:

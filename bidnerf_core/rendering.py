@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.constants import constant
 from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds, device_of
+from bidnerf_core.rolling_shutter import exposure_times, poses_of_rows
 from bidnerf_core.se3 import SE3
 from bidnerf_core.waiting import may_wait
 
@@ -140,17 +141,25 @@ def _composed(
 
 @torch.no_grad()
 def render_image(
-    field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, chunk: int = 8192
-) -> RenderedImage:
-    """Render a whole image from a pose, ``chunk`` rays at a time."""
-    ray = intrinsics.unproject(intrinsics.pixel_centres()).reshape(-1, 3)
+    field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, chunk: int = 8192,
+    motion: Float[Tensor, "6"] | None = None,
+) -> RenderedImage:  # fmt: skip
+    """Render a whole image from a pose, ``chunk`` rays at a time.
+
+    ``motion`` is that of the camera from the first row to the last, see ``rolling_shutter``; without it, the camera is at rest.
+    """
+    pixels = intrinsics.pixel_centres().reshape(-1, 2)
+    ray = intrinsics.unproject(pixels)
     length = torch.linalg.vector_norm(ray, dim=-1)
     device = device_of(field)
     T = T_world_camera.to(dtype=torch.float32, device=device)
+    motion = motion if motion is not None and bool(motion.any()) else None
+    times = exposure_times(pixels, intrinsics).to(T.translation).split(chunk)
     parts = []
-    for directions in (ray / length[:, None]).to(device).split(chunk):
-        turned = T.rotate(directions)
-        rendering = render(field, bounds.rays(T.translation.expand_as(turned), turned), bounds.background)
+    for directions, when in zip((ray / length[:, None]).to(device).split(chunk), times, strict=True):
+        at = T if motion is None else T @ poses_of_rows(when, motion)
+        turned = at.rotate(directions)
+        rendering = render(field, bounds.rays(at.translation.expand_as(turned), turned), bounds.background)
         parts.append(
             torch.cat([rendering.rgb, rendering.distance[:, None], rendering.opacity[:, None]], -1).cpu()
         )

@@ -65,8 +65,11 @@ def _times_along(pixels: Float[Tensor, "m 2"], camera: Intrinsics, axis: int) ->
     return pixels[:, axis].double() / (camera.width, camera.height)[axis] - 0.5
 
 
-def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "6"]) -> SE3:
-    """Return T_middle_row, the pose of the camera at each moment in the frame of the camera at the middle row."""
+def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "*m 6"]) -> SE3:
+    """Return T_middle_row, the pose of the camera at each moment in the frame of the camera at the middle row.
+
+    ``motion`` is that of one image, or of the image of each moment.
+    """
     return SE3.exp(times[:, None] * motion.to(times))
 
 

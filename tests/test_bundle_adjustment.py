@@ -21,6 +21,7 @@ from landmark_scene import looking_in
 
 VIEWS, POINTS, FOCAL = 12, 150, 300.0
 MILLIMETRES, RADIANS = 0.008, 0.004
+AT_REST_ALL = torch.zeros(VIEWS, 6, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -91,11 +92,11 @@ def test_the_gradient_is_the_numerical_one(depth: float) -> None:
     points = capture.points + 0.01
 
     def cost(of_poses: Tensor, of_points: Tensor) -> float:
-        moved = Adjustment(capture.poses.retract(of_poses), points + of_points, 0.0)
+        moved = Adjustment(capture.poses.retract(of_poses), points + of_points, AT_REST_ALL)
         return linearized(seen, moved, held).cost
 
     system, still = (
-        linearized(seen, Adjustment(capture.poses, points, 0.0), held),
+        linearized(seen, Adjustment(capture.poses, points, AT_REST_ALL), held),
         torch.zeros(VIEWS, 6).double(),
     )
     fixed, step = torch.zeros(POINTS, 3, dtype=torch.float64), 1e-6
@@ -103,7 +104,7 @@ def test_the_gradient_is_the_numerical_one(depth: float) -> None:
         change = torch.zeros_like(still)
         change[4, column] = step
         slope = (cost(change, fixed) - cost(-change, fixed)) / (2 * step)
-        assert slope == pytest.approx(float(system.pose_gradient[4, column]), rel=1e-5, abs=1e-3)
+        assert slope == pytest.approx(float(system.image_gradient[4, column]), rel=1e-5, abs=1e-3)
     for column in range(3):
         change = torch.zeros_like(fixed)
         change[7, column] = step
@@ -114,10 +115,10 @@ def test_the_gradient_is_the_numerical_one(depth: float) -> None:
 def test_the_schur_complement_gives_the_step_of_the_whole_equations() -> None:
     capture = Capture(noise=1.0, depth=0.02)
     given = capture.poses.retract(errors())
-    system = linearized(capture.seen(given), Adjustment(given, capture.points, 0.0), prior(given))
+    system = linearized(capture.seen(given), Adjustment(given, capture.points, AT_REST_ALL), prior(given))
     rows, columns = 6 * VIEWS, 3 * POINTS
     whole = torch.zeros(rows + columns, rows + columns, dtype=torch.float64)
-    for i, block in enumerate(system.pose_blocks):
+    for i, block in enumerate(system.image_blocks):
         whole[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = block
     for i, block in enumerate(system.point_blocks):
         at = rows + 3 * i
@@ -128,7 +129,7 @@ def test_the_schur_complement_gives_the_step_of_the_whole_equations() -> None:
         whole[at : at + 3, i : i + 6] = block.mT
     damping = 0.01
     whole += damping * torch.diag(whole.diagonal())
-    right = -torch.cat([system.pose_gradient.ravel(), system.point_gradient.ravel()])
+    right = -torch.cat([system.image_gradient.ravel(), system.point_gradient.ravel()])
     of_poses, of_points = system.step(damping)
     found = torch.cat([of_poses.ravel(), of_points.ravel()])
     torch.testing.assert_close(found, torch.linalg.solve(whole, right), rtol=1e-5, atol=1e-9)

@@ -93,7 +93,7 @@ def _render_views(field: RadianceField, bounds: SceneBounds, views: Sequence[Vie
     with console.status("") as status:
         for number, view in enumerate(views):
             status.update(Text(printable(f"rendering {number + 1}/{len(views)}: {view.frame.name}")))
-            image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds)
+            image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds, motion=view.motion)
             write_images(out, view.frame.name, image)
             rows.append((view.frame.name, *_scores(image, view.frame)))
             show(f"{rows[-1][0]}  PSNR {rows[-1][1]:.2f} dB  depth error {_metres(rows[-1][2])} m")

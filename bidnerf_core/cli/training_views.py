@@ -48,8 +48,10 @@ def prepared(views: Sequence[View], refinement: RefinementChoice = "auto") -> Tr
     with counted("poses", "image pairs") as report:
         least = 0.0 if refinement == "always" else INCONSISTENT
         found = training_poses(tracked, views, least, progress=report)
-    poses = found.tracked.T_world_camera
+    poses, motion = found.tracked.T_world_camera, found.tracked.motion
     moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
+    if bool(motion.any()):
+        moved = [replace(view, motion=motion[i]) for i, view in enumerate(moved)]
     if not (found.refined or found.replaced):
         moved = list(views)
     cameras = moved_from(views, stored_cameras(moved), found.pixels.tolist())

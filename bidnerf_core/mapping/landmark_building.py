@@ -30,6 +30,7 @@ from bidnerf_core.mapping.triangulation import (
     refined_points,
 )
 from bidnerf_core.mapping.view_pairs import likely_pairs_of_poses
+from bidnerf_core.rolling_shutter import AT_REST, exposure_times
 from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import Above, Range, Settings
 
@@ -110,10 +111,17 @@ class TrackedViews:
         """The keypoints that were matched with those of other images."""
         return self.observations[_tracked(self.observations)].compacted()[0]
 
-    def at(self, T_world_camera: SE3) -> TrackedViews:
-        """Return the same tracks in images with other poses (v)."""
+    @property
+    def motion(self) -> Float[Tensor, "v 6"]:
+        """The motions of the cameras while the rows of their images were exposed."""
+        return self.observations.motion
+
+    def at(self, T_world_camera: SE3, motion: Float[Tensor, "v 6"] | None = None) -> TrackedViews:
+        """Return the same tracks in images with other poses (v), and with other motions if these are given."""
+        motion = self.motion if motion is None else motion
         images = [
-            replace(p, T_world_camera=T_world_camera[i]) for i, p in enumerate(self.observations.images)
+            replace(p, T_world_camera=T_world_camera[i], motion=motion[i])
+            for i, p in enumerate(self.observations.images)
         ]
         return replace(self, observations=replace(self.observations, images=images))
 
@@ -177,7 +185,10 @@ def _detected(view: View, features: Features) -> PosedKeypoints:
     keypoints = features(view.frame.rgb)
     rays = intrinsics.unproject(keypoints.pixels.double())
     focal = (intrinsics.fx * intrinsics.fy) ** 0.5
-    return PosedKeypoints(keypoints, rays, focal, view.T_ref_camera.to("cpu", torch.float64))
+    return PosedKeypoints(
+        keypoints, rays, focal, view.T_ref_camera.to("cpu", torch.float64),
+        exposure_times(keypoints.pixels.double(), intrinsics), AT_REST if view.motion is None else view.motion,
+    )  # fmt: skip
 
 
 def _located(

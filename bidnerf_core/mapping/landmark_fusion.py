@@ -13,6 +13,8 @@ from bidnerf_core.frames import SeenLandmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.tracks import PosedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
+from bidnerf_core.rolling_shutter import poses_of_rows
+from bidnerf_core.se3 import SE3
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +44,25 @@ class TrackedKeypoints:
         return torch.searchsorted(last, self.number, right=True)
 
     @property
+    def exposure_times(self) -> Float[Tensor, "m"]:
+        """The times at which the keypoints were exposed, see ``rolling_shutter``."""
+        return torch.cat([p.exposure_times for p in self.images])[self.number]
+
+    @property
+    def motion(self) -> Float[Tensor, "v 6"]:
+        """The motion of each image's camera while its rows were exposed."""
+        return torch.stack([p.motion for p in self.images])
+
+    @property
     def sightings(self) -> Sightings:
-        image = self.image
-        rotation = torch.stack([p.T_world_camera.rotation.mT for p in self.images])
-        centre = torch.stack([p.T_world_camera.translation for p in self.images])
+        """The keypoints as observations by cameras at the poses at which their rows were exposed."""
+        image, motion = self.image, self.motion
+        T = SE3.stack([p.T_world_camera for p in self.images])[image]
+        if bool(motion.any()):
+            T = T @ poses_of_rows(self.exposure_times, motion[image])
         focal = torch.tensor([p.focal for p in self.images], dtype=torch.float64)
         rays = torch.cat([p.rays for p in self.images])[self.number]
-        return Sightings(self.point, rotation[image], centre[image], rays[:, :2], focal[image])
+        return Sightings(self.point, T.rotation.mT, T.translation, rays[:, :2], focal[image])
 
     @property
     def sizes(self) -> Float[Tensor, "m"]:

@@ -15,8 +15,10 @@ from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, pose_updates
 from bidnerf_core.mapping.resection import LEAST_NOISE
+from bidnerf_core.mapping.shutter_evidence import common_motion
 from bidnerf_core.mapping.triangulation import noise
 from bidnerf_core.robust import MAD_TO_SIGMA
+from bidnerf_core.rolling_shutter import STILL
 from bidnerf_core.se3 import SE3
 
 ROUNDS = 3
@@ -49,6 +51,8 @@ def adjusted_poses(
     The errors of the given poses are taken as independent of each other, and as large as resection of the images
     suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean motion of the images
     is about zero. If the first adjustment finds an inconsistency of less than ``least`` pixels, its poses are returned at once.
+    Otherwise, and if the keypoints show that the rows of the images were exposed one after another by moving cameras, these
+    motions are estimated too.
     """
     given = tracked.T_world_camera
     seen, points = tracked.triangulated(config)
@@ -56,24 +60,34 @@ def adjusted_poses(
     deviations = _deviations(seen, points, before)
     if deviations is None:
         return None
+    motion = STILL
     for number in range(ROUNDS):
         pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
         unmeasured = torch.zeros(len(seen.point), dtype=torch.float64)
         sightings = MeasuredSightings(
-            seen.sightings, seen.image, unmeasured, pixel_noise, 1.0, CORRELATED_KEYPOINTS
+            seen.sightings,
+            seen.image,
+            unmeasured,
+            pixel_noise,
+            1.0,
+            CORRELATED_KEYPOINTS,
+            seen.exposure_times,
         )
-        fit = adjusted(sightings, points, PosePrior(given, *deviations), tracked.T_world_camera)
+        prior = PosePrior(given, *deviations, motion)
+        fit = adjusted(sightings, points, prior, tracked.T_world_camera, motion=tracked.motion)
         step = _motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
         moved = (given.inverse() @ fit.T_world_camera).log()
         deviations = max(deviations[0], _spread(moved[:, :3])), max(deviations[1], _spread(moved[:, 3:]))
         pixels = _motion(seen, fit.points, given, fit.T_world_camera)
-        tracked = tracked.at(fit.T_world_camera)
+        tracked = tracked.at(fit.T_world_camera, fit.motion)
         if number == 0 and _found(tracked, pixels, before, config).consistency.inconsistency < least:
             break
         tracked = tracked.matched_anew(config, progress)
+        seen, points = tracked.triangulated(config)
+        if motion == STILL and (motion := common_motion(seen, points, CORRELATED_KEYPOINTS)) != STILL:
+            continue
         if float(step.max()) <= SETTLED_PIXELS:
             break
-        seen, points = tracked.triangulated(config)
     return _found(tracked, pixels, before, config)
 
 

@@ -13,6 +13,7 @@ from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import resect
 from bidnerf_core.mapping.triangulation import Sightings
+from bidnerf_core.se3 import SE3
 
 LEAST_VISIBLE_POINTS = 20
 """Least number of points from which the pose of an image is estimated."""
@@ -56,18 +57,19 @@ def pose_updates(
         own = (image == number).nonzero()[:, 0]
         T = tracked.images[number].T_world_camera
         views = float(seen[own].mean())
-        found = resect(_observed_points(sightings[own], positions), T, noise)
+        found = resect(observed_points(sightings[own], positions, T), T, noise)
         update = (T.inverse() @ found.T_world_rig).log()
         updates[number] = update * ((1 + 1 / views) / (1 - 1 / views)) ** 0.5
     return updates
 
 
-def _observed_points(sightings: Sightings, positions: Float[Tensor, "n 3"]) -> ObservedPoints:
+def observed_points(sightings: Sightings, positions: Float[Tensor, "n 3"], T: SE3) -> ObservedPoints:
+    """Return the points displaced so that a camera at rest at the pose ``T`` observes them where the moving one did."""
     count = len(sightings)
     zeros = torch.zeros((count, 3), dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
     return ObservedPoints(
-        positions[sightings.point], zeros[:, :2], zeros + torch.tensor([0.0, 0.0, 1.0]),
+        T.apply(sightings.in_camera(positions)), zeros[:, :2], zeros + torch.tensor([0.0, 0.0, 1.0]),
         sightings.image, sightings.focal, zeros[:, 0], eye, zeros, zeros[:, 0], zeros[:, 0],
     )  # fmt: skip
 

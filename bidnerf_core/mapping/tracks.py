@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.mapping.features import Keypoints, squared_distances
+from bidnerf_core.rolling_shutter import AT_REST
 from bidnerf_core.se3 import SE3
 
 EPIPOLAR_BAND = 2.0
@@ -32,7 +33,9 @@ class PosedKeypoints:
     keypoints: Keypoints
     rays: Float[Tensor, "n 3"]  # on the plane z = 1 of the camera, float64
     focal: float  # pixels
-    T_world_camera: SE3  # float64
+    T_world_camera: SE3  # float64; of the middle row
+    exposure_times: Float[Tensor, "n"]  # of the keypoints, see ``rolling_shutter``, float64
+    motion: Float[Tensor, "6"] = AT_REST  # while the rows were exposed; epipolar lines ignore it
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,8 @@ from bidnerf_core.field import Rays, SceneBounds
 from bidnerf_core.frames import SPARSE, View
 from bidnerf_core.moving import moved
 from bidnerf_core.observations import Observations
+from bidnerf_core.rolling_shutter import AT_REST, exposure_times, poses_of_rows
+from bidnerf_core.se3 import SE3
 
 MEASURED_SHARE = 0.25
 """Fraction of a batch's rays that are drawn from pixels with depth, if these are so few that hardly any would be drawn
@@ -67,6 +69,10 @@ class RayBank:
         grids = [kind.unproject(kind.pixel_centres()).reshape(-1, 3) for kind in kinds]
         starts = torch.tensor([0, *[len(grid) for grid in grids]]).cumsum(0)
         self._camera_rays = torch.cat(grids)  # z = 1
+        self._motion = _motion_of(views)
+        if self._motion is not None:
+            times = [exposure_times(kind.pixel_centres().reshape(-1, 2), kind) for kind in kinds]
+            self._exposure_times = torch.cat(times).float()
         self._camera_start = torch.stack([starts[kinds.index(frame.intrinsics)] for frame in frames])
 
     def draw(self, count: int, generator: Generator) -> TrainingBatch:
@@ -87,14 +93,22 @@ class RayBank:
         view = torch.searchsorted(self.offsets, index, right=True) - 1
         ray = self._camera_rays[self._camera_start[view] + index - self.offsets[view]]
         length = torch.linalg.vector_norm(ray, dim=-1)
-        directions = (self._rotation[view] @ (ray / length[:, None])[..., None])[..., 0]
+        T = self._poses(view, index - self.offsets[view])
+        directions = T.rotate(ray / length[:, None])
         distance = self._depth[index] * length if self.has_depth else torch.zeros(count)
         distance[: len(seen)] = seen
         rgb, background = self._coloured(index, generator)
-        origins, coloured = self._origin[view], torch.ones(count, dtype=torch.bool)
+        origins, coloured = T.translation, torch.ones(count, dtype=torch.bool)
         observed = Observations(origins, directions, rgb, distance, coloured)
         rays = self.bounds.rays(origins, directions)
         return moved(TrainingBatch(rays, observed, background, view, deviation), self.device)
+
+    def _poses(self, view: Int[Tensor, "r"], pixel: Int[Tensor, "r"]) -> SE3:
+        """Return the poses of the cameras at the times at which pixels of the views were exposed."""
+        T = SE3(self._rotation[view], self._origin[view])
+        if self._motion is None:
+            return T
+        return T @ poses_of_rows(self._exposure_times[self._camera_start[view] + pixel], self._motion[view])
 
     def _few_measured(self) -> Int[Tensor, "m"]:
         """Return the indices of the pixels with depth if it is sparse (structure from motion); otherwise none."""
@@ -110,6 +124,13 @@ class RayBank:
             return self._rgb[index], usual
         background = torch.rand((len(index), 3), generator=generator)
         return self._rgb[index] + (1 - self._alpha[index])[:, None] * (background - usual), background
+
+
+def _motion_of(views: Sequence[View]) -> Float[Tensor, "v 6"] | None:
+    """Return the motions of the cameras while the rows of their images were exposed; None if none moved."""
+    if all(view.motion is None for view in views):
+        return None
+    return torch.stack([AT_REST if view.motion is None else view.motion for view in views]).float()
 
 
 @dataclass(frozen=True, eq=False)
