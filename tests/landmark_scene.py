@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.mapping.features import Keypoints, quantized
+from bidnerf_core.rolling_shutter import exposure_times, poses_of_rows
 
 PINHOLE = Intrinsics(300.0, 300.0, 200.0, 150.0, 400, 300)
 SIZE = 0.04  # metres: of what a keypoint describes
@@ -38,11 +39,18 @@ class Points:
         depth: float | None = None,
         T_ref_camera: SE3 | None = None,
         seed: int = 0,
+        motion: Tensor | None = None,
     ) -> View:
-        """An image whose one number names the keypoints in it; with depth at them, times ``depth``."""
+        """An image whose one number names the keypoints in it; with depth at them, times ``depth``.
+
+        The rows of a camera with a ``motion`` are exposed one after another. The view does not tell.
+        """
         generator = torch.Generator().manual_seed(seed)
         local = T_world_camera.inverse().apply(self.positions)
         pixels = intrinsics.project(local)
+        for _ in range(0 if motion is None else 6):  # a point's row depends on when it was exposed
+            T = poses_of_rows(exposure_times(pixels, intrinsics), motion)
+            pixels = intrinsics.project(T.inverse().apply(local))
         size = torch.tensor([intrinsics.width, intrinsics.height])
         inside = ((pixels > 3) & (pixels < size - 3)).all(-1)
         pixels = pixels[inside] + self.noise * torch.randn(

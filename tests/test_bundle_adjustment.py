@@ -17,6 +17,7 @@ from bidnerf_core.mapping.bundle_adjustment import (
     linearized,
 )
 from bidnerf_core.mapping.triangulation import Sightings
+from bidnerf_core.rolling_shutter import STILL, MotionPrior, poses_of_rows
 from landmark_scene import looking_in
 
 VIEWS, POINTS, FOCAL = 12, 150, 300.0
@@ -31,6 +32,7 @@ class Capture:
     noise: float = 0.0  # pixels
     depth: float = 0.0  # relative error; nothing is measured for 0
     outliers: float = 0.0  # share of the sightings that are anywhere
+    moving: bool = False  # whether the cameras move while rows are exposed, by ``motions``
 
     @property
     def poses(self) -> SE3:
@@ -45,7 +47,9 @@ class Capture:
         generator = torch.Generator().manual_seed(2)
         image = torch.arange(VIEWS).repeat_interleave(POINTS)
         point = torch.arange(POINTS).repeat(VIEWS)
-        local = self.poses[image].inverse().apply(self.points[point])
+        times = (0.6180339887 * torch.arange(len(image), dtype=torch.float64)) % 1 - 0.5
+        T = self.poses[image] @ poses_of_rows(times, self.moving * motions()[image])
+        local = T.inverse().apply(self.points[point])
         noise = torch.randn(len(image), 3, dtype=torch.float64, generator=generator)
         flat = local[:, :2] / local[:, 2:] + self.noise / FOCAL * noise[:, :2]
         wrong = torch.rand(len(image), generator=generator) < self.outliers
@@ -54,7 +58,15 @@ class Capture:
         focal = torch.full((len(image),), FOCAL, dtype=torch.float64)
         sightings = Sightings(point, given.rotation[image].mT, given.translation[image], flat, focal)
         accuracy = max(0.1, self.noise), max(1e-3, self.depth)
-        return MeasuredSightings(sightings, image, depth.double(), *accuracy, correlation)
+        return MeasuredSightings(sightings, image, depth.double(), *accuracy, correlation, times)
+
+    def shifts(self, motion: Tensor) -> Tensor:
+        """Where each camera sees each point in its last row, pixels; what image motions differ in, if translation and
+        rotation make up for each other.
+        """
+        last = self.poses @ SE3.exp(0.5 * motion)
+        local = last[:, None].inverse().apply(self.points)
+        return FOCAL * local[..., :2] / local[..., 2:]
 
 
 def errors(seed: int = 3) -> Tensor:
@@ -63,8 +75,13 @@ def errors(seed: int = 3) -> Tensor:
     return size * torch.randn(VIEWS, 6, dtype=torch.float64, generator=generator)
 
 
-def prior(given: SE3) -> PosePrior:
-    return PosePrior(given, MILLIMETRES, RADIANS)
+def motions() -> Tensor:
+    """Motions from the first row of each image to the last: about four pixels."""
+    return errors(seed=5)
+
+
+def prior(given: SE3, motion: MotionPrior = STILL) -> PosePrior:
+    return PosePrior(given, MILLIMETRES, RADIANS, motion)
 
 
 def relative(T: SE3) -> SE3:
@@ -85,22 +102,23 @@ def spread(T: SE3) -> float:
 
 
 @pytest.mark.parametrize("depth", [0.0, 0.02])
-def test_the_gradient_is_the_numerical_one(depth: float) -> None:
-    capture = Capture(noise=1.0, depth=depth, outliers=0.1)
+@pytest.mark.parametrize("motion", [STILL, MotionPrior(MILLIMETRES, RADIANS)])
+def test_the_gradient_is_the_numerical_one(depth: float, motion: MotionPrior) -> None:
+    capture = Capture(noise=1.0, depth=depth, outliers=0.1, moving=motion != STILL)
     given = capture.poses.retract(errors())
-    seen, held = capture.seen(given, correlation=3.0), prior(given)
+    seen, held = capture.seen(given, correlation=3.0), prior(given, motion)
     points = capture.points + 0.01
 
-    def cost(of_poses: Tensor, of_points: Tensor) -> float:
-        moved = Adjustment(capture.poses.retract(of_poses), points + of_points, AT_REST_ALL)
+    def cost(of_images: Tensor, of_points: Tensor) -> float:
+        T = capture.poses.retract(of_images[:, :6])
+        moved = Adjustment(T, points + of_points, AT_REST_ALL if motion == STILL else of_images[:, 6:])
         return linearized(seen, moved, held).cost
 
-    system, still = (
-        linearized(seen, Adjustment(capture.poses, points, AT_REST_ALL), held),
-        torch.zeros(VIEWS, 6).double(),
-    )
+    system = linearized(seen, Adjustment(capture.poses, points, AT_REST_ALL), held)
+    unknowns = 6 if motion == STILL else 12
+    still = torch.zeros(VIEWS, unknowns, dtype=torch.float64)
     fixed, step = torch.zeros(POINTS, 3, dtype=torch.float64), 1e-6
-    for column in range(6):
+    for column in range(unknowns):
         change = torch.zeros_like(still)
         change[4, column] = step
         slope = (cost(change, fixed) - cost(-change, fixed)) / (2 * step)
@@ -112,26 +130,29 @@ def test_the_gradient_is_the_numerical_one(depth: float) -> None:
         assert slope == pytest.approx(float(system.point_gradient[7, column]), rel=1e-5, abs=1e-3)
 
 
-def test_the_schur_complement_gives_the_step_of_the_whole_equations() -> None:
+@pytest.mark.parametrize(("motion", "size"), [(STILL, 6), (MotionPrior(MILLIMETRES, RADIANS), 12)])
+def test_the_schur_complement_gives_the_step_of_the_whole_equations(motion: MotionPrior, size: int) -> None:
     capture = Capture(noise=1.0, depth=0.02)
     given = capture.poses.retract(errors())
-    system = linearized(capture.seen(given), Adjustment(given, capture.points, AT_REST_ALL), prior(given))
-    rows, columns = 6 * VIEWS, 3 * POINTS
+    system = linearized(
+        capture.seen(given), Adjustment(given, capture.points, AT_REST_ALL), prior(given, motion)
+    )
+    rows, columns = size * VIEWS, 3 * POINTS
     whole = torch.zeros(rows + columns, rows + columns, dtype=torch.float64)
     for i, block in enumerate(system.image_blocks):
-        whole[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = block
+        whole[size * i : size * i + size, size * i : size * i + size] = block
     for i, block in enumerate(system.point_blocks):
         at = rows + 3 * i
         whole[at : at + 3, at : at + 3] = block
     for block, image, point in zip(system.mixed_blocks, system.image, system.point, strict=True):
-        i, at = 6 * int(image), rows + 3 * int(point)
-        whole[i : i + 6, at : at + 3] = block
-        whole[at : at + 3, i : i + 6] = block.mT
+        i, at = size * int(image), rows + 3 * int(point)
+        whole[i : i + size, at : at + 3] = block
+        whole[at : at + 3, i : i + size] = block.mT
     damping = 0.01
     whole += damping * torch.diag(whole.diagonal())
     right = -torch.cat([system.image_gradient.ravel(), system.point_gradient.ravel()])
-    of_poses, of_points = system.step(damping)
-    found = torch.cat([of_poses.ravel(), of_points.ravel()])
+    of_images, of_points = system.step(damping)
+    found = torch.cat([of_images.ravel(), of_points.ravel()])
     torch.testing.assert_close(found, torch.linalg.solve(whole, right), rtol=1e-5, atol=1e-9)
 
 
@@ -152,6 +173,30 @@ def test_exact_sightings_take_errors_of_poses_back() -> None:
     before = off(relative(given), relative(capture.poses))
     assert translation < 0.15 * before[0]  # the scale
     assert rotation < 0.01 * before[1]
+
+
+def test_motions_are_found_with_the_poses() -> None:
+    capture = Capture(noise=0.3, moving=True)
+    given = capture.poses.retract(errors())
+    seen = capture.seen(given)
+    still = adjusted(seen, capture.points, prior(given))
+    moving = adjusted(seen, capture.points, prior(given, MotionPrior(MILLIMETRES, RADIANS)))
+    assert bool((still.motion == 0).all())
+    assert moving.cost < 0.7 * still.cost
+    true, found, none = (capture.shifts(m) for m in (motions(), moving.motion, AT_REST_ALL))
+    assert float((found - true).norm(dim=-1).median()) < 0.2 * float((true - none).norm(dim=-1).median())
+    of_moving, of_still = (
+        off(relative(found.T_world_camera), relative(capture.poses)) for found in (moving, still)
+    )
+    assert of_moving[1] < 0.5 * of_still[1]
+
+
+def test_cameras_at_rest_are_found_at_rest() -> None:
+    capture = Capture()
+    found = adjusted(
+        capture.seen(capture.poses), capture.points, prior(capture.poses, MotionPrior(MILLIMETRES, RADIANS))
+    )
+    assert float(found.motion.abs().max()) < 1e-9
 
 
 def test_the_mean_motion_is_zero() -> None:
@@ -202,7 +247,10 @@ def test_an_image_without_sightings_stays() -> None:
     given = capture.poses.retract(errors())
     seen = capture.seen(given)
     kept = seen.image != 3
-    seen = replace(seen, sightings=seen.sightings[kept], image=seen.image[kept], depth=seen.depth[kept])
+    seen = replace(
+        seen, sightings=seen.sightings[kept], image=seen.image[kept], depth=seen.depth[kept],
+        exposure_times=None,
+    )  # fmt: skip
     found = adjusted(seen, capture.points, prior(given)).T_world_camera
     assert max(off(found[3], given[3])) < 1e-12
     assert max(off(found[4], given[4])) > 1e-3

@@ -1,0 +1,185 @@
+"""Captures by moving cameras with rolling shutters: how it is noticed, what is estimated, and what training makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import degrees
+from statistics import median
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidnerf_core import SE3, View
+from bidnerf_core.localization.training_poses import TrainingPoses, training_poses
+from bidnerf_core.map_cameras import (
+    PoseRefinement,
+    at_stored_poses,
+    moved_from,
+    pose_sentences,
+    stored_cameras,
+)
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
+from bidnerf_core.mapping.pose_scatter import pose_updates
+from bidnerf_core.mapping.shutter_evidence import common_motion
+from bidnerf_core.pixels import all_pixels, observe
+from bidnerf_core.rendering import render, render_image
+from bidnerf_core.rolling_shutter import STILL
+from bidnerf_core.training import RayBank
+from landmark_scene import PINHOLE, Points, looking_in
+from textured_field import BOUNDS, CAMERA, ground, unseen
+
+VIEWS, NOISE = 16, 0.3
+METRES, RADIANS = 0.01, 0.008  # what a hand does in a few hundredths of a second: about three pixels
+
+
+def motions(scale: float) -> Tensor:
+    size = scale * torch.tensor([METRES] * 3 + [RADIANS] * 3, dtype=torch.float64)
+    return size * torch.randn(VIEWS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+
+
+def capture(moved: Tensor, pose_error: float = 0.0) -> tuple[Points, list[View], SE3]:
+    """Views of a ring of cameras that moved, with errors of the given poses (metres, and as many radians), and the true ones."""
+    points = Points(noise=NOISE)
+    poses = SE3.stack([looking_in(0.105 * i, 0.3 * (i % 3)) for i in range(VIEWS)])
+    generator = torch.Generator().manual_seed(3)
+    given = poses.retract(pose_error * torch.randn(VIEWS, 6, dtype=torch.float64, generator=generator))
+    views = [points.view(poses[i], T_ref_camera=given[i], seed=i, motion=moved[i]) for i in range(VIEWS)]
+    named = [replace(v, frame=replace(v.frame, name=f"{i}")) for i, v in enumerate(views)]
+    return points, named, poses
+
+
+def refined(moved: Tensor, pose_error: float = 0.004) -> tuple[TrainingPoses, list[View], SE3]:
+    points, views, true = capture(moved, pose_error)
+    return training_poses(tracked_views(views, points), views, features=points), views, true
+
+
+def evidence_prior(tracked: TrackedViews) -> object:
+    return common_motion(*tracked.triangulated(LandmarkConfig()), 1.0)
+
+
+def last_row(T: SE3, motion: Tensor) -> Tensor:
+    """Where each camera sees each point in its last row, pixels: translation and rotation may make up for each other."""
+    return PINHOLE.project((T @ SE3.exp(0.5 * motion))[:, None].inverse().apply(Points().positions))
+
+
+def turned(T: SE3, true: SE3) -> Tensor:
+    """The error (radians) of each rotation relative to the one before, which no common rotation changes."""
+    steps = [x[:-1].inverse() @ x[1:] for x in (T, true)]
+    return (steps[1].inverse() @ steps[0]).log()[:, 3:].norm(dim=-1)
+
+
+def test_cameras_that_moved_are_told_from_those_at_rest() -> None:
+    for scale, expected in ((0.0, True), (1.0, False)):
+        points, views, _ = capture(motions(scale))
+        assert (evidence_prior(tracked_views(views, points)) == STILL) == expected
+
+
+def test_one_image_is_no_evidence_against_all_others() -> None:
+    moved = torch.zeros(VIEWS, 6, dtype=torch.float64)
+    moved[5] = 3 * motions(1.0)[5]
+    points, views, _ = capture(moved)
+    assert evidence_prior(tracked_views(views, points)) == STILL
+
+
+def test_few_images_are_no_evidence() -> None:
+    points, views, _ = capture(motions(1.0))
+    assert evidence_prior(tracked_views(views[:5], points)) == STILL
+
+
+def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
+    found, views, poses = refined(motions(1.0))
+    assert found.refined
+    assert found.consistency is not None
+    assert found.consistency.noise_after == pytest.approx(NOISE, rel=0.15)
+    true, estimated, none = (last_row(poses, m) for m in (motions(1.0), found.tracked.motion, motions(0.0)))
+    assert float((estimated - true).norm(dim=-1).median()) < 0.35 * float((true - none).norm(dim=-1).median())
+    given = SE3.stack([view.T_ref_camera for view in views])
+    assert float(turned(found.tracked.T_world_camera, poses).median()) < 0.5 * float(
+        turned(given, poses).median()
+    )
+
+
+def test_cameras_at_rest_get_no_motion() -> None:
+    found, _, _ = refined(motions(0.0))
+    assert found.refined
+    assert bool((found.tracked.motion == 0).all())
+
+
+def test_known_motions_leave_only_the_noise_of_keypoints() -> None:
+    """What is built from the same tracks, landmarks and the scatter of poses, takes the motions into account."""
+    moved = motions(1.0)
+    points, views, true = capture(moved)
+    tracked = tracked_views(views, points)
+    known = tracked.at(true, moved)
+    seen, positions = known.triangulated(LandmarkConfig())
+    blind, elsewhere = tracked.triangulated(LandmarkConfig())
+    off, before = (
+        torch.stack([update[3:].norm() for update in pose_updates(*pair, NOISE).values()]).median()
+        for pair in ((seen, positions), (blind, elsewhere))
+    )
+    assert len(seen.point) > len(blind.point)
+    assert float(off) < 0.5 * float(before)
+
+
+def test_views_with_a_motion_are_tracked_with_it() -> None:
+    points, views, _ = capture(motions(1.0))
+    moving = [replace(view, motion=motion) for view, motion in zip(views, motions(1.0), strict=True)]
+    assert torch.equal(tracked_views(moving, points).motion, motions(1.0))
+
+
+def test_the_motion_is_stored_with_the_pose() -> None:
+    found, views, _ = refined(motions(1.0))
+    poses, moved = found.tracked.T_world_camera, found.tracked.motion
+    trained = [replace(v, T_ref_camera=poses[i], motion=moved[i]) for i, v in enumerate(views)]
+    cameras = moved_from(views, stored_cameras(trained), found.pixels.tolist())
+    again = at_stored_poses(views, cameras)
+    for one, other in zip(again, trained, strict=True):
+        assert one.motion is not None
+        assert other.motion is not None
+        assert torch.equal(one.motion, other.motion)
+    assert found.consistency is not None
+    noise = found.consistency.noise_before, found.consistency.noise_after
+    lines = pose_sentences(cameras, PoseRefinement(*noise, True))
+    assert len(lines) == 2
+    assert "exposed one after another" in lines[1]
+    metres, radians = (median(moved[:, part].norm(dim=-1).tolist()) for part in (slice(3), slice(3, 6)))
+    assert f"by {metres:.2g} and {degrees(radians):.2g}°" in lines[1]
+
+
+def test_training_draws_the_rays_of_the_rows() -> None:
+    view = replace(unseen(), motion=motions(1.0)[2], landmarks=None)
+    still = replace(unseen(), landmarks=None)
+    batch = RayBank([still, view], BOUNDS).draw(500, torch.Generator().manual_seed(0))
+    for number, one in enumerate((still, view)):
+        expected = observe(one, all_pixels(one.frame))
+        here = batch.image == number
+        nearest = torch.cdist(batch.rays.directions[here], expected.directions).argmin(1)
+        close = {"rtol": 0.0, "atol": 1e-5}
+        torch.testing.assert_close(batch.rays.directions[here], expected.directions[nearest], **close)
+        torch.testing.assert_close(batch.rays.origins[here], expected.origins[nearest], **close)
+    assert int((batch.image == 1).sum()) > 100
+
+
+def test_an_image_is_rendered_row_by_row() -> None:
+    view, motion = unseen(), motions(2.0)[1]
+    image = render_image(ground(), CAMERA, view.T_ref_camera, BOUNDS, motion=motion)
+    rays = observe(replace(view, motion=motion), all_pixels(view.frame))
+    rendered = render(ground(), BOUNDS.rays(rays.origins, rays.directions), BOUNDS.background)
+    expected = rendered.rgb.clamp(0, 1).reshape_as(image.rgb)
+    torch.testing.assert_close(image.rgb, expected, rtol=0, atol=1e-3)
+    at_rest = render_image(ground(), CAMERA, view.T_ref_camera, BOUNDS)
+    assert float((image.rgb - at_rest.rgb).abs().max()) > 0.1
+    zero = render_image(ground(), CAMERA, view.T_ref_camera, BOUNDS, motion=torch.zeros(6).double())
+    assert torch.equal(zero.rgb, at_rest.rgb)
+
+
+def test_the_columns_of_a_portrait_image_are_the_rows_of_its_sensor() -> None:
+    upright = replace(PINHOLE, cx=PINHOLE.cy, cy=PINHOLE.cx, width=PINHOLE.height, height=PINHOLE.width)
+    points = Points(noise=NOISE)
+    moved = motions(1.0)
+    views = [
+        points.view(looking_in(0.105 * i, 0.3 * (i % 3)), upright, seed=i, motion=moved[i])
+        for i in range(VIEWS)
+    ]
+    assert evidence_prior(tracked_views(views, points)) != STILL
