@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
+from bidnerf_core.localization.landmark_trial import tried_landmarks
 from bidnerf_core.localization.training_poses import TrainingPoses, training_poses
 from bidnerf_core.map_cameras import (
     PoseRefinement,
@@ -183,3 +184,16 @@ def test_the_columns_of_a_portrait_image_are_the_rows_of_its_sensor() -> None:
         for i in range(VIEWS)
     ]
     assert evidence_prior(tracked_views(views, points)) != STILL
+
+
+def test_a_trial_finds_the_motions_that_the_map_knows() -> None:
+    """If it took the images of moving cameras as still, their keypoints would seem to have large common errors."""
+    count = 48
+    points, moved = Points(noise=NOISE), motions(2.0).repeat(3, 1)
+    poses = [looking_in(0.105 * i, 0.3 * (i % 3)) for i in range(count)]
+    seen = [points.view(T, seed=i, motion=moved[i]) for i, T in enumerate(poses)]
+    views = [replace(view, motion=motion) for view, motion in zip(seen, moved, strict=True)]
+    landmarks = tried_landmarks(tracked_views(views, points), views, points)
+    assert landmarks.trial.found == 6
+    assert landmarks.trial.rotation_deg < 0.08
+    assert landmarks.correlation < 5

@@ -111,8 +111,8 @@ def _answers(
     for number in held_out:
         T = views[number].T_ref_camera.to("cpu", torch.float64)
         view = View(views[number].frame, SE3.identity())
-        # The given poses that it is compared with contain no motion either.
-        found = propose(matcher, [view], features, moving=False)
+        # Poses that were found without a motion are compared with such poses.
+        found = propose(matcher, [view], features, moving=views[number].motion is not None)
         if found is not None and landmark_verdict(found).accepted:
             answers.append(_Answer(found, (T.inverse() @ found.T_world_camera).log()))
     return answers
