@@ -7,8 +7,8 @@ PSNR of images, the absolute error of depth where depth was measured, and the nu
 exposure of a photo that it was not trained on: PSNR is measured as rendered, and after the gain and the offset per colour
 channel that fit the photo best. The poses of test frames may be as inaccurate as those of training frames were: PSNR is also
 measured at poses of the test frames that are refined with the map's landmarks, and on training frames at the poses in the map;
-both with the motion of a rolling shutter, where one was found. The errors of poses by landmarks are those that the map's own
-trial found.
+both with the motion of a rolling shutter, where one was found. The errors that the landmarks had in their own trial are recorded
+too.
 Coarser levels are judged on every fifth frame. A field that offers ``dense``, itself without the selection of samples that
 makes it fast, is compared with that on every fifth frame. ``--test-frames-only`` leaves out training frames, poses by
 landmarks and ``dense``, for backends that take minutes to render an image. ``--without-depth`` withholds the measured depth of

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import degrees
 from statistics import median
+from typing import Any
 
 import pytest
 import torch
@@ -99,6 +100,25 @@ def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
     assert float(turned(found.tracked.T_world_camera, poses).median()) < 0.5 * float(
         turned(given, poses).median()
     )
+
+
+def test_motions_are_noticed_though_the_poses_are_right() -> None:
+    """As structure from motion gives them for the frames of a video: the keypoints alone contradict a camera at rest."""
+    found, _, _ = refined(motions(1.0), pose_error=0.0)
+    assert found.refined
+    assert bool((found.tracked.motion != 0).any())
+
+
+@pytest.mark.parametrize("pose_error", [0.0, 0.004])
+@pytest.mark.parametrize(
+    "wrong", [{"fy": 1.05 * PINHOLE.fy}, {"cx": PINHOLE.cx + 10}, {"distortion": (0.2, 0, 0, 0)}]
+)
+def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float) -> None:
+    points, views, _ = capture(motions(0.0), pose_error)
+    camera = replace(PINHOLE, **wrong)
+    views = [replace(view, frame=replace(view.frame, intrinsics=camera)) for view in views]
+    found = training_poses(tracked_views(views, points), views, features=points)
+    assert bool((found.tracked.motion == 0).all())
 
 
 def test_cameras_at_rest_get_no_motion() -> None:

@@ -18,7 +18,7 @@ from bidnerf_core.mapping.resection import LEAST_NOISE
 from bidnerf_core.mapping.shutter_evidence import common_motion
 from bidnerf_core.mapping.triangulation import noise
 from bidnerf_core.robust import MAD_TO_SIGMA
-from bidnerf_core.rolling_shutter import STILL
+from bidnerf_core.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.se3 import SE3
 
 ROUNDS = 3
@@ -50,9 +50,9 @@ def adjusted_poses(
 
     The errors of the given poses are taken as independent of each other, and as large as resection of the images
     suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean motion of the images
-    is about zero. If the first adjustment finds an inconsistency of less than ``least`` pixels, its poses are returned at once.
-    Otherwise, and if the keypoints show that the rows of the images were exposed one after another by moving cameras, these
-    motions are estimated too.
+    is about zero. If the keypoints show that the cameras moved while the rows of their images were exposed, these motions are
+    estimated too. Otherwise, if the first adjustment finds an inconsistency of less than ``least`` pixels, its poses are
+    returned at once.
     """
     given = tracked.T_world_camera
     seen, points = tracked.triangulated(config)
@@ -62,33 +62,36 @@ def adjusted_poses(
         return None
     motion = STILL
     for number in range(ROUNDS):
-        pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
-        unmeasured = torch.zeros(len(seen.point), dtype=torch.float64)
-        sightings = MeasuredSightings(
-            seen.sightings,
-            seen.image,
-            unmeasured,
-            pixel_noise,
-            1.0,
-            CORRELATED_KEYPOINTS,
-            seen.exposure_times,
-        )
-        prior = PosePrior(given, *deviations, motion)
+        sightings, prior = _measured(seen, points), PosePrior(given, *deviations, motion)
         fit = adjusted(sightings, points, prior, tracked.T_world_camera, motion=tracked.motion)
         step = _motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
         moved = (given.inverse() @ fit.T_world_camera).log()
         deviations = max(deviations[0], _spread(moved[:, :3])), max(deviations[1], _spread(moved[:, 3:]))
         pixels = _motion(seen, fit.points, given, fit.T_world_camera)
         tracked = tracked.at(fit.T_world_camera, fit.motion)
-        if number == 0 and _found(tracked, pixels, before, config).consistency.inconsistency < least:
-            break
+        noticed = motion == STILL and (motion := _common_motion(tracked, config)) != STILL
+        if number == 0 and not noticed:
+            found = _found(tracked, pixels, before, config)
+            if found.consistency.inconsistency < least:
+                return found
         tracked = tracked.matched_anew(config, progress)
-        seen, points = tracked.triangulated(config)
-        if motion == STILL and (motion := common_motion(seen, points, CORRELATED_KEYPOINTS)) != STILL:
-            continue
-        if float(step.max()) <= SETTLED_PIXELS:
+        if float(step.max()) <= SETTLED_PIXELS and not noticed:
             break
+        seen, points = tracked.triangulated(config)
     return _found(tracked, pixels, before, config)
+
+
+def _measured(seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> MeasuredSightings:
+    """Return the keypoints without their measured depth, as sightings for an adjustment."""
+    pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
+    unmeasured = torch.zeros(len(seen.point), dtype=torch.float64)
+    return MeasuredSightings(
+        seen.sightings, seen.image, unmeasured, pixel_noise, 1.0, CORRELATED_KEYPOINTS, seen.exposure_times
+    )
+
+
+def _common_motion(tracked: TrackedViews, config: LandmarkConfig) -> MotionPrior:
+    return common_motion(*tracked.triangulated(config), CORRELATED_KEYPOINTS)
 
 
 def _found(
