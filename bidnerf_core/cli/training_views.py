@@ -9,6 +9,7 @@ from typing import Literal
 from bidnerf_core.carving import has_outline
 from bidnerf_core.cli.common import say
 from bidnerf_core.cli.progress import counted
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.map_cameras import (
@@ -20,6 +21,7 @@ from bidnerf_core.map_cameras import (
 )
 from bidnerf_core.mapping.capture_coverage import shows_distances
 from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedViews, tracked_views
+from bidnerf_core.mapping.pose_conventions import other_convention
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
 
 RefinementChoice = Literal["auto", "always", "never"]
@@ -89,8 +91,12 @@ def _lacks_distances(view: View) -> bool:
 
 
 def _tracked(views: Sequence[View]) -> TrackedViews:
+    """Track the keypoints of the views. Raises ``InputError`` if their poses are plainly in another convention."""
     with counted("landmarks", "steps") as report:
-        return tracked_views(views, progress=report)
+        tracked = tracked_views(views, progress=report)
+    if (other := other_convention(tracked.observations.images)) is not None:
+        raise InputError(other.sentence)
+    return tracked
 
 
 def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:

@@ -71,7 +71,8 @@ def tried_landmarks(
 ) -> LandmarkMap:
     """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on images that are held out.
 
-    The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks. Raises
+    The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks, and enlarges
+    ``pose_covariance`` if errors are larger than any ``correlation`` explains, as where many given poses are wrong. Raises
     ``InputError`` if there are no landmarks.
     """
     landmarks = tracked.landmarks(config, report)
@@ -83,6 +84,8 @@ def tried_landmarks(
     usual = float(torch.tensor([float(answer.matches) for answer in answers]).median())
     landmarks = replace(landmarks, usual_matches=usual)
     landmarks = replace(landmarks, correlation=_correlation(answers, landmarks))
+    if landmarks.correlation > 0.99 * CORRELATIONS[1]:
+        landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + _unexplained(answers))
     return replace(landmarks, calibration_scatter=_calibration_scatter(answers, landmarks))
 
 
@@ -141,6 +144,12 @@ def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
         squared = torch.einsum("ni,nij,nj->n", updates, information, updates)
         low, high = (middle, high) if float(squared.quantile(QUANTILE)) > expected else (low, middle)
     return (low * high) ** 0.5
+
+
+def _unexplained(answers: Sequence[_Answer]) -> Float[Tensor, "6 6"]:
+    """Return the covariance of independent errors along each axis as large as those of the answers."""
+    squared = torch.stack([answer.update for answer in answers]).square()
+    return torch.diag(squared.quantile(QUANTILE, dim=0) / float(chi2.ppf(QUANTILE, 1)))
 
 
 def _factors(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
