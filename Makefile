@@ -25,7 +25,7 @@ help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
 
 demo: $(VENV)/.installed-plots ## train a small scene, find poses in it, draw the result in demo-out/
-	@$(BIN)/bidnerf demo --out $(DEMO_OUT)
+	@$(BIN)/bidnerf demo --out $(DEMO_OUT) --overwrite
 
 test: $(VENV)/.installed-dev ## all tests; ARGS="-k se3" for some
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL) $(ARGS)

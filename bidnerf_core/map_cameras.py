@@ -15,6 +15,9 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
 
+NAMED = 6
+"""Largest number of images that a sentence names."""
+
 MatrixRows = tuple[tuple[float, float, float, float], ...]
 """The rows of a 4x4 matrix."""
 RowMotion = tuple[float, float, float, float, float, float]
@@ -134,7 +137,8 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
     wrong = [m for m in moved if m.name in found.replaced]
     error = f"errors of the given poses add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
     refined = found.refined and moved
-    lines = [f"{error}; {_typical_motion(moved)}" if refined else f"{error}; the poses are kept"]
+    kept = "the other poses are kept" if wrong else "the poses are kept"
+    lines = [f"{error}; {_typical_motion(moved)}" if refined else f"{error}; {kept}"]
     if motions := [m.motion for m in moved if m.motion is not None]:
         metres, degrees = _sizes(motions)
         lines.append(
@@ -142,7 +146,9 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
             f" {degrees:.2g}° (median)"
         )
     if wrong:
-        listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in wrong)
+        most = sorted(wrong, key=lambda m: m.pixels, reverse=True)[:NAMED]
+        listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in most)
+        listed += f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
         lines.append(f"moved to where the landmarks of the other images place them: {listed}")
     return lines
 

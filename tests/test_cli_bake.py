@@ -321,3 +321,24 @@ def test_a_damaged_record_of_photos_is_named_in_a_line(folder: Path, content: st
     assert file.name in err
     file.unlink()
     assert "missing" in bidnerf("info", folder).err
+
+
+def test_photos_of_another_scene_are_not_baked_into_a_map(
+    shared: Path, folder: Path, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiny.write_dataset(tmp_path / "other", train=9)
+    for file in (tmp_path / "other").glob("transforms*.json"):  # photos from elsewhere, as of another scene
+        described = json.loads(file.read_text())
+        for number, frame in enumerate(described["frames"]):
+            frame["transform_matrix"][0][3] += 0.01 * (1 + number)
+        file.write_text(json.dumps(described))
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    monkeypatch.setattr(module, "colour_noise", lambda *_: 0.31)
+    status, _, err = bidnerf("bake", folder, "--data", tmp_path / "other", *COARSE)
+    assert (status, err.count("\n")) == (1, 1)
+    assert "differ from the photos" in err
+    assert "by 31%" in err
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    monkeypatch.setattr(module, "colour_noise", lambda *_: 0.1)  # new photos of the same scene
+    assert bidnerf("bake", folder, "--data", tmp_path / "other", *COARSE).status == 0
+    assert bidnerf("bake", folder, "--data", shared / "data", *COARSE).status == 0

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.cli import common, main
+from bidnerf_core.cli import common, localize, main
 from bidnerf_core.cli.help_page import without_expert_settings
 from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
@@ -317,3 +317,36 @@ def test_public_names_are_there_and_no_others() -> None:
     )
     with pytest.raises(AttributeError, match="no attribute 'localise'"):
         _ = bidnerf_core.localise
+
+
+@pytest.mark.parametrize(("name", "kept"), [("found.json", True), ("found.txt", False), (None, False)])
+def test_an_interrupted_run_keeps_its_answers(
+    bidnerf: Run, shared: Path, place: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    name: str | None, kept: bool,
+) -> None:  # fmt: skip
+    """Of the 3 photos, 2 are answered; two steps from a start do not converge, so a trajectory would be empty."""
+
+    def stopping(number: int, *arguments: Any) -> Any:
+        if number == 2:
+            raise KeyboardInterrupt
+        return answered(number, *arguments)
+
+    answered = localize._answered
+    monkeypatch.setattr(localize, "_answered", stopping)
+    out = [] if name is None else ["--out", tmp_path / name]
+    status, _, err = bidnerf(*place, shared / "photos", *FOCAL, *out)
+    assert status == 130
+    assert [file.name for file in tmp_path.iterdir()] == ([name] if kept else [])
+    if kept and name:
+        assert f"{name}: holds the answers to 2 of 3 images" in err
+        found = json.loads((tmp_path / name).read_text())
+        assert [each["frame"] for each in found] == ["t_0000", "t_0001"]
+
+
+def test_a_photo_without_depth_among_others_is_named(bidnerf: Run, shared: Path, place: list[object]) -> None:
+    photos = [shared / "photos" / f"{name}.png" for name in ("t_0000", "t_0001")]
+    depth = shared / "depth/t_0000.depth.png"
+    status, _, err = bidnerf(*place, *photos, *FOCAL, "--depth", depth)
+    assert status == 0, err
+    assert "t_0001: no measured depth was given; colour only" in err
+    assert "t_0000: no measured depth" not in err

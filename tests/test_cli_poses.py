@@ -14,12 +14,14 @@ import tiny
 from bidnerf_core import View
 from bidnerf_core.cli import training_views
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.errors import InputError
 from bidnerf_core.localization.training_poses import TrainingPoses
 from bidnerf_core.map_cameras import PoseConsistency, as_given, stored_cameras
 from bidnerf_core.map_parts import load_capture
-from bidnerf_core.mapping.landmark_building import TrackedViews
+from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
 from bidnerf_core.storage import cameras_of, load_info
 from commands import Run
+from landmark_scene import Points, ring
 from test_cli import assert_same_map, stop_at
 from tiny import backends_listed_once  # noqa: F401
 
@@ -122,3 +124,44 @@ def test_a_damaged_given_pose_is_named(bidnerf: Run, data: Path, tmp_path: Path)
     status, _, err = bidnerf("info", tmp_path / "map")
     assert (status, err.count("\n")) == (1, 1)
     assert "not a rigid transform" in err
+
+
+def measured(ratio: float) -> TrackedViews:
+    """Images whose measured depth is ``ratio`` times the true one."""
+    points = Points(noise=0.3)
+    return tracked_views(ring(points, 8, depth=ratio), points)
+
+
+@pytest.mark.parametrize("ratio", [1000.0, 0.001, 0.3048])
+def test_depth_in_another_unit_is_refused(ratio: float) -> None:
+    with pytest.raises(InputError, match=r"times as long as the poses .*depth_unit_scale_factor"):
+        training_views._check_depth_unit(measured(ratio))
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(1.08, True), (0.94, True), (1.02, False)])
+def test_a_scale_of_depth_that_is_a_few_percent_off_is_told(
+    ratio: float, said: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training_views._check_depth_unit(measured(ratio))
+    assert (
+        "times as long as the poses and the photos say; training takes both" in capsys.readouterr().err
+    ) == said
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_training_refuses_axes_of_other_software(bidnerf: Run, data_dir: Path, tmp_path: Path) -> None:
+    source = data_dir / "room_living"
+    described = json.loads((source / "transforms_train.json").read_text())
+    described["frames"] = described["frames"][:30]
+    for frame in described["frames"]:
+        frame["transform_matrix"] = [[a, -b, -c, d] for a, b, c, d in frame["transform_matrix"]]
+        for key in ("file_path", "depth_file_path"):
+            frame[key] = str(source / frame[key])
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/transforms_train.json").write_text(json.dumps(described))
+    status, _, err = bidnerf("train", tmp_path / "data", "--out", tmp_path / "map", *tiny.options(2))
+    assert status == 1
+    assert "the poses contradict the photos" in err
+    assert "diag(1, -1, -1, 1)" in err
+    assert not (tmp_path / "map/map.json").exists()

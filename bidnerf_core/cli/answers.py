@@ -141,6 +141,15 @@ class Answers:
                 f"{self.failures} of {self._total} queries could not be read or localized, see above"
             )
 
+    def keep(self) -> None:
+        """Write the file of poses with the answers so far, if a run of several queries is interrupted."""
+        accepted = [answer.posed for answer in self._given if answer.found.converged]
+        out = self._spec.out
+        if out is None or not (accepted or (_ending(out) == ".json" and self._objects)):
+            return
+        self._write(out, accepted)
+        say(f"{out}: holds the answers to {len(self._objects)} of {self._total} images")
+
     def _write(self, out: Path, accepted: list[PosedImage]) -> None:
         if _ending(out) == ".json":
             write_file(out, (json.dumps(self._objects, indent=1, allow_nan=False) + "\n").encode())
@@ -150,7 +159,7 @@ class Answers:
                 f"{out}: not written, since no pose converged; a name ending with .json takes all"
             )
         WRITERS[_ending(out)](out, accepted)
-        left_out = self._total - len(accepted)
+        left_out = len(self._objects) - len(accepted)
         if left_out:
             say(f"{out}: {amount(len(accepted), 'pose')}; {left_out} without an accepted pose are left out")
 

@@ -22,13 +22,14 @@ from bidnerf_core.cli.common import (
     read_views,
     say,
 )
+from bidnerf_core.cli.opened_map import unfinished
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames import View
 from bidnerf_core.localization.capture_survey import surveyed
 from bidnerf_core.localization.landmark_trial import tried_landmarks
-from bidnerf_core.map_cameras import at_stored_poses
+from bidnerf_core.map_cameras import at_stored_poses, stored_cameras
 from bidnerf_core.map_parts import load_landmarks
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.capture_advice import summary
@@ -48,6 +49,10 @@ from bidnerf_core.storage import (
     save_landmarks,
     save_surface,
 )
+
+UNLIKE, UNLIKE_ITS_OWN = 0.2, 2.0
+"""Least difference (RMS) between rendered and photographed colours in another scene: as such, and as a multiple of that between
+the field and the photos that the map was made of."""
 
 
 def run(arguments: list[str]) -> None:
@@ -89,7 +94,22 @@ def _bake(
         if data is not None:
             dataset = open_dataset(data, info.bounds.background, camera=camera, register_depth=registration)
             views = at_stored_poses(read_views(dataset, split), info.cameras)
+            _check_scene(map, data, views)
         bake_map(map, views, config, rendered_landmarks, device=there)
+
+
+def _check_scene(folder: Path, data: Path, views: Sequence[View]) -> None:
+    """Raise ``InputError`` for photos of another scene: none of those that the map was made of, and unlike its field."""
+    stored = load_map(folder, baked=False)
+    own = {(camera.name, camera.T_world_camera) for camera in stored.info.cameras}
+    if not own or any((c.name, c.T_world_camera) in own for c in stored_cameras(views)):
+        return
+    off = colour_noise(stored.field, stored.bounds, views)
+    if off > max(UNLIKE, UNLIKE_ITS_OWN * (stored.colour_noise or 0)):
+        raise InputError(
+            f"{folder}: made from {stored.info.data!r}, and its renderings differ from the photos of {data} by {off:.0%} of the"
+            " range of colours; expected photos of the same scene, with poses in the coordinates of the map"
+        )
 
 
 def bake_map(
@@ -104,6 +124,8 @@ def bake_map(
     ``device``.
     """
     stored = load_map(folder, device, baked=False)  # its baked parts may be damaged, and are replaced anyway
+    if (stopped := unfinished(folder)) is not None:
+        say(f"{folder}: {stopped}")
     places = [(view.frame.intrinsics, view.T_ref_camera) for view in views]
     cameras = cameras_of(stored.info) or places
     if not cameras:

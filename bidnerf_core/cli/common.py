@@ -243,7 +243,10 @@ def _check_free(out: Path, overwrite: bool) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected the name of a folder")
     if out.is_dir() and not overwrite and not all(map(_is_leftover, out.iterdir())):
-        raise InputError(f"{out}: exists already and is not empty; name another --out or pass --overwrite")
+        from bidnerf_core.cli.opened_map import unfinished
+
+        what = unfinished(out) or "exists already and is not empty"
+        raise InputError(f"{out}: {what}; name another --out or pass --overwrite")
 
 
 def _is_leftover(file: Path) -> bool:

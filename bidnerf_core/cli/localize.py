@@ -30,6 +30,7 @@ from bidnerf_core.cli.common import (
 )
 from bidnerf_core.cli.depth_remark import depth_remark
 from bidnerf_core.cli.method_options import Preset, chosen_settings
+from bidnerf_core.cli.opened_map import opened_map
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import (
     DepthPoints,
@@ -46,7 +47,7 @@ from bidnerf_core.evaluation.trials import places_of
 from bidnerf_core.localization import METHODS, AutoConfig, Localizer
 from bidnerf_core.localization.methods import require_use_of_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.storage import Map, load_map
+from bidnerf_core.storage import Map
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
 
@@ -141,11 +142,11 @@ def run(arguments: list[str]) -> None:
         if not query:
             raise UsageError("no QUERY, expected image files, folders of photos, or a folder of a dataset")
         if METHODS[method].needs_start and not begin.given:
-            raise InputError(f"method {method!r} needs a start; give one, or take method 'auto'")
+            raise InputError(f"method {method!r} needs a start; give one by --start, or take method 'auto'")
         if depth_points is not None:
             require_use_of_depth(method)
         output.prepare()
-        stored = load_map(map)
+        stored = opened_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
         photos = replace(photos, assumed=_assumed_cameras(stored.landmarks, config))
         source = open_queries(query, photos, frames, stored.bounds.background, points)
@@ -179,19 +180,23 @@ def _localize(
     """Localize each query. A failure does not stop the others; the error of a single query is raised."""
     total = len(source.names)
     without_depth = list[str]()
-    with counted("localizing", "images", total) as report:
-        for number, name in enumerate(source.names):
-            try:
-                answer = _answered(number, source, localizer, begin, seed, without_depth)
-            except UsageError:
-                raise
-            except InputError as error:
-                if total == 1:
+    try:
+        with counted("localizing", "images", total) as report:
+            for number, name in enumerate(source.names):
+                try:
+                    answer = _answered(number, source, localizer, begin, seed, without_depth)
+                except UsageError:
                     raise
-                answers.fail(name, localizer.method, error)
-            else:
-                answers.add(answer)
-            report(number + 1, total)
+                except InputError as error:
+                    if total == 1:
+                        raise
+                    answers.fail(name, localizer.method, error)
+                else:
+                    answers.add(answer)
+                report(number + 1, total)
+    except KeyboardInterrupt:
+        answers.keep()
+        raise
     answers.finish()
 
 

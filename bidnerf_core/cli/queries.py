@@ -149,6 +149,8 @@ class Photos:
         for warning in caught:
             self._remark(name, str(warning.message).partition(": ")[2] or str(warning.message))
         self._remark(name, f"{frame.camera_source}")
+        if self._depth and file not in self._depth:
+            say(f"{name}: no measured depth was given; colour only")
         views = (View(replace(frame, name=name), SE3.identity()),)
         rays = None if self._points is None else self._points.rays(views, "")
         return Query(name, views, depth_rays=rays, file=file)

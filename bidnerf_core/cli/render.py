@@ -27,6 +27,7 @@ from bidnerf_core.cli.common import (
     say,
     show,
 )
+from bidnerf_core.cli.opened_map import opened_map
 from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
@@ -34,7 +35,7 @@ from bidnerf_core.field import RadianceField, SceneBounds, levels
 from bidnerf_core.files import write_file
 from bidnerf_core.frames import Frame, View
 from bidnerf_core.rendering import RenderedImage, render_image
-from bidnerf_core.storage import Map, load_map
+from bidnerf_core.storage import Map
 
 DEEPEST = 65.535  # metres that a 16-bit image of millimetres can hold
 
@@ -62,7 +63,7 @@ def _render(
     and prints PSNR and depth error against the dataset's images.
     """
     with output_folder(out, overwrite):
-        stored = load_map(map)
+        stored = opened_map(map)
         field = stored.field if level is None else _level(stored, level, map)
         names = [name for group in frame for name in group]
         registration = depth_registration(register_depth)

@@ -34,6 +34,7 @@ from bidnerf_core.cli.common import (
     say,
 )
 from bidnerf_core.cli.following import STDIN, requests
+from bidnerf_core.cli.opened_map import opened_map
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.cli.tracked_path import TrackedPath, check_out
@@ -45,7 +46,6 @@ from bidnerf_core.evaluation.plot_style import require_matplotlib
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization import AutoConfig, Localization, Localizer, Tracker, TrackerConfig
 from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import load_map
 
 TRIED = 3
 """Number of unreadable frames at the beginning of a sequence after which it is given up: probably none can be read."""
@@ -121,7 +121,7 @@ def run(arguments: list[str]) -> None:
         registration = depth_registration(register_depth)
         sensor = given_sensor(sequence, registration) if follow else None
         begin, settings = None if start is None else read_pose(start), AutoConfig(depth_sensor=depth_sensor)
-        stored = load_map(map)
+        stored = opened_map(map)
         assumed = () if stored.landmarks is None else stored.landmarks.cameras
         path = TrackedPath(stored.info)
         tracker = Tracker(Localizer(stored, config=settings), config, begin)

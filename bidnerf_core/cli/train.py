@@ -219,7 +219,7 @@ def _check_unchanged(out: Path, info: MapInfo, backend: str | None, default: Any
     for key, value in given.items():
         if value not in (usual[key], stored[key]):
             raise UsageError(
-                f"{out}: was begun with {key} {stored[key]}, got {value}; --resume keeps settings"
+                f"{out}: was begun with {key} {stored[key]}, got {value}; --resume keeps settings, --overwrite begins anew"
             )
 
 

@@ -20,12 +20,19 @@ from bidnerf_core.map_cameras import (
     stored_cameras,
 )
 from bidnerf_core.mapping.capture_coverage import shows_distances
+from bidnerf_core.mapping.keypoint_depth import depth_ratio
 from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedViews, tracked_views
 from bidnerf_core.mapping.pose_conventions import other_convention
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
 
 RefinementChoice = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` refines them if they are inconsistent."""
+
+
+UNUSUAL_RATIO = 0.05
+"""Least relative error of measured depth, compared with triangulated points, that is worth a remark."""
+OTHER_UNIT = 2.0
+"""Ratio of measured depth to triangulated depth, or the reverse, that only another unit explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +98,27 @@ def _lacks_distances(view: View) -> bool:
 
 
 def _tracked(views: Sequence[View]) -> TrackedViews:
-    """Track the keypoints of the views. Raises ``InputError`` if their poses are plainly in another convention."""
+    """Track the keypoints of the views. Raises ``InputError`` where poses or depth are plainly in another convention or unit."""
     with counted("landmarks", "steps") as report:
         tracked = tracked_views(views, progress=report)
     if (other := other_convention(tracked.observations.images)) is not None:
         raise InputError(other.sentence)
+    _check_depth_unit(tracked)
     return tracked
+
+
+def _check_depth_unit(tracked: TrackedViews) -> None:
+    seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
+    ratio = depth_ratio(seen.sightings, points, tracked.depth[seen.number])
+    if ratio is None or abs(ratio - 1) < UNUSUAL_RATIO:
+        return
+    remark = f"measured depth is {ratio:.3g} times as long as the poses and the photos say"
+    if not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
+        raise InputError(
+            f"{remark}; expected depth and poses in the same unit: check the unit of the depth images"
+            " (depth_unit_scale_factor in a transforms.json) and the scale of the poses"
+        )
+    say(f"{remark}; training takes both as they are")
 
 
 def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:

@@ -26,8 +26,9 @@ from bidnerf_core.datasets.transforms import TransformsReader
 from bidnerf_core.datasets.tum import TumReader
 from bidnerf_core.datasets.video import VIDEO_SUFFIXES, open_video
 from bidnerf_core.datasets.writing import write_transforms
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.images import Background
+from bidnerf_core.photos import photos_in
 
 __all__ = [
     "READERS",
@@ -132,8 +133,7 @@ def open_dataset(
     readers = READERS if readers is None else readers
     reader = _reader_of(folder, readers)
     if reader is None:
-        expected = " or ".join(reader.expected for reader in readers)
-        raise InputError(f"{folder}: no dataset found, expected {expected}")
+        raise InputError(f"{folder}: {_without_dataset(folder, readers)}")
     reader = _with_sensor(_with_camera(reader, folder, GivenCamera(camera)), folder, register_depth)
     return reader.open(folder, background)
 
@@ -201,6 +201,23 @@ def _with_sensor(reader: Reader, folder: Path, register: DepthRegistration | Non
     if register is True and reader.sensor is not None:
         return reader
     return reader.with_depth_sensor(given_sensor(folder, register))
+
+
+def _without_dataset(folder: Path, readers: Sequence[Reader]) -> str:
+    """Return why a folder is no dataset, and what to do."""
+    inside = [
+        child.name for child in sorted(folder.iterdir()) if child.is_dir() and _reader_of(child, readers)
+    ]
+    if inside:
+        return f"no dataset found, expected one of the folders in it, such as {inside[0]}"
+    photos, _ = photos_in(folder)
+    expected = "expected " + "; or ".join(reader.expected for reader in readers)
+    if not photos:
+        return f"no dataset found, {expected}"
+    return (
+        f"no dataset found: {amount(len(photos), 'photo')} without poses; COLMAP finds poses for them, or give"
+        f" those of an AR framework or a robot; {expected}"
+    )
 
 
 def _reader_of(folder: Path, readers: Sequence[Reader]) -> Reader | None:

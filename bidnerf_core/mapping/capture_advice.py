@@ -85,7 +85,7 @@ def _trial(report: CaptureReport) -> Iterator[str]:
         return
     errors = f", median error {trial.translation:.3g} and {trial.rotation_deg:.2g}°" if trial.found else ""
     yield (
-        f"of {_photos(trial.images)} held out of the landmarks, {trial.found} {_were(trial.found)} localized by them"
+        f"of {_photos(trial.images)} held out, {trial.found} {_were(trial.found)} localized by the landmarks of the others alone"
         f"{errors}; expect similar results for new photos taken the same way"
     )
 

@@ -59,6 +59,15 @@ def keypoint_depth_noise(
     return max(1e-4, MAD_TO_SIGMA * float(off.abs().median()))
 
 
+def depth_ratio(
+    sightings: Sightings, points: Float[Tensor, "n 3"], depth: Float[Tensor, "m"]
+) -> float | None:
+    """Return the median ratio of measured depth to that of triangulated points; None with too few of them."""
+    z = sightings.in_camera(points)[:, 2]
+    known = (depth > 0) & (z > 0)
+    return float((depth[known] / z[known]).median()) if int(known.sum()) >= ENOUGH_DEPTHS else None
+
+
 def placed(
     observations: TrackedKeypoints, depth: Float[Tensor, "m"], relative: float, pixel_noise: float
 ) -> tuple[TrackedKeypoints, Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
