@@ -102,10 +102,11 @@ def _check_scene(folder: Path, data: Path, views: Sequence[View]) -> None:
     """Raise ``InputError`` for photos of another scene: none of those that the map was made of, and unlike its field."""
     stored = load_map(folder, baked=False)
     own = {(camera.name, camera.T_world_camera) for camera in stored.info.cameras}
-    if not own or any((c.name, c.T_world_camera) in own for c in stored_cameras(views)):
+    known = any((c.name, c.T_world_camera) in own for c in stored_cameras(views))
+    if known or not own or stored.colour_noise is None:
         return
     off = colour_noise(stored.field, stored.bounds, views)
-    if off > max(UNLIKE, UNLIKE_ITS_OWN * (stored.colour_noise or 0)):
+    if off > max(UNLIKE, UNLIKE_ITS_OWN * stored.colour_noise):
         raise InputError(
             f"{folder}: made from {stored.info.data!r}, and its renderings differ from the photos of {data} by {off:.0%} of the"
             " range of colours; expected photos of the same scene, with poses in the coordinates of the map"
