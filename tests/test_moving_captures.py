@@ -13,6 +13,12 @@ from torch import Tensor
 
 from bidnerf_core import SE3, View
 from bidnerf_core.localization.landmark_trial import tried_landmarks
+from bidnerf_core.localization.search.evident_motion import (
+    SHARE_AS_MAP,
+    SHARE_MOVING,
+    evident_motion,
+    share_moving,
+)
 from bidnerf_core.localization.training_poses import TrainingPoses, training_poses
 from bidnerf_core.map_cameras import (
     PoseRefinement,
@@ -21,8 +27,11 @@ from bidnerf_core.map_cameras import (
     pose_sentences,
     stored_cameras,
 )
+from bidnerf_core.mapping.calibration import FIXED
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
-from bidnerf_core.mapping.pose_scatter import pose_updates
+from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
+from bidnerf_core.mapping.pose_scatter import observed_points, pose_updates
+from bidnerf_core.mapping.resection import resect
 from bidnerf_core.mapping.shutter_evidence import common_motion
 from bidnerf_core.pixels import all_pixels, observe
 from bidnerf_core.rendering import render, render_image
@@ -217,3 +226,33 @@ def test_a_trial_finds_the_motions_that_the_map_knows() -> None:
     assert landmarks.trial.found == 6
     assert landmarks.trial.rotation_deg < 0.08
     assert landmarks.correlation < 5
+
+
+def test_landmarks_tell_how_many_of_their_images_moved() -> None:
+    moved = motions(1.0)
+    moved[:4] = 0
+    points, views, true = capture(moved)
+    landmarks = tracked_views(views, points).at(true, moved).landmarks(LandmarkConfig())
+    assert landmarks.moving == 0.75
+    assert landmarks_from_tensors(landmark_tensors(landmarks)).moving == 0.75
+    tensors = landmark_tensors(landmarks)
+    assert landmarks_from_tensors({k: v for k, v in tensors.items() if k != "moving"}).moving == 0
+    with pytest.raises(ValueError, match=r"moving is 1\.5, expected a share"):
+        landmarks_from_tensors(tensors | {"moving": torch.tensor(1.5, dtype=torch.float64)})
+    assert share_moving(landmarks) == 0.75 * SHARE_AS_MAP
+    assert share_moving(replace(landmarks, moving=0.0)) == SHARE_MOVING
+
+
+def test_weaker_motions_are_believed_where_the_map_moved() -> None:
+    """The same image, whose motion is about as probable as none, by either prior probability."""
+    points, views, true = capture(motions(0.35))
+    seen, positions = tracked_views(views, points).at(true).triangulated(LandmarkConfig())
+    taken = {SHARE_MOVING: 0, 0.8: 0}
+    for number in range(VIEWS):
+        own = (seen.image == number).nonzero()[:, 0]
+        data = observed_points(seen.sightings[own], positions, true[number])
+        data = replace(data, exposure_times=seen.exposure_times[own])
+        fit = resect(data, true[number], NOISE)
+        for share in taken:
+            taken[share] += evident_motion(data, fit, 1.0, FIXED, share).prior != STILL
+    assert taken[SHARE_MOVING] < taken[0.8]

@@ -89,7 +89,8 @@ class TrackedViews:
             raise InputError(
                 f"no landmark found in {images} images: expected texture that several images show from different places"
             )
-        return _bounded(found, config.most, report)
+        moving = float((self.motion != 0).any(1).double().mean())
+        return replace(_bounded(found, config.most, report), moving=moving)
 
     def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
         """Return the triangulated landmarks that each image shows; training uses their depth where none was measured."""

@@ -28,6 +28,7 @@ LATER_KINDS = {
     "usual_matches": ((), torch.float64),
     "calibration_scatter": ((4,), torch.float64),
     "trial": ((4,), torch.float64),  # the fields of ``HeldOutTrial`` in order
+    "moving": ((), torch.float64),
 }
 """Shape and dtype of the tensors that maps of earlier versions lack."""
 
@@ -60,7 +61,7 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
             raise ValueError(f"{name} holds NaN or infinity")
     _check_contents(tensors)
     parts: dict[str, Any] = {name: tensors[name] for name in present}
-    for name in {"noise", "correlation", "usual_matches"} & present.keys():
+    for name in {"noise", "correlation", "usual_matches", "moving"} & present.keys():
         parts[name] = float(tensors[name])
     if "trial" in parts:
         images, found, translation, rotation_deg = parts["trial"].tolist()
@@ -81,6 +82,8 @@ def _check_contents(tensors: dict[str, Tensor]) -> None:
         raise ValueError(f"correlation is {float(tensors['correlation'])}, expected a positive number")
     if "usual_matches" in tensors and not float(tensors["usual_matches"]) >= 0:
         raise ValueError(f"usual_matches is {float(tensors['usual_matches'])}, expected 0 or more")
+    if "moving" in tensors and not 0 <= float(tensors["moving"]) <= 1:
+        raise ValueError(f"moving is {float(tensors['moving'])}, expected a share of the images")
     if "calibration_scatter" in tensors and not bool((tensors["calibration_scatter"] > 0).all()):
         raise ValueError(
             f"calibration_scatter is {tensors['calibration_scatter'].tolist()}, expected positive"

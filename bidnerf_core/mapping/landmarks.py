@@ -49,6 +49,9 @@ class LandmarkMap:
         default_factory=lambda: torch.full((4,), 0.02, dtype=torch.float64)
     )
     trial: HeldOutTrial = HeldOutTrial()
+    moving: float = (
+        0.0  # share of the map's images whose cameras moved while rows were exposed, see ``rolling_shutter``
+    )
     cameras: tuple[Intrinsics, ...] = ()  # of the images, where known
 
     def __len__(self) -> int:

@@ -10,16 +10,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.mapping.calibration import FIXED, NOMINAL, CalibrationPrior
+from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
 ENOUGH_POINTS = 20
 """Least number of points that determine a motion: with fewer, the noise is as uncertain as the motion itself."""
-SHARE_MOVING = 1 / 30
-"""Prior probability that an image shows a motion.
+SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
+"""Prior probability that an image shows a motion, and that it does if those of the map do.
 
-It is low because lens stabilisers, and lenses that the intrinsics do not describe, distort images in similar ways.
+The first is low because lens stabilisers, and lenses that the intrinsics do not describe, distort images in similar ways.
 """
 
 LARGEST_MOTION = 22.5
@@ -42,12 +43,21 @@ class EvidentMotion:
     doubt: Float[Tensor, "6 6"] = field(default_factory=lambda: torch.zeros((6, 6), dtype=torch.float64))
 
 
+def share_moving(landmarks: LandmarkMap) -> float:
+    """Return the prior probability that an image of the scene shows a motion: its camera may be that of the map's images."""
+    return max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving)
+
+
 def evident_motion(
-    data: ObservedPoints, fit: ReprojectionFit, correlation: float, camera: CalibrationPrior = NOMINAL
+    data: ObservedPoints,
+    fit: ReprojectionFit,
+    correlation: float,
+    camera: CalibrationPrior = NOMINAL,
+    share: float = SHARE_MOVING,
 ) -> EvidentMotion:
     """Return the more probable of a camera at rest and one that moved, and the doubt about the pose that is left.
 
-    ``fit`` is a fit to these points. The intrinsics are free in all fits that are compared, as far as the prior ``camera``
+    ``fit`` is a fit to these points, and ``share`` the prior probability of a motion. The intrinsics are free in all fits that are compared, as far as the prior ``camera``
     leaves them open: what they explain is not a motion.
     """
     if len(data) < ENOUGH_POINTS:
@@ -62,10 +72,10 @@ def evident_motion(
     log_odds = [
         _log_evidence(points, found, still, motion, correlation) + math.log(share)
         for points, found, share in (
-            (data, moving, SHARE_MOVING * (1 - TURNED)), (transposed, turned, SHARE_MOVING * TURNED)
+            (data, moving, share * (1 - TURNED)), (transposed, turned, share * TURNED)
         )
     ]  # fmt: skip
-    of_still, of_moving, of_turned = torch.tensor([math.log(1 - SHARE_MOVING), *log_odds]).softmax(0).tolist()
+    of_still, of_moving, of_turned = torch.tensor([math.log(1 - share), *log_odds]).softmax(0).tolist()
     if not all(map(math.isfinite, (of_still, of_moving, of_turned))):
         return EvidentMotion()
     if max(of_moving, of_turned) < NEGLIGIBLE:

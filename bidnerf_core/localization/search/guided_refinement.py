@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.evident_motion import EvidentMotion, evident_motion
+from bidnerf_core.localization.search.evident_motion import EvidentMotion, evident_motion, share_moving
 from bidnerf_core.localization.search.guided import (
     ProjectedLandmarks,
     guided_matches,
@@ -175,7 +175,8 @@ def _evident_motion(
     """Return the motion of a single image's camera; a rig, whose views may be from different moments, counts as still."""
     if not query.may_move:
         return EvidentMotion()
-    return evident_motion(query.observed(found), free, query.landmarks.correlation_of(len(found)), camera)
+    correlation = query.landmarks.correlation_of(len(found))
+    return evident_motion(query.observed(found), free, correlation, camera, share_moving(query.landmarks))
 
 
 def _with_free_camera(

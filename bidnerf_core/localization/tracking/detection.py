@@ -13,6 +13,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
+from bidnerf_core.localization.search.evident_motion import share_moving
 from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches, projected_landmarks
 from bidnerf_core.localization.search.guided_refinement import RADII, matches_by_chance, usual_distance
 from bidnerf_core.localization.search.landmark_evidence import (
@@ -105,7 +106,8 @@ class LandmarkDetector:
         if seen is None:
             return None
         points, found, _ = seen
-        found = with_motion(found, self.landmarks.correlation_of(int(found.inliers.sum())))
+        correlation = self.landmarks.correlation_of(int(found.inliers.sum()))
+        found = with_motion(found, correlation, share_moving(self.landmarks))
         evidence = _guided_evidence(query, found, tight, most_distance)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
         points = replace(points, landmark=number[points.landmark])

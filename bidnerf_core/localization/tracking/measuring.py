@@ -17,6 +17,7 @@ from bidnerf_core.localization.covariance import INDEPENDENT
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.localization.search.evident_motion import share_moving
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import pixel_threshold
@@ -108,7 +109,8 @@ class ByLandmarks:
         found = fit_pose(
             points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation
         )
-        found = None if found is None else with_motion(found, correlation)
+        if found is not None:
+            found = with_motion(found, correlation, share_moving(self.detector.landmarks))
         judged = measured = None
         state = replace(state, age=state.age + 1)
         if found is not None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import Frame
-from bidnerf_core.localization.search.evident_motion import EvidentMotion, evident_motion
+from bidnerf_core.localization.search.evident_motion import SHARE_MOVING, EvidentMotion, evident_motion
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
@@ -136,9 +136,12 @@ def fit_pose(
     return other if other.within(threshold) > found.within(threshold) else found
 
 
-def with_motion(found: PointFit, correlation: float) -> PointFit:
-    """Return a fit with the camera's motion while its rows were exposed, if one is evident, and with the doubt about it."""
-    evident = evident_motion(found.data[found.inliers], found.fit, correlation)
+def with_motion(found: PointFit, correlation: float, share: float = SHARE_MOVING) -> PointFit:
+    """Return a fit with the camera's motion while its rows were exposed, if one is evident, and with the doubt about it.
+
+    ``share`` is the prior probability of a motion.
+    """
+    evident = evident_motion(found.data[found.inliers], found.fit, correlation, share=share)
     if evident.prior == STILL:
         return replace(found, evident=evident)
     start, noise, motion = found.T_world_camera, found.fit.noise, evident.prior
