@@ -24,12 +24,14 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from kornia.metrics import psnr, ssim
+from torch import Tensor
 
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.provenance import write_record
@@ -37,7 +39,7 @@ from bidnerf_core.field import RadianceField, SceneBounds, device_of, levels
 from bidnerf_core.frames import View
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.map_cameras import at_stored_poses
+from bidnerf_core.map_cameras import RowMotion, at_stored_poses
 from bidnerf_core.rendering import render_image
 from bidnerf_core.se3 import SE3
 from bidnerf_core.serialization import to_plain
@@ -152,6 +154,18 @@ def at_landmark_poses(stored: Map, views: list[View]) -> dict[str, Any] | None:
     }
 
 
+def moved_median(updates: Sequence[Tensor | RowMotion | None]) -> dict[str, float] | None:
+    """Return the median translation (metres) and rotation (degrees) of updates or motions; None if there are none."""
+    known = [torch.as_tensor(update, dtype=torch.float64) for update in updates if update is not None]
+    if not known:
+        return None
+    translation, rotation = torch.linalg.vector_norm(torch.stack(known).unflatten(-1, (2, 3)), dim=-1).T
+    return {
+        "translation": statistics.median(translation.tolist()),
+        "rotation_deg": statistics.median(rotation.rad2deg().tolist()),
+    }
+
+
 def on_training_frames(stored: Map, data: Path) -> dict[str, float | None]:
     """Return the quality on a few training frames, at their poses in the map."""
     views = open_dataset(data, stored.bounds.background).views("train")
@@ -216,6 +230,8 @@ def main() -> None:
         moved = [camera.moved for camera in stored.info.cameras if camera.moved is not None]
         results["pose_refinement"] = to_plain(stored.info.pose_refinement)
         results["pixels_moved_median"] = statistics.median(m.pixels for m in moved) if moved else 0.0
+        results["moved_median"] = moved_median([camera.update for camera in stored.info.cameras])
+        results["motion_median"] = moved_median([camera.motion for camera in stored.info.cameras])
     if not given.test_frames_only and (compared := beside_dense(stored.field, stored.bounds, views)):
         results["beside_dense"] = compared
     print(write_record(given.results / f"{given.name}.json", results, seed=stored.info.config.get("seed", 0)))
