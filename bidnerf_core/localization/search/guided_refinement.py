@@ -132,7 +132,9 @@ def _settled(
     fit, found = _guided(query, prior, fit, found, most, RADII)
     open_camera = prior.log_focal > 0
     free, crop = _with_free_camera(query, fit, found, open_camera)
-    evident = _evident_motion(query, free, found, ANY if crop > POSSIBLE_CROP else NOMINAL)
+    # Where a motion is probable from the outset, other intrinsics need not be given the benefit of the doubt.
+    usual = CALIBRATED if query.landmarks.moving > 0.5 and not open_camera else NOMINAL
+    evident = _evident_motion(query, free, found, ANY if crop > POSSIBLE_CROP else usual)
     motion, correlation = evident.prior, query.landmarks.correlation_of(len(found))
     if motion != STILL:
         data = query.observed(found)
