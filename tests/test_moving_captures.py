@@ -19,6 +19,8 @@ from bidnerf_core.localization.search.evident_motion import (
     evident_motion,
     share_moving,
 )
+from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.training_poses import TrainingPoses, training_poses
 from bidnerf_core.map_cameras import (
     PoseRefinement,
@@ -256,3 +258,18 @@ def test_weaker_motions_are_believed_where_the_map_moved() -> None:
         for share in taken:
             taken[share] += evident_motion(data, fit, 1.0, FIXED, share).prior != STILL
     assert taken[SHARE_MOVING] < taken[0.8]
+
+
+def test_slow_motions_are_taken_from_queries_of_a_moving_map() -> None:
+    moved = motions(0.2)
+    points, views, true = capture(moved)
+    landmarks = tracked_views(views, points).at(true, moved).landmarks(LandmarkConfig())
+    sure = torch.full((4,), 1e-4, dtype=torch.float64)
+    landmarks = replace(landmarks, correlation=1.0, calibration_scatter=sure)
+    seen = {}
+    for share in (0.0, 1.0):
+        matcher = LandmarkMatcher(replace(landmarks, moving=share))
+        found = [propose(matcher, [View(v.frame, SE3.identity())], points) for v in views]
+        assert all(pose is not None for pose in found)
+        seen[share] = sum(pose is not None and pose.has_motion for pose in found)
+    assert seen[1.0] > seen[0.0] > 0
