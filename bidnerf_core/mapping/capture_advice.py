@@ -32,14 +32,14 @@ PROBLEMS: dict[PhotoProblem, tuple[str, str]] = {
         "turned against the pose",
         "rotate the image, or the pose, so that both agree on what is up",
     ),
-    "badly posed": ("not where the given pose says, by the landmarks of other photos", "estimate the pose anew, or leave the photo out"),
+    "badly posed": ("not where the given pose says, by the landmarks of other photos", "estimate such poses anew, or leave the photos out"),
     "apart": (
         "linked to the rest by no landmarks",
         "photos of another place need a map of their own; otherwise take some in between",
     ),
     "isolated": (
         "short of landmarks in common with others",
-        "leave it out, or take photos between it and the rest",
+        "leave such photos out, or take some between them and the rest",
     ),
     "blurred": ("blurred compared with photos from nearby", "take such photos again, with more light or a steadier camera"),
     "badly exposed": ("exposed differently from the rest", "take such photos again with locked exposure"),
