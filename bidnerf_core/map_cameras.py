@@ -33,9 +33,8 @@ class StoredCamera:
     T_world_camera: MatrixRows
     given_T_world_camera: MatrixRows | None = None  # the dataset's pose, where training refined it
     moved_pixels: float | None = None  # median motion (pixels) of the image's points by the refinement
-    motion: RowMotion | None = (
-        None  # of the camera from the first row to the last, where refinement estimated it
-    )
+    # of the camera from the first row to the last, where refinement estimated it
+    motion: RowMotion | None = None
 
     @property
     def pose(self) -> SE3:
@@ -135,11 +134,13 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
     """Return a sentence or two on the consistency of the given poses and how far they were moved."""
     moved = [camera.moved for camera in cameras if camera.moved is not None]
     wrong = [m for m in moved if m.name in found.replaced]
-    error = f"errors of the given poses add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
+    motions = [camera.motion for camera in cameras if camera.motion is not None]
+    cause = "errors of the given poses and motions of the cameras" if motions else "errors of the given poses"
+    error = f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
     refined = found.refined and moved
     kept = "the other poses are kept" if wrong else "the poses are kept"
     lines = [f"{error}; {_typical_motion(moved)}" if refined else f"{error}; {kept}"]
-    if motions := [m.motion for m in moved if m.motion is not None]:
+    if motions:
         metres, degrees = _sizes(motions)
         lines.append(
             f"the rows of the images were exposed one after another, while the camera moved by {metres:.2g} and"

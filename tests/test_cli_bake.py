@@ -332,6 +332,9 @@ def test_photos_of_another_scene_are_not_baked_into_a_map(
         for number, frame in enumerate(described["frames"]):
             frame["transform_matrix"][0][3] += 0.01 * (1 + number)
         file.write_text(json.dumps(described))
+    never_baked = ["bake", shutil.copytree(folder, tmp_path / "fresh"), "--data", tmp_path / "other", *COARSE]
+    monkeypatch.setattr(module, "colour_noise", lambda *_: 0.31)
+    assert bidnerf(*never_baked).status == 1
     monkeypatch.setattr(module, "colour_noise", lambda *_: 0.1)
     assert bidnerf("bake", folder, "--data", shared / "data", *COARSE).status == 0
     before = {file.name: file.read_bytes() for file in folder.iterdir()}

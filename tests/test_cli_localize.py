@@ -338,7 +338,7 @@ def test_an_interrupted_run_keeps_its_answers(
     assert status == 130
     assert [file.name for file in tmp_path.iterdir()] == ([name] if kept else [])
     if kept and name:
-        assert f"{name}: holds the answers to 2 of 3 images" in err
+        assert f"{name}: written after 2 of 3 images" in err
         found = json.loads((tmp_path / name).read_text())
         assert [each["frame"] for each in found] == ["t_0000", "t_0001"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import View
+from bidnerf_core import SE3, View
 from bidnerf_core.cli import training_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
@@ -130,6 +131,32 @@ def measured(ratio: float) -> TrackedViews:
     """Images whose measured depth is ``ratio`` times the true one."""
     points = Points(noise=0.3)
     return tracked_views(ring(points, 8, depth=ratio), points)
+
+
+def prepared(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prepare views of points for training, as the command does."""
+    monkeypatch.setattr(
+        training_views,
+        "tracked_views",
+        lambda given, progress: tracked_views(given, points, progress=progress),
+    )
+    training_views.prepared(views)
+
+
+def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = Points(noise=0.3)
+    views = ring(points, 14, depth=1.0)
+    prepared(views, points, monkeypatch)
+    reversed_axes = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    flipped = [
+        replace(v, T_ref_camera=SE3(v.T_ref_camera.rotation @ reversed_axes, v.T_ref_camera.translation))
+        for v in views
+    ]
+    with pytest.raises(InputError, match="the poses contradict the photos"):
+        prepared(flipped, points, monkeypatch)
+    millimetres = ring(points, 14, depth=1000.0)
+    with pytest.raises(InputError, match="depth_unit_scale_factor"):
+        prepared(millimetres, points, monkeypatch)
 
 
 @pytest.mark.parametrize("ratio", [1000.0, 0.001, 0.3048])

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
+from bidnerf_core.cli import training_views
 from bidnerf_core.localization.landmark_trial import tried_landmarks
 from bidnerf_core.localization.search.evident_motion import (
     SHARE_AS_MAP,
@@ -177,6 +178,26 @@ def test_the_motion_is_stored_with_the_pose() -> None:
     assert "exposed one after another" in lines[1]
     metres, radians = (median(moved[:, part].norm(dim=-1).tolist()) for part in (slice(3), slice(3, 6)))
     assert f"by {metres:.2g} and {degrees(radians):.2g}°" in lines[1]
+
+
+def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, views, _ = capture(motions(1.0), 0.004)
+    monkeypatch.setattr(
+        training_views,
+        "tracked_views",
+        lambda given, progress: tracked_views(given, points, progress=progress),
+    )
+    monkeypatch.setattr(
+        training_views,
+        "training_poses",
+        lambda tracked, given, least, progress: training_poses(
+            tracked, given, least, points, progress=progress
+        ),
+    )
+    found = training_views.prepared(views)
+    assert all(view.motion is not None and bool(view.motion.any()) for view in found.views)
+    assert all(camera.motion is not None for camera in found.cameras)
+    assert stored_cameras(views) != found.cameras
 
 
 def test_training_draws_the_rays_of_the_rows() -> None:

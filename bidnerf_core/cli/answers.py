@@ -148,7 +148,7 @@ class Answers:
         if out is None or not (accepted or (_ending(out) == ".json" and self._objects)):
             return
         self._write(out, accepted)
-        say(f"{out}: holds the answers to {len(self._objects)} of {self._total} images")
+        say(f"{out}: written after {len(self._objects)} of {self._total} images")
 
     def _write(self, out: Path, accepted: list[PosedImage]) -> None:
         if _ending(out) == ".json":

@@ -50,9 +50,9 @@ from bidnerf_core.storage import (
     save_surface,
 )
 
-UNLIKE, UNLIKE_ITS_OWN = 0.2, 2.0
+UNLIKE, UNLIKE_ITS_OWN, UNLIKE_ANY = 0.2, 2.0, 0.3
 """Least difference (RMS) between rendered and photographed colours in another scene: as such, and as a multiple of that between
-the field and the photos that the map was made of."""
+the field and the photos that the map was made of; and where the latter is not known, as in a map that was never baked."""
 
 
 def run(arguments: list[str]) -> None:
@@ -94,19 +94,19 @@ def _bake(
         if data is not None:
             dataset = open_dataset(data, info.bounds.background, camera=camera, register_depth=registration)
             views = at_stored_poses(read_views(dataset, split), info.cameras)
-            _check_scene(map, data, views)
+            _check_scene(map, data, views, there)
         bake_map(map, views, config, rendered_landmarks, device=there)
 
 
-def _check_scene(folder: Path, data: Path, views: Sequence[View]) -> None:
+def _check_scene(folder: Path, data: Path, views: Sequence[View], device: torch.device) -> None:
     """Raise ``InputError`` for photos of another scene: none of those that the map was made of, and unlike its field."""
-    stored = load_map(folder, baked=False)
+    stored = load_map(folder, device, baked=False)
     own = {(camera.name, camera.T_world_camera) for camera in stored.info.cameras}
     known = any((c.name, c.T_world_camera) in own for c in stored_cameras(views))
-    if known or not own or stored.colour_noise is None:
+    if known or not own:
         return
-    off = colour_noise(stored.field, stored.bounds, views)
-    if off > max(UNLIKE, UNLIKE_ITS_OWN * stored.colour_noise):
+    off, usual = colour_noise(stored.field, stored.bounds, views), stored.colour_noise
+    if off > (UNLIKE_ANY if usual is None else max(UNLIKE, UNLIKE_ITS_OWN * usual)):
         raise InputError(
             f"{folder}: made from {stored.info.data!r}, and its renderings differ from the photos of {data} by {off:.0%} of the"
             " range of colours; expected photos of the same scene, with poses in the coordinates of the map"

@@ -18,12 +18,12 @@ def opened_map(folder: Path) -> Map:
 
 
 def unfinished(folder: Path) -> str | None:
-    """Return what to know of a map whose training was interrupted; None where there is no such map."""
+    """Return what a folder holds, if it is a map whose training was interrupted."""
     try:
         info = load_info(folder)
     except InputError:
         return None
-    return None if info.complete else _stopped(info.step)
+    return None if info.complete else f"holds a map, and {_stopped(info.step)}"
 
 
 def _stopped(step: int) -> str:

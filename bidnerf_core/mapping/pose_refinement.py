@@ -69,7 +69,10 @@ def adjusted_poses(
         deviations = max(deviations[0], _spread(moved[:, :3])), max(deviations[1], _spread(moved[:, 3:]))
         pixels = _motion(seen, fit.points, given, fit.T_world_camera)
         tracked = tracked.at(fit.T_world_camera, fit.motion)
-        noticed = motion == STILL and (motion := _common_motion(tracked, config)) != STILL
+        noticed = False
+        if motion == STILL and number < ROUNDS - 1:  # later ones could not be estimated any more
+            motion = _common_motion(tracked, config)
+            noticed = motion != STILL
         if number == 0 and not noticed:
             found = _found(tracked, pixels, before, config)
             if found.consistency.inconsistency < least:

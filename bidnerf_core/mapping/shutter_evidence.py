@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -40,5 +41,5 @@ def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlat
         still = resect(data, T, pixel_noise, correlation=correlation)
         moving = resect(data, T, pixel_noise, correlation=correlation, motion=prior)
         evidence = log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(prior)
-        total += min(STRONGEST, max(-STRONGEST, evidence))
+        total += min(STRONGEST, max(-STRONGEST, evidence)) if math.isfinite(evidence) else -STRONGEST
     return prior if total > 0 else STILL

@@ -57,8 +57,8 @@ def evident_motion(
 ) -> EvidentMotion:
     """Return the more probable of a camera at rest and one that moved, and the doubt about the pose that is left.
 
-    ``fit`` is a fit to these points, and ``share`` the prior probability of a motion. The intrinsics are free in all fits that are compared, as far as the prior ``camera``
-    leaves them open: what they explain is not a motion.
+    ``fit`` is a fit to these points, and ``share`` the prior probability of a motion. The intrinsics are free in all fits
+    that are compared, as far as the prior ``camera`` leaves them open: what they explain is not a motion.
     """
     if len(data) < ENOUGH_POINTS:
         return EvidentMotion()
@@ -70,8 +70,8 @@ def evident_motion(
     transposed = replace(data, exposure_times=data.transposed_exposure_times)
     turned = resect(transposed, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, motion)
     log_odds = [
-        _log_evidence(points, found, still, motion, correlation) + math.log(share)
-        for points, found, share in (
+        _log_evidence(points, found, still, motion, correlation) + math.log(probability)
+        for points, found, probability in (
             (data, moving, share * (1 - TURNED)), (transposed, turned, share * TURNED)
         )
     ]  # fmt: skip
