@@ -195,8 +195,9 @@ def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
     )
     found = training_views.prepared(views)
-    assert all(view.motion is not None and bool(view.motion.any()) for view in found.views)
-    assert all(camera.motion is not None for camera in found.cameras)
+    moving = [view.motion is not None and bool(view.motion.any()) for view in found.views]
+    assert sum(moving) >= VIEWS - 1  # an image whose keypoints are all left out keeps its pose
+    assert [camera.motion is not None and any(camera.motion) for camera in found.cameras] == moving
     assert stored_cameras(views) != found.cameras
 
 
