@@ -15,7 +15,7 @@ from bidnerf_core.camera import Intrinsics
 from bidnerf_core.frames import View
 from bidnerf_core.se3 import SE3
 
-NAMED = 6
+MOST_NAMED = 6
 """Largest number of images that a sentence names."""
 
 MatrixRows = tuple[tuple[float, float, float, float], ...]
@@ -147,9 +147,9 @@ def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> li
             f" {degrees:.2g}° (median)"
         )
     if wrong:
-        most = sorted(wrong, key=lambda m: m.pixels, reverse=True)[:NAMED]
+        most = sorted(wrong, key=lambda m: m.pixels, reverse=True)[:MOST_NAMED]
         listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in most)
-        listed += f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+        listed += f" and {len(wrong) - MOST_NAMED} more" if len(wrong) > MOST_NAMED else ""
         lines.append(f"moved to where the landmarks of the other images place them: {listed}")
     return lines
 

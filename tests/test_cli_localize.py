@@ -324,7 +324,7 @@ def test_an_interrupted_run_keeps_its_answers(
     bidnerf: Run, shared: Path, place: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     name: str | None, kept: bool,
 ) -> None:  # fmt: skip
-    """Of the 3 photos, 2 are answered; two steps from a start do not converge, so a trajectory would be empty."""
+    """Two of the three photos are answered; two steps from a start do not converge, so a trajectory would be empty."""
 
     def stopping(number: int, *arguments: Any) -> Any:
         if number == 2:

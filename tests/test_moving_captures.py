@@ -33,7 +33,7 @@ from bidnerf_core.map_cameras import (
 from bidnerf_core.mapping.calibration import FIXED
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
-from bidnerf_core.mapping.pose_scatter import observed_points, pose_updates
+from bidnerf_core.mapping.pose_scatter import observed_at_rest, pose_updates
 from bidnerf_core.mapping.resection import resect
 from bidnerf_core.mapping.shutter_evidence import common_motion
 from bidnerf_core.pixels import all_pixels, observe
@@ -115,7 +115,7 @@ def test_motions_are_estimated_and_the_poses_become_more_accurate() -> None:
 
 
 def test_motions_are_noticed_though_the_poses_are_right() -> None:
-    """As structure from motion gives them for the frames of a video: the keypoints alone contradict a camera at rest."""
+    """Structure from motion gives such poses for the frames of a video; the keypoints alone contradict a camera at rest."""
     found, _, _ = refined(motions(1.0), pose_error=0.0)
     assert found.refined
     assert bool((found.tracked.motion != 0).any())
@@ -268,13 +268,13 @@ def test_landmarks_tell_how_many_of_their_images_moved() -> None:
 
 
 def test_weaker_motions_are_believed_where_the_map_moved() -> None:
-    """The same image, whose motion is about as probable as none, by either prior probability."""
+    """Images whose motion is about as probable as none are judged by either prior probability."""
     points, views, true = capture(motions(0.35))
     seen, positions = tracked_views(views, points).at(true).triangulated(LandmarkConfig())
     taken = {SHARE_MOVING: 0, 0.8: 0}
     for number in range(VIEWS):
         own = (seen.image == number).nonzero()[:, 0]
-        data = observed_points(seen.sightings[own], positions, true[number])
+        data = observed_at_rest(seen.sightings[own], positions, true[number])
         data = replace(data, exposure_times=seen.exposure_times[own])
         fit = resect(data, true[number], NOISE)
         for share in taken:

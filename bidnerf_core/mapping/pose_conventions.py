@@ -32,11 +32,11 @@ ENOUGH_MATCHES = 40
 """Least number of matches of a pair that agree on an essential matrix."""
 MATCH_PIXELS, POSE_PIXELS = 1.0, 4.0
 """Largest distance (pixels) of a match from its epipolar line: by its own essential matrix, and by poses of any source."""
-AGREEING = 0.7
+NEAR_LINES = 0.7
 """Least share of the matches of a pair near their epipolar lines, for poses that agree with it."""
 FEW, MOST = 0.4, 0.7
 """Shares of the pairs with which poses agree: fewer contradict them as given, and as many support another convention."""
-ALIKE = 0.9
+ALMOST_BEST = 0.9
 """Share of the best convention's pairs with which a more usual one must agree to be preferred."""
 
 
@@ -99,7 +99,7 @@ def other_convention(images: Sequence[PosedKeypoints]) -> OtherConvention | None
     if int(agreeing[0]) > FEW * len(known) or best < MOST * len(known):
         return None
     usual = [1, len(axes), len(axes) + 1]  # y and z reversed, and both ways to invert
-    number = next((n for n in usual if int(agreeing[n]) >= ALIKE * best), int(agreeing.argmax()))
+    number = next((n for n in usual if int(agreeing[n]) >= ALMOST_BEST * best), int(agreeing.argmax()))
     rows = tuple((int(a), int(b), int(c)) for a, b, c in axes[number % len(axes)].tolist())
     return OtherConvention(rows, number >= len(axes), len(known), int(agreeing[number]), int(agreeing[0]))
 
@@ -129,7 +129,7 @@ class _MatchedPair:
             lines = torch.linalg.cross(moved.mT, rays)
             away = (lines * self.second).sum(-1) / torch.linalg.vector_norm(lines[..., :2], dim=-1)
         near = (away.abs() * self.focal <= POSE_PIXELS).double().mean(-1)
-        return (near >= AGREEING).double()
+        return (near >= NEAR_LINES).double()
 
 
 def _axes() -> Float[Tensor, "24 3 3"]:

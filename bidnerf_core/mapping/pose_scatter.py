@@ -57,13 +57,13 @@ def pose_updates(
         own = (image == number).nonzero()[:, 0]
         T = tracked.images[number].T_world_camera
         views = float(seen[own].mean())
-        found = resect(observed_points(sightings[own], positions, T), T, noise)
+        found = resect(observed_at_rest(sightings[own], positions, T), T, noise)
         update = (T.inverse() @ found.T_world_rig).log()
         updates[number] = update * ((1 + 1 / views) / (1 - 1 / views)) ** 0.5
     return updates
 
 
-def observed_points(sightings: Sightings, positions: Float[Tensor, "n 3"], T: SE3) -> ObservedPoints:
+def observed_at_rest(sightings: Sightings, positions: Float[Tensor, "n 3"], T: SE3) -> ObservedPoints:
     """Return the points displaced so that a camera at rest at the pose ``T`` observes them where the moving one did."""
     count = len(sightings)
     zeros = torch.zeros((count, 3), dtype=torch.float64)

@@ -151,6 +151,17 @@ def log_likelihood_ratio(
     return (costs[0] - costs[1]) / correlation
 
 
+def log_motion_evidence(
+    data: ObservedPoints,
+    moving: ReprojectionFit,
+    still: ReprojectionFit,
+    motion: MotionPrior,
+    correlation: float,
+) -> float:
+    """Return the logarithm of the Bayes factor of a motion against none."""
+    return log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
+
+
 def log_likelihood(
     data: ObservedPoints, fit: ReprojectionFit, noise: float, correlation: float = 1.0
 ) -> float:

@@ -10,14 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, observed_points
-from bidnerf_core.mapping.resection import log_likelihood_ratio, resect
+from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, observed_at_rest
+from bidnerf_core.mapping.resection import log_motion_evidence, resect
 from bidnerf_core.mapping.triangulation import noise
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
 MOST_IMAGES = 60
 """Largest number of images that are examined; they are spread over the capture."""
-STRONGEST = 10.0
+MOST_EVIDENCE = 10.0
 """Largest contribution of an image to the logarithm of the evidence, for or against a motion: no few images decide."""
 
 
@@ -36,10 +36,12 @@ def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlat
     for number in numbers[:: -(-len(numbers) // MOST_IMAGES)].tolist():
         own = (image == number).nonzero()[:, 0]
         T = seen.images[number].T_world_camera
-        data = observed_points(sightings[own], points, T)
+        data = observed_at_rest(sightings[own], points, T)
         data = replace(data, exposure_times=seen.exposure_times[own])
         still = resect(data, T, pixel_noise, correlation=correlation)
         moving = resect(data, T, pixel_noise, correlation=correlation, motion=prior)
-        evidence = log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(prior)
-        total += min(STRONGEST, max(-STRONGEST, evidence)) if math.isfinite(evidence) else -STRONGEST
+        evidence = log_motion_evidence(data, moving, still, prior, correlation)
+        total += (
+            min(MOST_EVIDENCE, max(-MOST_EVIDENCE, evidence)) if math.isfinite(evidence) else -MOST_EVIDENCE
+        )
     return prior if total > 0 else STILL

@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf_core.mapping.calibration import FIXED, NOMINAL, CalibrationPrior
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
+from bidnerf_core.mapping.resection import ReprojectionFit, log_motion_evidence, resect
 from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
 ENOUGH_POINTS = 20
@@ -70,7 +70,7 @@ def evident_motion(
     transposed = replace(data, exposure_times=data.transposed_exposure_times)
     turned = resect(transposed, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, motion)
     log_odds = [
-        _log_evidence(points, found, still, motion, correlation) + math.log(probability)
+        log_motion_evidence(points, found, still, motion, correlation) + math.log(probability)
         for points, found, probability in (
             (data, moving, share * (1 - TURNED)), (transposed, turned, share * TURNED)
         )
@@ -95,13 +95,6 @@ def evident_motion(
     if takes_motion:
         return EvidentMotion(motion, doubt + of_still * _square(chosen, still))
     return EvidentMotion(STILL, doubt + of_moving * (_square(chosen, moving) + moving.covariance_by_motion))
-
-
-def _log_evidence(
-    data: ObservedPoints, moving: ReprojectionFit, still: ReprojectionFit, motion: MotionPrior, correlation: float
-) -> float:  # fmt: skip
-    """Return the logarithm of the Bayes factor of a motion against none."""
-    return log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
 
 
 def _square(fit: ReprojectionFit, other: ReprojectionFit) -> Float[Tensor, "6 6"]:
