@@ -24,11 +24,11 @@ from scipy.stats import chi2
 
 from bidnerf_core import Localizer, Map, load_map
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error, success_rate
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
 from bidnerf_core.localization import settings_of
+from bidnerf_core.results.errors import normalized_error_squared, pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
 VARIANTS: dict[str, dict[str, Any]] = {

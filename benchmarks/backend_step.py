@@ -23,14 +23,14 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.comparison import map_bytes, map_labels
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.field import FieldValues, RadianceField, RaySampler, SceneBounds, levels
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import FieldValues, RadianceField, RaySampler, SceneBounds, levels
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.pixels import draw, uniform
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import BidConfig
 from bidnerf_core.localization.method_settings import objective_of
-from bidnerf_core.pixels import draw, uniform
-from bidnerf_core.rendering import render
-from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import load_map
+from bidnerf_core.maps.storage import load_map
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.storage import load_info, load_map
+from bidnerf_core.maps.storage import load_info, load_map
 
 RESULTS = Path(__file__).parent / "results"
 # The child measures itself: the child's peak as reported to the parent includes the parent's own.

@@ -29,17 +29,17 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.captures.advice import summary
+from bidnerf_core.captures.coverage import horizontal_axes
+from bidnerf_core.captures.report import CaptureReport, Gap
+from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.frames import View
-from bidnerf_core.localization.capture_survey import surveyed
-from bidnerf_core.mapping.capture_advice import summary
-from bidnerf_core.mapping.capture_coverage import horizontal_axes
-from bidnerf_core.mapping.capture_report import CaptureReport, Gap
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.features import SIFT, Keypoints
 from bidnerf_core.mapping.landmark_building import tracked_views
-from bidnerf_core.se3 import SE3
 
 RESULTS = Path(__file__).resolve().parent / "results"
 BLUR = 0.02

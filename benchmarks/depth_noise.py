@@ -19,12 +19,12 @@ from typing import Any
 import torch
 
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.depth_noise import estimated_depth_noise
-from bidnerf_core.depth_steps import depth_steps
+from bidnerf_core.depth.noise import estimated_depth_noise
+from bidnerf_core.depth.steps import depth_steps
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import NO_FAULT, faulty, parse_faults
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
 
 RESULTS = Path(__file__).resolve().parent / "results"
 FAULTS = (NO_FAULT, "depth-noise:0.005", "depth-noise:0.02", "depth-noise-squared:0.005")

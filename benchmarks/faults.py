@@ -36,14 +36,14 @@ from bidnerf_core import Localization, Localizer, Map, load_map
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import local_processes
-from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error, success_rate
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults, faulty, find_fault, parse_faults
 from bidnerf_core.evaluation.fingerprint import views_digest
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import parse_settings
-from bidnerf_core.frames import View
-from bidnerf_core.serialization import to_plain
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.results.errors import normalized_error_squared, pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
 FOREIGN = "another-scene"

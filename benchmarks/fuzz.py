@@ -43,7 +43,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.memory import STATUS, forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened, opened_points
-from bidnerf_core.files import is_temporary
+from bidnerf_core.io.files import is_temporary
 
 RESULTS = Path(__file__).parent / "results"
 LONGEST, MOST_MEMORY = 10.0, 2 * 2**30

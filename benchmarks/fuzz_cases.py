@@ -20,11 +20,11 @@ from malformed import ARRAYS, IMAGES, JSON, NUMBERS, POINTS, TENSORS, TEXTS, Dam
 from bidnerf_core import Frame, Intrinsics, Localizer, load_map
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset, write_transforms
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import settings_of
 from bidnerf_core.scenes.closed_form import views as seen_from
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.se3 import SE3
 
 SMALL_CAMERA = Intrinsics(32.0, 32.0, 12.0, 12.0, 24, 24)
 SMALL_FIELD = [

@@ -32,13 +32,13 @@ import torch
 from paper_tables import RESULTS, test_frames
 
 from bidnerf_core import Localizer
-from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.devices import without_waiting
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened
-from bidnerf_core.field import levels
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import levels
+from bidnerf_core.frames.frame import View
 from bidnerf_core.localization import METHODS
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
@@ -52,7 +52,7 @@ from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.cuda_graph import captured
-from bidnerf_core.waiting import without_waiting
+from bidnerf_core.results.errors import pose_error
 
 TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
 FRAMES = 40

@@ -28,7 +28,6 @@ from kornia.metrics import psnr
 from scipy.stats import binomtest
 
 from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.evaluation.errors import CRITERIA
 from bidnerf_core.evaluation.figures import depth_to_rgb, tile
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
@@ -36,11 +35,12 @@ from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.summary import NEVER, steps_of, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import run_trial
-from bidnerf_core.field import levels
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.rendering import render_image
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import Map, load_map
+from bidnerf_core.fields.contract import levels
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.maps.storage import Map, load_map
+from bidnerf_core.results.errors import CRITERIA
 from bidnerf_nerf_pytorch.command import main as import_command
 
 RESULTS = Path(__file__).parent / "results"

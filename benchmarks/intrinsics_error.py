@@ -18,8 +18,8 @@ from typing import Any
 
 from bidnerf_core import Frame, Localizer, View, load_map
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.results.errors import pose_error
 
 FACTORS = (0.9, 0.95, 0.98, 0.99, 1.0, 1.01, 1.02, 1.05, 1.1)
 NEAR = (0.05, 5.0)  # metres and degrees within which an answer counts as right

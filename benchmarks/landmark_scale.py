@@ -24,12 +24,12 @@ import torch
 from bidnerf_core import SE3, View, load_map
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import pose_error, success_rate
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
+from bidnerf_core.results.errors import pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
 

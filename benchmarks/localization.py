@@ -26,14 +26,14 @@ import torch
 from scipy.stats import chi2
 
 from bidnerf_core.evaluation.bench import Plan, left_to_do, local_processes, planned, run_trials
-from bidnerf_core.evaluation.errors import normalized_error_squared, success_rate
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.summary import median, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import opened
-from bidnerf_core.se3 import SE3
-from bidnerf_core.serialization import to_plain
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.results.errors import normalized_error_squared, success_rate
 
 RESULTS = Path(__file__).parent / "results"
 

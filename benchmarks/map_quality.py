@@ -33,17 +33,17 @@ import torch
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
+from bidnerf_core.captures.cameras import RowMotion, at_stored_poses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.field import RadianceField, SceneBounds, device_of, levels
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, levels
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.map_cameras import RowMotion, at_stored_poses
-from bidnerf_core.rendering import render_image
-from bidnerf_core.se3 import SE3
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import Map, load_map
+from bidnerf_core.maps.storage import Map, load_map
 from bidnerf_core.training import fitted_colours
 
 LEAST_LANDMARKS = 30

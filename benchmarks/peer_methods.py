@@ -21,8 +21,8 @@ from sift_points import sift_points
 from bidnerf_core import Localizer, Map
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.serialization import from_plain
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.io.serialization import from_plain
 
 LIBRARIES = {
     "pycolmap": "pycolmap", "kiss_matcher": "kiss-matcher", "small_gicp": "small_gicp",

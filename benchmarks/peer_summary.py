@@ -10,7 +10,7 @@ from typing import Any
 
 from scipy.stats import binomtest
 
-from bidnerf_core.evaluation.errors import CRITERIA, Within, success_rate
+from bidnerf_core.results.errors import CRITERIA, Within, success_rate
 
 LIMITS = ("translation", "rotation_deg")
 CRITERIA_REPORTED = ("5deg 0.05", "1deg 0.02")

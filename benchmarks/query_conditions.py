@@ -25,10 +25,10 @@ import torch
 
 from bidnerf_core import SE3, Frame, Localizer, View, load_map
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.errors import pose_error, success_rate
 from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.results.errors import pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
 WRONG_FOCAL = 1.1

@@ -48,16 +48,16 @@ from registration_methods import Gicp, Matrix, Open3d, Ransac, Refine, SmallGicp
 from registration_tuning import Case, as_pose, cases, tuned_gicp, tuned_open3d
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import CRITERIA, pose_error, success_rate
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.protocols import bid_start
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.localization import Localizer
-from bidnerf_core.se3 import SE3
-from bidnerf_core.serialization import from_plain, to_plain
-from bidnerf_core.storage import Map
+from bidnerf_core.maps.storage import Map
+from bidnerf_core.results.errors import CRITERIA, pose_error, success_rate
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import observe
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.casting import trace
-from bidnerf_core.pixels import observe
-from bidnerf_core.se3 import SE3
 
 WITNESSES = 24
 """Number of keyframes that vote on the outward side of surfels."""

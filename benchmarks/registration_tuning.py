@@ -23,8 +23,8 @@ from registration_methods import (
     refine_choices,
 )
 
-from bidnerf_core.evaluation.errors import CRITERIA, pose_error
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.results.errors import CRITERIA, pose_error
 
 LEAST = 4
 """Minimum number of cases to tune on; if there are fewer frames, each is tried with several seeds."""

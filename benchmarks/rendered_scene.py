@@ -20,7 +20,7 @@ import torch
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
 
 WHITE = (1.0, 1.0, 1.0)
 

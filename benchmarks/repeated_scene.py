@@ -25,12 +25,12 @@ from torch import Generator, Tensor, nn
 from bidnerf_core import Localizer, Map, load_map
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import pose_error, success_rate
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.se3 import SE3
+from bidnerf_core.results.errors import pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
 TURNS = (0.0, 90.0, 180.0)

@@ -26,14 +26,14 @@ from torch import Generator
 from bidnerf_core import load_map
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error, success_rate
 from bidnerf_core.evaluation.faults.camera import rolling_shutter
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.serialization import to_plain
+from bidnerf_core.results.errors import normalized_error_squared, pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"
 BOUND = float(chi2.ppf(0.95, 6))

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from sift_points import SiftDetector, SiftPoints, colmap_camera
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import Frame
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.frames.frame import Frame
 
 RATIO = 0.8
 """Largest ratio of the distances to the nearest and to the second nearest descriptor."""

@@ -2,7 +2,7 @@
 
     python benchmarks/step_estimate.py DATA --map MAP [MAP ...] --name step_estimate_lego
 
-The step runs on the simulated device of ``bidnerf_core.testing.elsewhere``, with the shapes that it would have on a GPU. Each
+The step runs on the simulated device of ``bidnerf_core.testing.simulated_device``, with the shapes that it would have on a GPU. Each
 operation that is not a mere view counts as one kernel, which reads its arguments and writes its results once; matrix products
 count 2 m n k operations. From these follow three lower bounds, of which the largest is the estimate: traffic at ``BANDWIDTH``,
 arithmetic at ``ARITHMETIC``, and launches at ``LAUNCH`` each. It is an estimate and not a measurement: caches make traffic
@@ -22,11 +22,11 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from bidnerf_core.devices import without_waiting
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened
-from bidnerf_core.field import levels
-from bidnerf_core.testing.elsewhere import DEVICE, Elsewhere
-from bidnerf_core.waiting import without_waiting
+from bidnerf_core.fields.contract import levels
+from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 
 RESULTS = Path(__file__).parent / "results"
 BANDWIDTH = 0.6 * 3.35e12

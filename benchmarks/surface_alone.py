@@ -22,12 +22,12 @@ import torch
 
 from bidnerf_core import Localizer, Map, load_map
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
 from bidnerf_core.localization import settings_of
 from bidnerf_core.mapping import bake
-from bidnerf_core.storage import cameras_of
+from bidnerf_core.maps.storage import cameras_of
+from bidnerf_core.results.errors import pose_error
 
 RESULTS = Path(__file__).resolve().parent / "results"
 

@@ -41,11 +41,11 @@ from tracking_runs import (
 
 from bidnerf_core import SE3, Frame, Localizer, Map, Tracker, TrackerConfig, load_map
 from bidnerf_core.datasets import TimedFrame, open_sequence
-from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.evaluation.trajectory import TrajectoryErrors, spans
 from bidnerf_core.localization import Localization
+from bidnerf_core.results.errors import normalized_error_squared, pose_error
+from bidnerf_core.results.trajectory import TrajectoryErrors, spans
 
 RESULTS = Path(__file__).resolve().parent / "results"
 BOUND = float(chi2.ppf(0.95, 6))

@@ -26,8 +26,8 @@ from tracking_runs import Frames, covered_frame
 
 from bidnerf_core import Localizer, Tracker, load_map
 from bidnerf_core.datasets import TimedFrame, open_sequence
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.results.errors import pose_error
 
 EVERY = 1000
 """The number of frames after which memory is read."""

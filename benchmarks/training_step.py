@@ -28,9 +28,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.maps.storage import Map, load_map
 from bidnerf_core.registry import load_backend
-from bidnerf_core.storage import Map, load_map
 from bidnerf_core.training import Silent, Supervision, TrainingState
 from bidnerf_core.training.loop import BESIDE
 

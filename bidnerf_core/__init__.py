@@ -20,9 +20,9 @@ except Exception:
     os.environ.setdefault("TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 if TYPE_CHECKING:
-    from bidnerf_core.camera import Intrinsics
+    from bidnerf_core.camera.intrinsics import Intrinsics
     from bidnerf_core.errors import InputError, InputWarning
-    from bidnerf_core.field import (
+    from bidnerf_core.fields.contract import (
         FieldValues,
         RadianceField,
         Rays,
@@ -31,25 +31,33 @@ if TYPE_CHECKING:
         SceneBounds,
         levels,
     )
-    from bidnerf_core.frames import Frame, View
+    from bidnerf_core.fields.observations import Observations
+    from bidnerf_core.fields.rendering import render, render_image
+    from bidnerf_core.frames.frame import Frame, View
+    from bidnerf_core.geometry.se3 import SE3
     from bidnerf_core.localization import Localization, Localizer, Outcome, Tracker, TrackerConfig
-    from bidnerf_core.observations import Observations
+    from bidnerf_core.maps.storage import Map, load_map
     from bidnerf_core.registry import list_backends, load_backend
-    from bidnerf_core.rendering import render, render_image
-    from bidnerf_core.se3 import SE3
-    from bidnerf_core.storage import Map, load_map
 
 HOMES = {
-    "camera": ("Intrinsics",),
+    "camera.intrinsics": ("Intrinsics",),
     "errors": ("InputError", "InputWarning"),
-    "field": ("FieldValues", "RadianceField", "RaySampler", "RaySamples", "Rays", "SceneBounds", "levels"),
-    "frames": ("Frame", "View"),
+    "fields.contract": (
+        "FieldValues",
+        "RadianceField",
+        "RaySampler",
+        "RaySamples",
+        "Rays",
+        "SceneBounds",
+        "levels",
+    ),
+    "frames.frame": ("Frame", "View"),
     "localization": ("Localization", "Localizer", "Outcome", "Tracker", "TrackerConfig"),
-    "observations": ("Observations",),
+    "fields.observations": ("Observations",),
     "registry": ("list_backends", "load_backend"),
-    "rendering": ("render", "render_image"),
-    "se3": ("SE3",),
-    "storage": ("Map", "load_map"),
+    "fields.rendering": ("render", "render_image"),
+    "geometry.se3": ("SE3",),
+    "maps.storage": ("Map", "load_map"),
 }
 """The modules that define the public names. They are imported when a name is first used (PEP 562): importing torch takes
 seconds, and ``bidnerf --help`` does not need it."""

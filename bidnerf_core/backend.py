@@ -9,8 +9,8 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from bidnerf_core.field import RadianceField, SceneBounds
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.frames.frame import View
 from bidnerf_core.training import Report
 
 

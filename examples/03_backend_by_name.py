@@ -13,12 +13,12 @@ from pathlib import Path
 
 from bidnerf_core import Intrinsics, Localizer, list_backends, load_backend, load_map
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import settings_of
+from bidnerf_core.maps.storage import MapInfo, save_map
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object, orbit, views
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import MapInfo, save_map
 from bidnerf_core.training import Silent, TrainingState
 
 parser = argparse.ArgumentParser(description=__doc__)

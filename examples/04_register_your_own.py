@@ -15,14 +15,14 @@ from pathlib import Path
 import torch
 
 from bidnerf_core import Intrinsics, Localizer, Map, list_backends, load_backend
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import FieldValues, device_of
+from bidnerf_core.fields.contract import FieldValues, device_of
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.localization import settings_of
-from bidnerf_core.rendering import render
-from bidnerf_core.sampling import Stratified
+from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object, orbit, views
-from bidnerf_core.storage import MapInfo
 from bidnerf_core.training import RayBank, Silent, StepOutcome, fit, supervised_loss
 
 

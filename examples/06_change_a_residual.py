@@ -11,11 +11,11 @@ import argparse
 import torch
 
 from bidnerf_core import Localizer
-from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.fields.residuals import DEPTH_RESIDUALS
 from bidnerf_core.localization import settings_of
-from bidnerf_core.residuals import DEPTH_RESIDUALS
+from bidnerf_core.results.errors import pose_error
+from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
 
 
 def log_depth(rendering, observed, miss=None):

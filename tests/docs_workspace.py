@@ -13,18 +13,18 @@ from PIL import Image
 from PIL.ExifTags import Base
 
 import tiny
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.datasets import write_transforms
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import Outcome
-from bidnerf_core.map_cameras import stored_cameras
 from bidnerf_core.mapping import BakeConfig, bake
+from bidnerf_core.maps.storage import MapInfo, save_map, save_surface
 from bidnerf_core.registry import load_backend
 from bidnerf_core.scenes.closed_form import views as views_of
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import MapInfo, save_map, save_surface
 from bidnerf_core.training import Silent, TrainingState
 
 TEST_FRAMES = ("r_0", "r_4", "r_8")

@@ -9,8 +9,8 @@ from dataclasses import replace
 import torch
 
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.localization import AutoConfig
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.trajectories import look_at
 from textured_field import textured_map, view
 

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 import baked
-from bidnerf_core.field import FieldValues, RaySampler
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.devices import moved
+from bidnerf_core.fields.contract import FieldValues, RaySampler
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.mapping import SurfaceMap, bake
-from bidnerf_core.moving import moved
-from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 

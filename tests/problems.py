@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from bidnerf_core.field import RadianceField, SceneBounds
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import Localization, find_method, settings_of
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.observations import Observations
-from bidnerf_core.se3 import SE3
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import torch
 from torch import Generator
 
 import baked
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import (
     SurfaceDiagnostics,
     descent_verdict,
@@ -25,7 +26,6 @@ from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.scenes.demo import demo_room
-from bidnerf_core.se3 import SE3
 
 
 def rejection(T: SE3, cloud: PointCloud, margin: float = math.inf) -> Verdict | None:

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGES = [ROOT / "bidnerf_core", *sorted(f.parent for f in (ROOT / "backends").glob("*/__init__.py"))]
 FILES = sorted(file for package in PACKAGES for file in package.rglob("*.py"))
-LONGEST = 300
+LONGEST = 500
 
 every_file = pytest.mark.parametrize("file", FILES, ids=[str(f.relative_to(ROOT)) for f in FILES])
 

@@ -10,9 +10,12 @@ import torch
 
 import baked
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import depth_rays_of
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, by_depth, settings_of
 from bidnerf_core.localization.auto_config import LEAST_POINTS
 from bidnerf_core.localization.costs.surface import PointCloud
@@ -20,13 +23,10 @@ from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.mapping import bake
-from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import depth_rays_of
-from bidnerf_core.rendering import render_image
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_room
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.se3 import SE3
 from problems import FieldMap, localize
 
 QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)

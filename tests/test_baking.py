@@ -11,8 +11,8 @@ from torch import Tensor
 
 import baked
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import FieldValues
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import FieldValues
+from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.scenes.primitives import Box, Sphere

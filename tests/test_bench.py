@@ -20,16 +20,16 @@ import torch
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.arcs import arc, mean_up, seen_middle, turned_about
 from bidnerf_core.evaluation.bench import InThisProcess, Plan, planned, run_trials, shard_of
-from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import read_runs, write_record
 from bidnerf_core.evaluation.results import ResultsFile, read_results, result_line
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import run_trial
+from bidnerf_core.geometry.arcs import arc, mean_up, seen_middle, turned_about
 from bidnerf_core.localization import METHODS
+from bidnerf_core.results.errors import pose_error
+from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
 from bidnerf_core.scenes.trajectories import look_at, orbit
 from bidnerf_core.settings import to_flat
 
@@ -147,7 +147,7 @@ def test_a_turned_camera_sees_its_middle_in_the_same_place() -> None:
 
 @pytest.fixture
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidnerf_core.evaluation.closed_form_data.DEMO_CAMERA", tiny.CAMERA)
+    monkeypatch.setattr("bidnerf_core.scenes.closed_form_data.DEMO_CAMERA", tiny.CAMERA)
 
 
 @pytest.mark.usefixtures("small_images")

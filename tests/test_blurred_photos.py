@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.mapping.capture_photos import LEAST_BLUR, detail_kept
-from bidnerf_core.rendering import render
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.captures.photos import LEAST_BLUR, detail_kept
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training import Progress, Silent, Supervision, SupervisionConfig, supervised_loss
 from landmark_scene import looking_in

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.mapping.bundle_adjustment import (
     Adjustment,
     MeasuredSightings,
@@ -17,7 +18,6 @@ from bidnerf_core.mapping.bundle_adjustment import (
     linearized,
 )
 from bidnerf_core.mapping.triangulation import Sightings
-from bidnerf_core.rolling_shutter import STILL, MotionPrior, poses_of_rows
 from landmark_scene import looking_in
 
 VIEWS, POINTS, FOCAL = 12, 150, 300.0

@@ -9,9 +9,11 @@ import torch
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
 from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.fields.sampling import Stratified
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import Localization, by_blurred_image
 from bidnerf_core.localization.by_blurred_image import BLURS
 from bidnerf_core.localization.costs.images import ColourScales, ImageCost, uniform_cost
@@ -21,11 +23,9 @@ from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.landmark_building import build_landmarks
-from bidnerf_core.rendering import render_image
-from bidnerf_core.sampling import Stratified
+from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.se3 import SE3
 from landmark_scene import Points, ring
 from problems import FieldMap
 

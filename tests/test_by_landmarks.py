@@ -14,8 +14,8 @@ import bidnerf_core.localization.auto as auto_module
 import bidnerf_core.localization.by_landmarks as by_landmarks_module
 import textured_field
 from bidnerf_core import Localization, Localizer, Outcome, View
-from bidnerf_core.depth_sensor import find_depth_sensor
-from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.depth.sensors import find_depth_sensor
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 from bidnerf_core.localization.by_depth import share_on_surface
@@ -36,7 +36,7 @@ from bidnerf_core.localization.method_settings import RefinementStage
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.search.landmarks import Confirmation
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.se3 import SE3
+from bidnerf_core.results.errors import pose_error
 from textured_field import CAMERA, MapWithLandmarks, textured_map, unseen
 
 TRUTH = unseen().T_ref_camera

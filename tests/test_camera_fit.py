@@ -10,8 +10,8 @@ import torch
 from torch import Generator
 
 from bidnerf_core import Frame, Localization, Outcome, View
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.problem import rig
@@ -23,7 +23,7 @@ from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.calibration import GIVEN, UNSTRETCHED, Calibration, Stretch
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.se3 import SE3
+from bidnerf_core.results.errors import pose_error
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from problems import localize
 from textured_field import CAMERA, textured_map, training_views, unseen

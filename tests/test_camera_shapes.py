@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.camera_shapes import cameras_at_size, centre_crop_cameras, median_camera, stretched_cameras
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import QUARTER_TURNS
+from bidnerf_core.camera.shapes import cameras_at_size, centre_crop_cameras, median_camera, stretched_cameras
 from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.mapping.calibration import Calibration
-from bidnerf_core.orientation import QUARTER_TURNS
 
 LANDSCAPE = Intrinsics(520.0, 521.0, 310.0, 245.0, 640, 480, (0.05, -0.01, 0.001, 0.002))
 TILTED = replace(LANDSCAPE, distortion=(0.0,) * 12 + (0.1, 0.0))

@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.camera_sources import Raster, find_camera, read_camera
+from bidnerf_core.camera.exif import Exif, read_exif
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT, Orientation
+from bidnerf_core.camera.source import Raster, find_camera, read_camera
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.exif import Exif, read_exif
-from bidnerf_core.orientation import UPRIGHT, Orientation
 from photo_files import noise, write_photo
 
 SIZE = (4032, 3024)

@@ -14,19 +14,19 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
+from bidnerf_core.captures.advice import SUMMARY_LINES, sentences, summary
+from bidnerf_core.captures.links import groups
+from bidnerf_core.captures.photos import exposures, nearby, photo_measures
+from bidnerf_core.captures.report import CaptureReport, CoverageRecord, Gap, PhotoRecord
+from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.evaluation.capture_figure import draw_capture
-from bidnerf_core.localization.capture_survey import surveyed
-from bidnerf_core.mapping.capture_advice import SUMMARY_LINES, sentences, summary
-from bidnerf_core.mapping.capture_links import groups
-from bidnerf_core.mapping.capture_photos import exposures, nearby, photo_measures
-from bidnerf_core.mapping.capture_report import CaptureReport, CoverageRecord, Gap, PhotoRecord
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
 from bidnerf_core.mapping.landmarks import HeldOutTrial
-from bidnerf_core.rendering import render_image
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.serialization import from_plain, to_plain
 from landmark_scene import Points, looking_in, ring
 from textured_field import BOUNDS, TexturedGround
 

@@ -28,9 +28,9 @@ import tiny
 from bidnerf_core.cli import COMMANDS, main, progress
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
+from bidnerf_core.maps.storage import MapInfo, load_info, load_map
 from bidnerf_core.registry import list_backends, load_backend
 from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.storage import MapInfo, load_info, load_map
 from bidnerf_core.training import Progress
 from commands import CommandResult, Run
 from tiny import backends_listed_once  # noqa: F401
@@ -827,8 +827,8 @@ def test_an_answer_that_is_not_finite_is_no_answer(
 ) -> None:
     from dataclasses import replace
 
+    from bidnerf_core.geometry.se3 import SE3
     from bidnerf_core.localization import Localizer
-    from bidnerf_core.se3 import SE3
 
     real, nowhere = (
         Localizer.__call__,

@@ -14,16 +14,16 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.captures.report import CaptureReport, CoverageRecord
 from bidnerf_core.cli import bake as module
 from bidnerf_core.cli import main, train, training_views
 from bidnerf_core.cli.common import read_views
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.frames import View
-from bidnerf_core.mapping.capture_report import CaptureReport, CoverageRecord
+from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
+from bidnerf_core.maps.storage import Map, load_info, load_map, save_capture
 from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.storage import Map, load_info, load_map, save_capture
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
 from commands import Run

@@ -20,8 +20,8 @@ from bidnerf_core.cli import common, localize, main
 from bidnerf_core.cli.help_page import without_expert_settings
 from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.maps.storage import load_info
 from bidnerf_core.settings import EXPERT, Settings
-from bidnerf_core.storage import load_info
 from commands import Run
 from tiny import backends_listed_once  # noqa: F401
 

@@ -13,14 +13,14 @@ import torch
 
 import tiny
 from bidnerf_core import SE3, View
+from bidnerf_core.captures.cameras import PoseConsistency, as_given, stored_cameras
+from bidnerf_core.captures.training_poses import TrainingPoses
 from bidnerf_core.cli import training_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.training_poses import TrainingPoses
-from bidnerf_core.map_cameras import PoseConsistency, as_given, stored_cameras
-from bidnerf_core.map_parts import load_capture
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
-from bidnerf_core.storage import cameras_of, load_info
+from bidnerf_core.maps.parts import load_capture
+from bidnerf_core.maps.storage import cameras_of, load_info
 from commands import Run
 from landmark_scene import Points, ring
 from test_cli import assert_same_map, stop_at

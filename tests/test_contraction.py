@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from bidnerf_core.contraction import RaySpacing, contract, expand
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.voxel_grid import VoxelGrid
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.contraction import RaySpacing, contract, expand
+from bidnerf_core.fields.voxel_grid import VoxelGrid
 
 OPEN = SceneBounds((-1.0, -2.0, 0.5), (2.0, 1.0, 3.0), 0.1, 400.0, contracted=True)
 

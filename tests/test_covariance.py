@@ -10,7 +10,8 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.depth_sensor import EXACT
+from bidnerf_core.depth.sensors import EXACT
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import (
     INDEPENDENT,
@@ -19,7 +20,6 @@ from bidnerf_core.localization.covariance import (
     surface_covariance,
 )
 from bidnerf_core.localization.search.by_points import PointSearch
-from bidnerf_core.se3 import SE3
 
 
 def seen_patch(noise: float) -> PointCloud:

@@ -13,18 +13,18 @@ from torch import Tensor
 import baked
 import module_fields
 import tiny
-from bidnerf_core import Localizer, constants
+from bidnerf_core import Localizer, devices
 from bidnerf_core.backend import quick_config
 from bidnerf_core.cli import main
-from bidnerf_core.constants import constant
+from bidnerf_core.devices import constant
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import FieldValues, SceneBounds, device_of, levels
+from bidnerf_core.fields.contract import FieldValues, SceneBounds, device_of, levels
+from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.localization import settings_of
 from bidnerf_core.localization.solvers import adam
 from bidnerf_core.localization.solvers.cuda_graph import captured
+from bidnerf_core.maps.storage import load_map
 from bidnerf_core.registry import load_backend
-from bidnerf_core.rendering import render_image
-from bidnerf_core.storage import load_map
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views
 from bidnerf_core.training import Progress, Silent, TrainingState, TrainingStopped
 from problems import FieldMap
@@ -97,7 +97,7 @@ def test_a_captured_step_keeps_the_constants_that_it_reads(captures: list[bool])
 
     step()
     replay = captured(step, device, torch.Generator(device))
-    constants.forget()
+    devices.forget()
     _ = [torch.full((3,), -1.0, device=device) for _ in range(1000)]  # would take its place
     step_result.zero_()
     replay()

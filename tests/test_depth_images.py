@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core.depth_images import DepthReader, depth_image, read_depth
+from bidnerf_core.depth.images import DepthReader, depth_image, read_depth
 from bidnerf_core.errors import InputError, InputWarning
 
 LARGEST_FLOAT = float(np.finfo(np.float32).max)

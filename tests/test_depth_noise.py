@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.depth_noise import estimated_depth_noise
-from bidnerf_core.depth_sensor import KINECT, DepthNoise
-from bidnerf_core.depth_steps import DepthSteps, depth_steps
+from bidnerf_core.depth.noise import estimated_depth_noise
+from bidnerf_core.depth.sensors import KINECT, DepthNoise
+from bidnerf_core.depth.steps import DepthSteps, depth_steps
 
 CAMERA = Intrinsics.from_hfov(60.0, 320, 240)
 LENS = Intrinsics(280.0, 280.0, 158.0, 121.0, 320, 240, (0.1, -0.05, 0.001, 0.002))

@@ -13,7 +13,7 @@ from torch import Generator
 import baked
 from bidnerf_core import Frame, Intrinsics, Localizer
 from bidnerf_core.cli.depth_remark import depth_remark
-from bidnerf_core.depth_sensor import (
+from bidnerf_core.depth.sensors import (
     DEPTH_SENSORS,
     KINECT,
     REALSENSE,

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.devices import may_wait, without_waiting
+from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.fields.sampling import Stratified
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.solvers.history import History
-from bidnerf_core.sampling import Stratified
-from bidnerf_core.se3 import SE3
 from bidnerf_core.testing.device import check_steps
-from bidnerf_core.testing.elsewhere import DEVICE, DeviceFault, Elsewhere
 from bidnerf_core.testing.scene import BOUNDS
-from bidnerf_core.waiting import may_wait, without_waiting
+from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
 
 FORBIDDEN: dict[str, Callable[[Tensor], object]] = {
     "cpu": lambda x: x.cpu(),

@@ -22,17 +22,18 @@ import tyro
 import bidnerf_core
 import docs_workspace
 import tiny
-from bidnerf_core import Localization, Localizer, Map, Outcome, residuals
+from bidnerf_core import Localization, Localizer, Map, Outcome
 from bidnerf_core.cli import COMMANDS, main
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
+from bidnerf_core.fields import residuals
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.localization.auto import auto
 from bidnerf_core.localization.by_colour import ByColourConfig, ColourRefinementSettings
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import MapInfo
 from bidnerf_core.training import Silent
 from tiny import backends_listed_once  # noqa: F401
 

@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import (
+from bidnerf_core.evaluation.protocols import (
+    bid_hard_start,
+    bid_start,
+    perturb,
+    random_units,
+    rotation_of_size,
+)
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.results.errors import (
     CRITERIA,
     Criterion,
     PoseError,
@@ -25,14 +33,6 @@ from bidnerf_core.evaluation.errors import (
     steps_to_success,
     success_rate,
 )
-from bidnerf_core.evaluation.protocols import (
-    bid_hard_start,
-    bid_start,
-    perturb,
-    random_units,
-    rotation_of_size,
-)
-from bidnerf_core.se3 import SE3
 
 tangents = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(
     lambda x: torch.tensor(x, dtype=torch.float64)

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
+from bidnerf_core.geometry.robust import Robust
 from bidnerf_core.localization.exposure import clipped, fit_exposure, robust_exposure
-from bidnerf_core.robust import Robust
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import InThisProcess, Plan, left_to_do, planned
-from bidnerf_core.evaluation.closed_form_data import closed_form_data
 from bidnerf_core.evaluation.fault_figure import draw_faults, fault_curves
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, faulty
 from bidnerf_core.evaluation.groups import grouped
@@ -25,6 +24,7 @@ from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.results import ResultsFile, key_of, result_line
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trials import trial_views
+from bidnerf_core.scenes.closed_form_data import closed_form_data
 from tiny import backends_listed_once  # noqa: F401
 
 pytestmark = pytest.mark.usefixtures("backends_listed_once")

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import PoseError
 from bidnerf_core.evaluation.figures import (
     NO_DEPTH,
     as_picture,
@@ -24,6 +23,7 @@ from bidnerf_core.evaluation.figures import (
     save_gif,
     tile,
 )
+from bidnerf_core.results.errors import PoseError
 
 
 def disc(column: float, size: int = 40) -> torch.Tensor:

@@ -9,12 +9,14 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import DrawerName, draw, uniform
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import BidConfig, InerfConfig, settings_of
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
@@ -29,11 +31,9 @@ from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.history import WINDOW
-from bidnerf_core.pixels import DrawerName, draw, uniform
-from bidnerf_core.rendering import render_image
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.se3 import SE3
 from bidnerf_hashgrid import backend as hashgrid
 from problems import FieldMap, localize, single
 

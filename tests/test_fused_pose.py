@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
@@ -26,7 +26,7 @@ from bidnerf_core.localization.fusion import finest_cost
 from bidnerf_core.localization.method_settings import ColourSettings, RefinementSettings, RefinementStage
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.problem import rig
-from bidnerf_core.se3 import SE3
+from bidnerf_core.results.errors import pose_error
 from textured_field import textured_map, unseen
 
 TRUTH = unseen().T_ref_camera

@@ -25,22 +25,22 @@ from safetensors.torch import save
 
 import tiny
 from bidnerf_core import Frame, load_map
-from bidnerf_core.arrays import read_archive, read_array
-from bidnerf_core.camera_sources import read_camera
+from bidnerf_core.camera.source import read_camera
 from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.points import read_depth_points
-from bidnerf_core.depth_images import read_depth_image
+from bidnerf_core.depth.images import read_depth_image
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.results import read_results
-from bidnerf_core.files import read_file
-from bidnerf_core.images import read_image
-from bidnerf_core.records import read_record
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import MapInfo, load_info, save_map
-from bidnerf_core.storage import load_map as load
-from bidnerf_core.tensor_files import read_tensors
+from bidnerf_core.io.arrays import read_archive, read_array
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.images import read_image
+from bidnerf_core.io.records import read_record
+from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.maps.storage import MapInfo, load_info, save_map
+from bidnerf_core.maps.storage import load_map as load
+from bidnerf_core.maps.tensors import read_tensors
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from commands import Run
@@ -300,7 +300,7 @@ def test_arrays_come_back_as_they_were(tmp_path: Path) -> None:
 def test_an_archive_that_unpacks_to_more_than_an_image_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.arrays.LARGEST_ARRAY", 10**6)
+    monkeypatch.setattr("bidnerf_core.io.arrays.LARGEST_ARRAY", 10**6)
     np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**5, 3)))
     with pytest.raises(InputError, match=r"points\.npy has 2 MiB"):
         read_depth_points(tmp_path / "a.npz")
@@ -348,7 +348,7 @@ def test_a_file_of_tensors_has_the_length_that_its_header_says(tensors: bytes, t
 WRONG_ARGUMENTS = """
 import numpy as np
 from bidnerf_core import Frame, InputError, Intrinsics
-from bidnerf_core.images import pixel_array
+from bidnerf_core.io.images import pixel_array
 camera, image = Intrinsics(32, 32, 12, 12, 24, 24), np.zeros((24, 24, 3), "u1")
 calls = [
     lambda: Intrinsics("1", 1, 0, 0, 24, 24), lambda: Intrinsics(1, None, 0, 0, 24, 24),

@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.search.halving import Distinct, SearchStage, search
-from bidnerf_core.se3 import SE3
 
 PLACES = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]], dtype=torch.float64)
 OFFSETS = torch.tensor([0.0, 0.3], dtype=torch.float64)

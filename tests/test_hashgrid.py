@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 import tiny
-from bidnerf_core.concentrated import Concentrated, SplittingSampler
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
-from bidnerf_core.rendering import render
-from bidnerf_core.sampling import Resampled
-from bidnerf_core.voxel_grid import VoxelGrid
+from bidnerf_core.fields.concentrated import Concentrated, SplittingSampler
+from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.fields.sampling import Resampled
+from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig
 from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid

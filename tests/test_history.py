@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.solvers.history import WINDOW, History
-from bidnerf_core.se3 import SE3
 
 
 def history(losses: list[float]) -> History:

@@ -8,13 +8,13 @@ from scipy.stats import kstest
 from torch import Generator
 
 import baked
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.hypotheses import (
     _without_repetition,
     hypotheses_for_points,
     neighbours,
     random_rotations,
 )
-from bidnerf_core.se3 import SE3
 
 
 @pytest.mark.parametrize("started", [True, False])

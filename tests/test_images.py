@@ -14,9 +14,9 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core import files
 from bidnerf_core.errors import InputError
-from bidnerf_core.images import (
+from bidnerf_core.io import files
+from bidnerf_core.io.images import (
     LARGEST_IMAGE,
     ImageHeader,
     open_image,

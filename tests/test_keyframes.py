@@ -10,14 +10,14 @@ import torch
 
 import textured_field
 from bidnerf_core import View
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation.errors import pose_error
-from bidnerf_core.field import SceneBounds
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.keyframes import KEYFRAME_SIDE, MOST, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import build_landmarks
-from bidnerf_core.sampling import Stratified
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.scenes.trajectories import orbit
 from textured_field import BOUNDS, CAMERA, ground, training_views, unseen

@@ -14,8 +14,8 @@ import pytest
 import tiny
 from bidnerf_core.cli import common, main
 from bidnerf_core.evaluation.plot_style import new_figure, save_figure
-from bidnerf_core.files import is_temporary, temporary, write_file
-from bidnerf_core.storage import load_map
+from bidnerf_core.io.files import is_temporary, temporary, write_file
+from bidnerf_core.maps.storage import load_map
 from commands import Run
 from tiny import backends_listed_once  # noqa: F401
 

@@ -13,13 +13,13 @@ from safetensors.torch import save as tensors_to_bytes
 import baked
 import tiny
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import write_file
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.maps.storage import MapInfo, load_info, load_map, save_landmarks, save_map, save_surface
 from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import MapInfo, load_info, load_map, save_landmarks, save_map, save_surface
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from landmark_scene import Points, ring

@@ -17,14 +17,14 @@ import module_fields
 import textured_field
 import tiny
 from bidnerf_core import Localizer, Map, load_backend
+from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.moving import moved
+from bidnerf_core.maps.storage import MapInfo
 from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import MapInfo
-from bidnerf_core.testing.elsewhere import DEVICE, Elsewhere
+from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from problems import FieldMap
 
 CPU = torch.device("cpu")

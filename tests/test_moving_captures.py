@@ -12,8 +12,20 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
+from bidnerf_core.camera.rolling_shutter import STILL
+from bidnerf_core.captures.cameras import (
+    PoseRefinement,
+    at_stored_poses,
+    moved_from,
+    pose_sentences,
+    stored_cameras,
+)
+from bidnerf_core.captures.shutter_evidence import common_motion
+from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
+from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.cli import training_views
-from bidnerf_core.localization.landmark_trial import tried_landmarks
+from bidnerf_core.fields.rendering import render, render_image
+from bidnerf_core.frames.pixels import all_pixels, observe
 from bidnerf_core.localization.search.evident_motion import (
     SHARE_AS_MAP,
     SHARE_MOVING,
@@ -22,23 +34,11 @@ from bidnerf_core.localization.search.evident_motion import (
 )
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.training_poses import TrainingPoses, training_poses
-from bidnerf_core.map_cameras import (
-    PoseRefinement,
-    at_stored_poses,
-    moved_from,
-    pose_sentences,
-    stored_cameras,
-)
 from bidnerf_core.mapping.calibration import FIXED
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews, tracked_views
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
 from bidnerf_core.mapping.pose_scatter import observed_at_rest, pose_updates
 from bidnerf_core.mapping.resection import resect
-from bidnerf_core.mapping.shutter_evidence import common_motion
-from bidnerf_core.pixels import all_pixels, observe
-from bidnerf_core.rendering import render, render_image
-from bidnerf_core.rolling_shutter import STILL
 from bidnerf_core.training import RayBank
 from landmark_scene import PINHOLE, Points, looking_in
 from textured_field import BOUNDS, CAMERA, ground, unseen

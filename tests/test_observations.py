@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.rendering import render, render_image
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import depth_rays_of
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import window
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
@@ -27,12 +30,9 @@ from bidnerf_core.localization.method_settings import (
     objective_of,
 )
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import depth_rays_of
-from bidnerf_core.rendering import render, render_image
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.se3 import SE3
 from problems import localize, single
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))

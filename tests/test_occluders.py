@@ -9,8 +9,9 @@ import torch
 
 import baked
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import pose_error
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import drawer
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization
 from bidnerf_core.localization.by_depth import share_on_surface
 from bidnerf_core.localization.search.correspondences import query_image
@@ -19,8 +20,7 @@ from bidnerf_core.localization.search.mirrored import mirror_image
 from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
 from bidnerf_core.mapping.calibration import GIVEN
 from bidnerf_core.mapping.features import SIFT
-from bidnerf_core.pixels import drawer
-from bidnerf_core.se3 import SE3
+from bidnerf_core.results.errors import pose_error
 from problems import localize
 from textured_field import textured_map, unseen
 

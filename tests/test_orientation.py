@@ -10,9 +10,9 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.errors import InputError
-from bidnerf_core.orientation import UPRIGHT, Orientation
 
 CODES = range(1, 9)
 WIDTH, HEIGHT = 9, 6

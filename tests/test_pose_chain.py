@@ -5,20 +5,20 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import SceneBounds, widened
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.contract import SceneBounds, widened
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.fields.residuals import Objective, colour_term, depth_term
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import draw, uniform
+from bidnerf_core.geometry.robust import Robust
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.problem import Problem, rig
-from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import draw, uniform
-from bidnerf_core.rendering import render
-from bidnerf_core.residuals import Objective, colour_term, depth_term
-from bidnerf_core.robust import Robust
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import look_at, orbit
-from bidnerf_core.se3 import SE3
 from problems import FieldMap, localize, single
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))

@@ -12,9 +12,9 @@ from scipy.stats import kstest
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import parallel_inversion
-from bidnerf_core.evaluation.errors import pose_error
 from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol, inerf_start
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.results.errors import pose_error
 
 TRUE = SE3.exp(torch.tensor([0.3, 1.0, -2.0, 0.5, -0.2, 0.9], dtype=torch.float64))
 by_name = pytest.mark.parametrize("name", PROTOCOLS)

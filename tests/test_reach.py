@@ -7,10 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.blurring import Blurred
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.blurring import Blurred
+from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.fields.sampling import Stratified
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import METHODS, Localizer, settings_of
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
@@ -22,9 +25,6 @@ from bidnerf_core.localization.method_settings import (
     objective_of,
 )
 from bidnerf_core.localization.problem import Problem, rig
-from bidnerf_core.rendering import render_image
-from bidnerf_core.sampling import Stratified
-from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import to_flat
 from bidnerf_core.testing.scene import CAMERA
 from problems import FieldMap, localize

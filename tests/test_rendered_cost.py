@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import Frame
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.fields.residuals import Objective, colour_term, depth_term
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.robust import Robust
 from bidnerf_core.localization.costs.rendered import LEAST_WITH_DEPTH, RenderedCost, Residuals, _residuals
 from bidnerf_core.localization.method_settings import RefinementSettings, RefinementStage
-from bidnerf_core.rendering import render
-from bidnerf_core.residuals import Objective, colour_term, depth_term
-from bidnerf_core.robust import Robust
 from problems import single
 from rendered_rays import BOUNDS, FIELD, OBJECTIVE, OBSERVED, PIVOTS, POSES, RAYS, seen
 

@@ -9,12 +9,26 @@ import numpy as np
 import pytest
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.field import FieldValues, RadianceField, Rays, RaySamples, SceneBounds, levels, widened
-from bidnerf_core.rendering import query_samples, render, render_image, render_samples, rendering_weights
-from bidnerf_core.sampling import Importance, Stratified, inverse_transform
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.fields.contract import (
+    FieldValues,
+    RadianceField,
+    Rays,
+    RaySamples,
+    SceneBounds,
+    levels,
+    widened,
+)
+from bidnerf_core.fields.rendering import (
+    query_samples,
+    render,
+    render_image,
+    render_samples,
+    rendering_weights,
+)
+from bidnerf_core.fields.sampling import Importance, Stratified, inverse_transform
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.se3 import SE3
 
 BLUE = (0.1, 0.2, 0.9)
 

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from bidnerf_core import Intrinsics
-from bidnerf_core.evaluation.errors import pose_error
-from bidnerf_core.frames import View
+from bidnerf_core.camera.rolling_shutter import exposure_times, moved_points
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.correspondences import query_images
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
@@ -22,8 +23,7 @@ from bidnerf_core.localization.search.resized_image import RESIZED, log_odds
 from bidnerf_core.mapping.calibration import FIXED
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.rolling_shutter import exposure_times, moved_points
-from bidnerf_core.se3 import SE3
+from bidnerf_core.results.errors import pose_error
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 POINTS = Points(noise=0.3)

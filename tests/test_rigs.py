@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.scenes.demo import demo_room
 from bidnerf_core.scenes.trajectories import look_around, look_at, orbit

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.robust import Robust, RobustName
+from bidnerf_core.geometry.robust import Robust, RobustName
 
 NAMES = get_args(RobustName)
 SCALE = 0.3

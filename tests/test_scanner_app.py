@@ -15,11 +15,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import Dataset, FileSequence, open_dataset, open_sequence
 from bidnerf_core.datasets.scanner_app import LARGEST_SIDE, RANGE, ScannerAppReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 960, 720, 800.0, (473.5, 363.25)
 """The photo's camera; ``CENTRE`` counts pixels from the centre of the upper left one, as ARKit does."""

@@ -13,7 +13,7 @@ from kornia.geometry.liegroup import Se3
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.se3 import (
+from bidnerf_core.geometry.se3 import (
     SE3,
     se3_left_jacobian,
     se3_right_jacobian,

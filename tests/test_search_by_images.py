@@ -10,8 +10,8 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.evaluation.errors import pose_error
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.view_renderers import SurfaceRenderer
 from bidnerf_core.localization.search.by_images import (
     APART,
@@ -22,9 +22,9 @@ from bidnerf_core.localization.search.by_images import (
 )
 from bidnerf_core.localization.search.halving import Distinct
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches
-from bidnerf_core.se3 import SE3
 
 KEYFRAMES = SE3.from_matrix(baked.toy().keyframes)
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import (
     Dataset,
     FileSequence,
@@ -25,8 +25,8 @@ from bidnerf_core.datasets import (
 )
 from bidnerf_core.datasets.dataset import ReadingProgress
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
-from bidnerf_core.images import Background
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.images import Background
 
 NAMES = ("b_10", "b_2", "a_3", "b_1")
 

@@ -11,12 +11,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
 from bidnerf_core.datasets.depth_registration import DepthCamera, register_depth
 from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH, SevenScenesReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
 
 SIZE = (160, 120)
 COLOUR, DEPTH = COLOUR_CAMERA.resized(*SIZE), DEPTH_CAMERA.resized(*SIZE)

@@ -19,16 +19,14 @@ from torch import Tensor, nn
 
 import baked
 import tiny
-from bidnerf_core import storage
+from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.files import write_file
-from bidnerf_core.map_cameras import stored_cameras
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
-from bidnerf_core.registry import load_backend
-from bidnerf_core.scenes.fields import HomogeneousBall
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import (
+from bidnerf_core.maps import storage
+from bidnerf_core.maps.storage import (
     MapInfo,
     load_info,
     load_map,
@@ -36,6 +34,8 @@ from bidnerf_core.storage import (
     save_map,
     save_surface,
 )
+from bidnerf_core.registry import load_backend
+from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
 from tiny import backends_listed_once  # noqa: F401

@@ -10,14 +10,14 @@ import torch
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import depth_rays_of, measured_middle
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.mapping import SurfaceMap, Surfels
 from bidnerf_core.mapping.surfel_index import SurfelIndex
-from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import depth_rays_of, measured_middle
-from bidnerf_core.se3 import SE3
-from bidnerf_core.voxel_grid import VoxelGrid
 
 SCALES = PointScales(0.1, 0.3, 0.7)
 
@@ -209,7 +209,7 @@ def test_points_are_drawn_from_some_pixels_of_a_large_image(monkeypatch: pytest.
     middle, count = measured_middle([view]), len(depth_rays_of([view]))
     assert middle is not None
     monkeypatch.setattr("bidnerf_core.localization.costs.surface.MOST_DRAWN_FROM", count // 3)
-    monkeypatch.setattr("bidnerf_core.pixels.MOST_FOR_MIDDLE", count // 12)
+    monkeypatch.setattr("bidnerf_core.frames.pixels.MOST_FOR_MIDDLE", count // 12)
     cloud = PointCloud.measured((view,), None, count, torch.Generator().manual_seed(0))
     assert count // 4 < len(cloud) <= count // 3 + 1
     thinned = measured_middle([view])

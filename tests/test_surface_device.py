@@ -13,9 +13,11 @@ from torch import Generator, Tensor
 
 import baked
 import module_fields
+from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.field import RadianceField
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs import images, surface, view_renderers
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
@@ -36,10 +38,7 @@ from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import SurfaceMap, Surfels, casting
 from bidnerf_core.mapping.casting import cast, trace
 from bidnerf_core.mapping.surfel_index import SurfelIndex
-from bidnerf_core.moving import moved
-from bidnerf_core.se3 import SE3
-from bidnerf_core.testing.elsewhere import DEVICE, DeviceFault, Elsewhere
-from bidnerf_core.waiting import without_waiting
+from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
 from problems import FieldMap
 
 

@@ -8,11 +8,11 @@ from scipy.spatial import cKDTree
 from torch import Generator, Tensor
 
 import baked
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.casting import trace
 from bidnerf_core.scenes.primitives import Box, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import blotches
-from bidnerf_core.se3 import SE3
 
 PAINT = blotches((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), 0.5, 1)
 

@@ -7,7 +7,7 @@ from threading import Barrier
 import pytest
 import torch
 
-from bidnerf_core.threads import one_thread, set_threads_here
+from bidnerf_core.devices import one_thread, set_threads_here
 
 
 @pytest.fixture(autouse=True)

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
-from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.tracking.answers import METHOD
 from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
-from bidnerf_core.se3 import SE3
+from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from flights import (
     FRAMES,
     INTERVAL,

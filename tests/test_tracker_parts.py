@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, Localizer, Outcome, Tracker
-from bidnerf_core.depth_sensor import KINECT
-from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
+from bidnerf_core.depth.sensors import KINECT
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointScales, SurfaceCost
@@ -31,6 +30,7 @@ from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping.features import grey_image
+from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from flights import (
     INTERVAL,
     assert_honest,

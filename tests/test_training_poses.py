@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, View
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.localization.training_poses import TrainingPoses, training_poses
-from bidnerf_core.map_cameras import (
+from bidnerf_core.captures.cameras import (
     PoseRefinement,
     as_given,
     at_stored_poses,
@@ -21,9 +19,11 @@ from bidnerf_core.map_cameras import (
     pose_sentences,
     stored_cameras,
 )
+from bidnerf_core.captures.pose_refinement import adjusted_poses
+from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.mapping.features import Sift
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
-from bidnerf_core.mapping.pose_refinement import adjusted_poses
 from landmark_scene import Points, looking_in, ring
 
 VIEWS, WRONG = 16, 7

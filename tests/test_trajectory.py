@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, InputError
-from bidnerf_core.evaluation.trajectory import (
+from bidnerf_core.evaluation.trajectory_plot import PlottedPath, plot_path
+from bidnerf_core.results.trajectory import (
     ErrorSummary,
     TrajectoryErrors,
     alignment_errors,
@@ -18,7 +19,6 @@ from bidnerf_core.evaluation.trajectory import (
     rigid_alignment,
     spans,
 )
-from bidnerf_core.evaluation.trajectory_plot import PlottedPath, plot_path
 
 
 def walk(count: int = 40, seed: int = 0, noise: float = 0.0) -> SE3:

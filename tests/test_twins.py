@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Localization, Localizer, Outcome, View
-from bidnerf_core.evaluation.errors import pose_error
+from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
@@ -20,7 +20,7 @@ from bidnerf_core.localization.tracking.relocalization import relocalized
 from bidnerf_core.localization.twin_rejection import twin_rejection
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.rendering import render_image
+from bidnerf_core.results.errors import pose_error
 from landmark_scene import Points, looking_in, ring
 from problems import localize
 from textured_field import BOUNDS, CAMERA, ground, textured_map, unseen

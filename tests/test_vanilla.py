@@ -14,17 +14,17 @@ from torch import Tensor
 
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import RadianceField, RaySampler, RaySamples, SceneBounds, levels
-from bidnerf_core.frames import View
-from bidnerf_core.rendering import query_samples, render
-from bidnerf_core.sampling import Importance, OccupiedOnly, Stratified
-from bidnerf_core.serialization import from_plain, to_plain
-from bidnerf_core.storage import MapInfo, load_map, save_map
+from bidnerf_core.fields.contract import RadianceField, RaySampler, RaySamples, SceneBounds, levels
+from bidnerf_core.fields.rendering import query_samples, render
+from bidnerf_core.fields.sampling import Importance, OccupiedOnly, Stratified
+from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.maps.storage import MapInfo, load_map, save_map
 from bidnerf_core.testing import BackendContract
 from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, SIDE, points, rgb_views, rgbd_views
 from bidnerf_core.training import RayBank, Supervision, TrainingState, ray_termination, supervised_loss
-from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
 from bidnerf_vanilla.encoding import encoded_width, positional_encoding
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig

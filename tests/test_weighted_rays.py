@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import depth_rays_of
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.weighted_rays import RayCounts, blurred, draw_weighted_rays
 from bidnerf_core.localization.method_settings import ColourSettings, DepthSettings, objective_of
 from bidnerf_core.localization.problem import rig
-from bidnerf_core.pixels import depth_rays_of
-from bidnerf_core.se3 import SE3
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap, single
 

@@ -14,10 +14,10 @@ import pytest
 import torch
 
 from bidnerf_core import registry
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.field import Rays
-from bidnerf_core.frames import View
-from bidnerf_core.observations import Observations
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.fields.contract import Rays
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.frame import View
 from bidnerf_core.scenes.closed_form import views as seen_from
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit

@@ -12,7 +12,7 @@ from torch.nn import functional
 from bidnerf_adanerf.bins import Bins, Sparse
 from bidnerf_adanerf.config import AdaNerfConfig
 from bidnerf_adanerf.networks import Oracle, ShadingNetwork
-from bidnerf_core.field import FieldValues, SceneBounds
+from bidnerf_core.fields.contract import FieldValues, SceneBounds
 
 SHARPNESS = 30.0
 """Density per side of the scene at a raw density of about 1, so that networks with small outputs can represent surfaces."""

@@ -15,12 +15,12 @@ from bidnerf_adanerf.dense import dense_samples, opacity, render_softly, soft_we
 from bidnerf_adanerf.field import AdaNerfField
 from bidnerf_adanerf.oracle_loss import oracle_loss
 from bidnerf_core.carving import occupied_voxels
-from bidnerf_core.field import SceneBounds, device_of
-from bidnerf_core.frames import View
-from bidnerf_core.moving import moved
-from bidnerf_core.rendering import query_samples, render, rendering_weights
+from bidnerf_core.devices import moved
+from bidnerf_core.fields.contract import SceneBounds, device_of
+from bidnerf_core.fields.rendering import query_samples, render, rendering_weights
+from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
+from bidnerf_core.frames.frame import View
 from bidnerf_core.training import Report, StepOutcome, Supervision, TrainingBatch, fit
-from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 
 PROBE = 4096
 """Number of rays from which the mean number of samples per ray is estimated."""

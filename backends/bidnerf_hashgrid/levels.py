@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.constants import constant
+from bidnerf_core.devices import constant
 from bidnerf_hashgrid.threads import slices
 
 # The primes of eq. 4, modulo 2^32 and signed: int32 products wrap, and only their low bits are used.

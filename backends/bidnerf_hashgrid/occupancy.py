@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
-from bidnerf_core.contraction import RaySpacing
-from bidnerf_core.field import FieldValues, Rays, RaySamples, SceneBounds
-from bidnerf_core.sampling import rows_of
-from bidnerf_core.voxel_grid import VoxelGrid
-from bidnerf_core.waiting import may_wait
+from bidnerf_core.devices import may_wait
+from bidnerf_core.fields.contract import FieldValues, Rays, RaySamples, SceneBounds
+from bidnerf_core.fields.contraction import RaySpacing
+from bidnerf_core.fields.sampling import rows_of
+from bidnerf_core.fields.voxel_grid import VoxelGrid
 
 BLOCK = 8
 """Steps along a ray that are skipped together where no occupied cell is near."""

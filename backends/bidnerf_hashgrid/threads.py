@@ -11,7 +11,7 @@ from threading import Barrier, Lock
 
 import torch
 
-from bidnerf_core.threads import one_thread, set_threads_here
+from bidnerf_core.devices import one_thread, set_threads_here
 
 THREADED = 4096  # number of points from which several threads are worthwhile
 

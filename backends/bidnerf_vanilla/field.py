@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.field import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.sampling import Importance, OccupiedOnly, Stratified
+from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.fields.sampling import Importance, OccupiedOnly, Stratified
+from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_core.settings import Count, Range
-from bidnerf_core.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 
 SHARPNESS = 30.0

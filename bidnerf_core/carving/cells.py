@@ -11,10 +11,10 @@ from torch import Tensor
 
 from bidnerf_core.carving.boxes import Corner
 from bidnerf_core.carving.free_space import FreeSpace
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.frames import View
-from bidnerf_core.se3 import SE3
-from bidnerf_core.voxel_grid import VoxelGrid
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 
 BLOCK = 8
 """Cells along the side of a block. A block that a view does not see costs next to nothing to process for that view."""

@@ -15,14 +15,14 @@ from bidnerf_core.cli.another_scene import question_about_scene
 from bidnerf_core.cli.common import UsageError, print_json, say, show
 from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.queries import Query
-from bidnerf_core.datasets.pose_writing import POSE_WRITERS, PosedImage
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.trials import plain_localization
-from bidnerf_core.files import write_file
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization
-from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import Map
+from bidnerf_core.maps.storage import Map
+from bidnerf_core.results.errors import PoseError, pose_error
+from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage
 
 TRANSFORMS = "transforms.json"
 WRITERS = {ending: write for ending, write in POSE_WRITERS.items() if ending != ".json"}

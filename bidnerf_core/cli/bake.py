@@ -10,6 +10,10 @@ from typing import Annotated
 
 import torch
 
+from bidnerf_core.captures.advice import summary
+from bidnerf_core.captures.cameras import at_stored_poses, stored_cameras
+from bidnerf_core.captures.survey import surveyed
+from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
 from bidnerf_core.cli.common import (
     Device,
@@ -25,20 +29,16 @@ from bidnerf_core.cli.common import (
 from bidnerf_core.cli.opened_map import unfinished
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
-from bidnerf_core.localization.capture_survey import surveyed
-from bidnerf_core.localization.landmark_trial import tried_landmarks
-from bidnerf_core.map_cameras import at_stored_poses, stored_cameras
-from bidnerf_core.map_parts import load_landmarks
+from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.mapping.capture_advice import summary
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
 from bidnerf_core.mapping.landmarks import HeldOutTrial
 from bidnerf_core.mapping.pose_scatter import update_scatter
-from bidnerf_core.moving import working_device
-from bidnerf_core.storage import (
+from bidnerf_core.maps.parts import load_landmarks
+from bidnerf_core.maps.storage import (
     LandmarkSource,
     Map,
     MapInfo,

@@ -9,7 +9,7 @@ import tyro
 
 from bidnerf_core.cli.common import option
 from bidnerf_core.datasets import DepthRegistration
-from bidnerf_core.depth_sensor import DEPTH_SENSORS
+from bidnerf_core.depth.sensors import DEPTH_SENSORS
 
 NO = "no"
 """The value of ``--register-depth`` for which depth is used as it is."""

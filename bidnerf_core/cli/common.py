@@ -24,14 +24,14 @@ from rich.text import Text
 from bidnerf_core.cli.help_page import Page, without_expert_settings
 from bidnerf_core.cli.text import PrintableStream, printable
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import is_temporary, temporary
+from bidnerf_core.io.files import is_temporary, temporary
 
 if sys.platform != "win32":
     import fcntl
 
 if TYPE_CHECKING:
     from bidnerf_core.datasets import Dataset
-    from bidnerf_core.frames import View
+    from bidnerf_core.frames.frame import View
 else:
     Dataset = View = Any  # their modules import torch, which commands such as 'backends' do not need
 
@@ -251,7 +251,7 @@ def _check_free(out: Path, overwrite: bool) -> None:
 
 def _is_leftover(file: Path) -> bool:
     """Return whether the file was left behind by a process that was killed before the map was complete."""
-    from bidnerf_core.storage import DESCRIPTION, OURS
+    from bidnerf_core.maps.storage import DESCRIPTION, OURS
 
     of_map = OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
     return of_map or is_temporary(file.name)

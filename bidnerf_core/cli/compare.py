@@ -30,18 +30,18 @@ from bidnerf_core.cli.common import (
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.bench import changed_settings
-from bidnerf_core.evaluation.closed_form_data import is_closed_form
 from bidnerf_core.evaluation.comparison import Comparison, MapRow, compare_maps, plan_comparison
 from bidnerf_core.evaluation.comparison_figure import comparison_figure
-from bidnerf_core.evaluation.errors import CRITERIA
 from bidnerf_core.evaluation.protocols import MOST_TRIALS, PROTOCOLS, Size, find_protocol
 from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trial_process import Measured
-from bidnerf_core.files import write_file
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import METHODS
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import load_info
+from bidnerf_core.maps.storage import load_info
+from bidnerf_core.results.errors import CRITERIA
+from bidnerf_core.scenes.closed_form_data import is_closed_form
 
 Folders = Annotated[
     tuple[str, ...],

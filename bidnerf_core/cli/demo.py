@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from rich.table import Table
 
 from bidnerf_core.backend import Backend, quick_config
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.cli.common import (
     DEFAULT_BACKEND,
     LARGEST_SEED,
@@ -33,18 +33,18 @@ from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.progress import timed
 from bidnerf_core.cli.train import train_map
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.figures import convergence_plot, save_gif
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.files import write_file
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization, Localizer, settings_of
+from bidnerf_core.maps.storage import Map, load_map
 from bidnerf_core.registry import load_backend
+from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import Map, load_map
 from bidnerf_core.training import TrainingStopped
 
 PHOTO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)

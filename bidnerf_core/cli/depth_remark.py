@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from bidnerf_core.depth_noise import estimated_depth_noise
-from bidnerf_core.depth_sensor import find_depth_sensor
-from bidnerf_core.depth_steps import depth_steps
-from bidnerf_core.frames import Frame
+from bidnerf_core.depth.noise import estimated_depth_noise
+from bidnerf_core.depth.sensors import find_depth_sensor
+from bidnerf_core.depth.steps import depth_steps
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization import AutoConfig
 
 

@@ -12,10 +12,10 @@ from typing import Any
 
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame
-from bidnerf_core.images import Background
-from bidnerf_core.photos import photos_in
-from bidnerf_core.serialization import LARGEST_NUMBER
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.photos import photos_in
+from bidnerf_core.io.images import Background
+from bidnerf_core.io.serialization import LARGEST_NUMBER
 
 STDIN = "-"
 POLL = 0.05

@@ -5,19 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
+from bidnerf_core.captures.advice import sentences
+from bidnerf_core.captures.cameras import pose_sentences
+from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json, show
 from bidnerf_core.cli.trial_progress import duration_text
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.capture_figure import draw_capture
-from bidnerf_core.field import SceneBounds, levels
-from bidnerf_core.map_cameras import pose_sentences
-from bidnerf_core.map_parts import load_capture
-from bidnerf_core.mapping.capture_advice import sentences
-from bidnerf_core.mapping.capture_report import CaptureReport
+from bidnerf_core.fields.contract import SceneBounds, levels
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.surface_map import SurfaceMap
-from bidnerf_core.serialization import to_plain
-from bidnerf_core.storage import Map, load_map
+from bidnerf_core.maps.parts import load_capture
+from bidnerf_core.maps.storage import Map, load_map
 
 
 def run(arguments: list[str]) -> None:

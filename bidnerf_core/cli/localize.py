@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.cli.answers import Answer, Answers, OutputSpec
 from bidnerf_core.cli.camera_options import (
     CameraFile,
@@ -47,7 +47,7 @@ from bidnerf_core.evaluation.trials import places_of
 from bidnerf_core.localization import METHODS, AutoConfig, Localizer
 from bidnerf_core.localization.methods import require_use_of_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.storage import Map
+from bidnerf_core.maps.storage import Map
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bidnerf_core.cli.common import say
 from bidnerf_core.errors import InputError
-from bidnerf_core.storage import Map, load_info, load_map
+from bidnerf_core.maps.storage import Map, load_info, load_map
 
 
 def opened_map(folder: Path) -> Map:

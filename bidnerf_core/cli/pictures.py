@@ -9,11 +9,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from bidnerf_core.evaluation.figures import blend, overlay, tile
-from bidnerf_core.frames import Frame
-from bidnerf_core.images import reduced
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import reduced
 from bidnerf_core.localization.problem import SceneMap
-from bidnerf_core.rendering import render_image
-from bidnerf_core.se3 import SE3
 
 PICTURE_SIDE = 240
 """Maximum pixels on the longer side; larger photos are reduced, since each rendered pixel takes time."""

@@ -26,8 +26,8 @@ from rich.progress import (
 from torch import nn
 
 from bidnerf_core.cli.common import console, say
-from bidnerf_core.field import RadianceField
-from bidnerf_core.storage import MapInfo, save_map
+from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.maps.storage import MapInfo, save_map
 from bidnerf_core.training import Progress as TrainingProgress
 from bidnerf_core.training import TrainingState
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.cli.common import UsageError, read_views, require, require_different, say
 from bidnerf_core.datasets import READERS, Dataset, DepthRegistration, given_sensor, open_dataset
 from bidnerf_core.datasets.colmap import SparsePoints
@@ -17,11 +17,11 @@ from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.errors import InputError, InputWarning, amount
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.photos import DEPTH_STEM, photos_in
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import window as windowed
-from bidnerf_core.observations import Observations
-from bidnerf_core.photos import DEPTH_STEM, photos_in
-from bidnerf_core.se3 import SE3
 
 NAMED = 5
 """Maximum number of files that a message names."""

@@ -31,11 +31,11 @@ from bidnerf_core.cli.opened_map import opened_map
 from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import RadianceField, SceneBounds, levels
-from bidnerf_core.files import write_file
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.rendering import RenderedImage, render_image
-from bidnerf_core.storage import Map
+from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
+from bidnerf_core.fields.rendering import RenderedImage, render_image
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.io.files import write_file
+from bidnerf_core.maps.storage import Map
 
 DEEPEST = 65.535  # metres that a 16-bit image of millimetres can hold
 

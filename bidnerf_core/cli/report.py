@@ -48,7 +48,7 @@ def report(
     from bidnerf_core.evaluation.plot_style import require_matplotlib
     from bidnerf_core.evaluation.provenance import read_runs
     from bidnerf_core.evaluation.results import read_results
-    from bidnerf_core.files import write_file
+    from bidnerf_core.io.files import write_file
 
     if not results:
         raise UsageError("no file of results, expected at least one that 'bidnerf evaluate' wrote")
@@ -86,7 +86,7 @@ def _criterion(asked: str | None, groups: Sequence[Group]) -> str:
 def _check_ours(out: Path) -> None:
     """Raise ``InputError`` where ``out`` holds anything but a report, which a newer report may replace."""
     from bidnerf_core.evaluation.page import MARK
-    from bidnerf_core.files import is_temporary, open_binary
+    from bidnerf_core.io.files import is_temporary, open_binary
 
     try:
         with open_binary(out / "index.html", "the page of a report") as file:
@@ -135,9 +135,9 @@ def draw_figures(groups: Sequence[Group], folder: Path, criterion: str) -> list[
 def _print(groups: Sequence[Group]) -> None:
     from rich.table import Table
 
-    from bidnerf_core.evaluation.errors import CRITERIA
     from bidnerf_core.evaluation.groups import situation_titles
     from bidnerf_core.evaluation.summary import summarize
+    from bidnerf_core.results.errors import CRITERIA
 
     table = Table(box=None, pad_edge=False)
     table.add_column("success by")

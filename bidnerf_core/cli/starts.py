@@ -11,9 +11,9 @@ import torch
 from bidnerf_core.cli.common import UsageError
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
-from bidnerf_core.files import read_file
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import read_file
 from bidnerf_core.localization import pose_from_matrix
-from bidnerf_core.se3 import SE3
 
 EXPECTED_POSE = 'expected {"T_world_camera": 4x4 rows}'
 

@@ -11,20 +11,20 @@ import torch
 from rich.table import Table
 from torch import Tensor
 
+from bidnerf_core.captures.cameras import as_given
 from bidnerf_core.cli.common import UsageError, say
-from bidnerf_core.datasets.pose_writing import POSE_WRITERS, PosedImage, write_poses
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.evaluation.errors import normalized_error_squared, pose_error
-from bidnerf_core.evaluation.trajectory import ErrorSummary, TrajectoryErrors, spans
 from bidnerf_core.evaluation.trajectory_plot import PlottedPath, plot_path
 from bidnerf_core.evaluation.trials import plain_localization
-from bidnerf_core.files import write_file
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization
-from bidnerf_core.map_cameras import as_given
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.se3 import SE3
-from bidnerf_core.storage import MapInfo
+from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.results.errors import normalized_error_squared, pose_error
+from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage, write_poses
+from bidnerf_core.results.trajectory import ErrorSummary, TrajectoryErrors, spans
 
 SAME_POSE = 1e-4
 """Difference of two poses' matrices (metres) that rounding in files may cause."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.figures import tile
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization import Localization
 from bidnerf_core.localization.problem import SceneMap
 

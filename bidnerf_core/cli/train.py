@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import torch
 
 from bidnerf_core.backend import Backend
+from bidnerf_core.captures.cameras import as_given, at_stored_poses, stored_cameras
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.cli.bake import bake_map
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
@@ -32,17 +33,16 @@ from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
 from bidnerf_core.cli.training_views import RefinementChoice, located, prepared
 from bidnerf_core.datasets import Background, Dataset, DepthRegistration, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
+from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames import View
-from bidnerf_core.images import background_colour
-from bidnerf_core.map_cameras import as_given, at_stored_poses, stored_cameras
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.images import background_colour
+from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.mapping.landmark_building import TrackedViews
-from bidnerf_core.moving import moved, working_device
+from bidnerf_core.maps.storage import MapInfo, build_field, load_info, load_state
 from bidnerf_core.registry import load_backend
-from bidnerf_core.serialization import from_plain, to_plain
 from bidnerf_core.settings import to_flat
-from bidnerf_core.storage import MapInfo, build_field, load_info, load_state
 from bidnerf_core.training import TrainingStopped
 
 

@@ -6,23 +6,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from bidnerf_core.carving import has_outline
-from bidnerf_core.cli.common import say
-from bidnerf_core.cli.progress import counted
-from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
-from bidnerf_core.localization.training_poses import INCONSISTENT, training_poses
-from bidnerf_core.map_cameras import (
+from bidnerf_core.captures.cameras import (
     PoseRefinement,
     StoredCamera,
     moved_from,
     pose_sentences,
     stored_cameras,
 )
-from bidnerf_core.mapping.capture_coverage import shows_distances
+from bidnerf_core.captures.coverage import shows_distances
+from bidnerf_core.captures.pose_conventions import other_convention
+from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
+from bidnerf_core.carving import has_outline
+from bidnerf_core.cli.common import say
+from bidnerf_core.cli.progress import counted
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping.keypoint_depth import depth_ratio
 from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedViews, tracked_views
-from bidnerf_core.mapping.pose_conventions import other_convention
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
 
 RefinementChoice = Literal["auto", "always", "never"]

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, TypeAlias, runtime_checkable
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.colmap_project import ColmapReader
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.depth_registration import DepthCamera
@@ -27,8 +27,8 @@ from bidnerf_core.datasets.tum import TumReader
 from bidnerf_core.datasets.video import VIDEO_SUFFIXES, open_video
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.images import Background
-from bidnerf_core.photos import photos_in
+from bidnerf_core.frames.photos import photos_in
+from bidnerf_core.io.images import Background
 
 __all__ = [
     "READERS",

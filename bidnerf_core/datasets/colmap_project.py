@@ -16,19 +16,19 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.camera_sources import Raster
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT
+from bidnerf_core.camera.source import Raster
 from bidnerf_core.datasets.colmap_files import ModelImage, has_posed_images, read_posed_images
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import is_file
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, over, read_header, read_image
-from bidnerf_core.orientation import UPRIGHT
-from bidnerf_core.photos import natural_order
-from bidnerf_core.se3 import SE3
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.photos import natural_order
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import is_file
+from bidnerf_core.io.images import Background, over, read_header, read_image
 
 MODELS = ("sparse/0", "sparse", ".")
 """Possible places of a model, in order of preference; COLMAP writes the first of several models to ``sparse/0``."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol, TypeAlias, runtime_checkable
 
 from bidnerf_core.errors import InputError, spelling_hint
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
 
 ReadingProgress: TypeAlias = Callable[[int, int], None]
 """Called with (frames read, frames requested) after each frame."""

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.camera_sources import Raster, read_camera
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT
+from bidnerf_core.camera.source import Raster, read_camera
 from bidnerf_core.datasets.poses import rigid_of_rows
 from bidnerf_core.errors import InputError
-from bidnerf_core.images import resampled
-from bidnerf_core.orientation import UPRIGHT
-from bidnerf_core.records import read_record
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import resampled
+from bidnerf_core.io.records import read_record
 
 ENOUGH_REGISTERED = 1000
 """Number of measured pixels above which at least one must fall into the colour image."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.camera_sources import Raster, read_camera
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT
+from bidnerf_core.camera.source import Raster, read_camera
 from bidnerf_core.errors import InputError
-from bidnerf_core.orientation import UPRIGHT
 
 CAMERA_FILES = ("camera.json", "cameras.txt")
 """Files in a recording's folder that may hold its camera, in the formats of ``read_camera``."""

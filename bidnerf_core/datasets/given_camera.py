@@ -6,15 +6,15 @@ import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.camera_sources import WAYS, CameraSource, Raster, find_camera
+from bidnerf_core.camera.exif import Exif
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT
+from bidnerf_core.camera.source import WAYS, CameraSource, Raster, find_camera
 from bidnerf_core.datasets.depth_registration import DepthCamera
-from bidnerf_core.depth_images import read_depth_image
+from bidnerf_core.depth.images import read_depth_image
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.exif import Exif
-from bidnerf_core.frames import Frame
-from bidnerf_core.images import Background
-from bidnerf_core.orientation import UPRIGHT
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.io.images import Background
 
 
 @dataclass(frozen=True)

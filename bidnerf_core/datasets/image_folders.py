@@ -8,11 +8,11 @@ from pathlib import Path
 from bidnerf_core.datasets.dataset import unique_names
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.sequence import FileSequence, SequenceEntry, timestamp
-from bidnerf_core.depth_images import MILLIMETRE
+from bidnerf_core.depth.images import MILLIMETRE
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame
-from bidnerf_core.images import Background
-from bidnerf_core.photos import DEPTH_STEM, photos_in
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.photos import DEPTH_STEM, photos_in
+from bidnerf_core.io.images import Background
 
 
 def open_images(folder: Path, camera: GivenCamera, background: Background | None = None) -> FileSequence:

@@ -9,8 +9,8 @@ import torch
 
 from bidnerf_core.datasets.poses import rigid_pose
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import open_binary
 
 EXPECTED = "expected 4 rows of 4 numbers, the last of them 0 0 0 1"
 LARGEST_POSE = 4096

@@ -29,21 +29,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics, same_aspect
-from bidnerf_core.camera_sources import Raster
+from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
+from bidnerf_core.camera.orientation import UPRIGHT
+from bidnerf_core.camera.source import Raster
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.poses import pose_of_rows
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
-from bidnerf_core.depth_images import MILLIMETRE, DepthImage, read_depth_image
+from bidnerf_core.depth.images import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import read_file
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, decode, over, read_header, read_image, reduced
-from bidnerf_core.orientation import UPRIGHT
-from bidnerf_core.photos import fit_depth
-from bidnerf_core.records import Record, read_record
-from bidnerf_core.se3 import SE3
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.photos import fit_depth
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.images import Background, decode, over, read_header, read_image, reduced
+from bidnerf_core.io.records import Record, read_record
 
 LARGEST_SIDE = 640
 """Maximum number of pixels on the longer side of a photo once it is read."""

@@ -25,20 +25,20 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.depth_registration import DepthCamera
 from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.pose_files import read_pose_matrix
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
-from bidnerf_core.depth_images import MILLIMETRE, DepthReader
+from bidnerf_core.depth.images import MILLIMETRE, DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import read_file
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, over, read_header, read_image
-from bidnerf_core.photos import natural_order
-from bidnerf_core.se3 import SE3
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.photos import natural_order
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.images import Background, over, read_header, read_image
 
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
 COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)

@@ -11,10 +11,10 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 from bidnerf_core.datasets.dataset import ReadingProgress, positions, unique_names
 from bidnerf_core.datasets.sequence import FileSequence, FrameSequence, SequenceEntry
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, background_colour
-from bidnerf_core.photos import natural_order
-from bidnerf_core.se3 import SE3
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.photos import natural_order
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import Background, background_colour
 
 HOLD_OUT_EVERY = 8
 

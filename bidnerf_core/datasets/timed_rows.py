@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
+from bidnerf_core.io.files import open_binary
 
 LARGEST_LIST = 256 * 2**20
 """Bytes. A trajectory over a whole day at 100 Hz is about as large."""

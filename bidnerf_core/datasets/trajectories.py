@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows
 from bidnerf_core.errors import InputError
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
 
 NUMBERS_A_LINE = "tx ty tz qx qy qz qw"
 UNIT_TO = 0.01

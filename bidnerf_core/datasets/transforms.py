@@ -25,11 +25,11 @@ from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
-from bidnerf_core.depth_images import DepthReader
+from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import is_file
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.io.files import is_file
+from bidnerf_core.io.images import Background, background_colour, over, read_header, read_image
 
 TRIED_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.camera_records import CameraRecord, camera_record
+from bidnerf_core.camera.records import CameraRecord, camera_record
 from bidnerf_core.datasets.poses import pose
 from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError
-from bidnerf_core.images import IMAGE_SUFFIXES
-from bidnerf_core.records import Record, read_record
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import IMAGE_SUFFIXES
+from bidnerf_core.io.records import Record, read_record
 
 SPLITS = ("train", "val", "test")
 METRES_PER_DEPTH_UNIT = 0.001

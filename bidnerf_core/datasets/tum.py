@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.depth_registration import DepthCamera
 from bidnerf_core.datasets.folder_camera import FolderCamera
@@ -35,12 +35,12 @@ from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
 from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows, require_distinct_times
 from bidnerf_core.datasets.trajectories import LARGEST_GAP, read_trajectory
-from bidnerf_core.depth_images import DepthReader
+from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import is_file
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.images import Background, over, read_header, read_image
-from bidnerf_core.se3 import SE3
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import is_file
+from bidnerf_core.io.images import Background, over, read_header, read_image
 
 COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 METRES_PER_STEP = 1 / 5000

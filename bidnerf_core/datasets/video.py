@@ -24,9 +24,9 @@ from jaxtyping import UInt8
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.sequence import TimedFrame
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary
-from bidnerf_core.frames import Frame
-from bidnerf_core.images import LARGEST_IMAGE
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.io.files import open_binary
+from bidnerf_core.io.images import LARGEST_IMAGE
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".3gp", ".ts", ".mts")
 INPUT = ("-hide_banner", "-nostdin", "-nostats", "-protocol_whitelist", "file,pipe", "-i")

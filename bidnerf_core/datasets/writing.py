@@ -11,10 +11,10 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.transforms_json import METRES_PER_DEPTH_UNIT, SPLITS, file_of
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames.frame import Frame, View
 
 OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
 LENS = ("k1", "k2", "p1", "p2", "k3")

@@ -16,8 +16,6 @@ import torch
 
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.arcs import arc
-from bidnerf_core.evaluation.closed_form_data import ClosedFormData
 from bidnerf_core.evaluation.faults import NO_FAULT, check_depth
 from bidnerf_core.evaluation.protocols import Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -30,9 +28,11 @@ from bidnerf_core.evaluation.trials import (
     run_trial,
     trial_views,
 )
+from bidnerf_core.geometry.arcs import arc
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.localization.methods import RENAMED, require_use_of_depth
-from bidnerf_core.serialization import to_plain
+from bidnerf_core.scenes.closed_form_data import ClosedFormData
 from bidnerf_core.settings import to_flat
 
 CHANGED = {

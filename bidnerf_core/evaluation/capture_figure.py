@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from bidnerf_core.captures.coverage import horizontal_axes
+from bidnerf_core.captures.report import CaptureReport, Gap, PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.plot_style import COLOURS, new_figure, styled
-from bidnerf_core.mapping.capture_coverage import horizontal_axes
-from bidnerf_core.mapping.capture_report import CaptureReport, Gap, PhotoProblem, PhotoRecord
 
 LOOKS: dict[PhotoProblem, tuple[str, str]] = {
     "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),

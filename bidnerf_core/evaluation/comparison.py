@@ -11,12 +11,12 @@ from typing import Any, TypeAlias
 
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.closed_form_data import closed_form_data, is_closed_form
 from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.evaluation.summary import Success, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trial_process import Measured, TrialProcess
-from bidnerf_core.storage import DESCRIPTION, load_info
+from bidnerf_core.maps.storage import DESCRIPTION, load_info
+from bidnerf_core.scenes.closed_form_data import closed_form_data, is_closed_form
 
 ProgressCallback: TypeAlias = Callable[[int, int, Measured], None]
 """Called after each trial with the number of finished trials, the number of all, and the latest result."""

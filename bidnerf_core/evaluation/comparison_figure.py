@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from bidnerf_core.evaluation.comparison import Comparison, MapRow
-from bidnerf_core.evaluation.errors import CRITERIA
 from bidnerf_core.evaluation.plot_style import (
     CRITERION_NAMES,
     SHORT_CRITERION_NAMES,
@@ -19,6 +18,7 @@ from bidnerf_core.evaluation.plot_style import (
     write_figure,
 )
 from bidnerf_core.evaluation.summary import seconds_to_success, usual_criterion
+from bidnerf_core.results.errors import CRITERIA
 
 COSTS: dict[str, Callable[[MapRow], float]] = {
     "ms a step": lambda row: row.ms_per_step,

@@ -15,9 +15,9 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.errors import PoseError
 from bidnerf_core.evaluation.plot_style import line_look, new_figure, styled, write_figure
-from bidnerf_core.files import write_file
+from bidnerf_core.io.files import write_file
+from bidnerf_core.results.errors import PoseError
 
 TILE = 240  # pixels: smaller images are enlarged to about this, so that captions fit
 CAPTION, GAP = 22, 6  # pixels

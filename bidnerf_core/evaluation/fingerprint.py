@@ -12,8 +12,8 @@ from pathlib import Path
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
-from bidnerf_core.serialization import to_plain
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.serialization import to_plain
 
 DIGEST_BYTES = 16  # enough that no two inputs share one by chance
 

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import open_binary, read_file, read_open_file, write_file
+from bidnerf_core.io.files import open_binary, read_file, read_open_file, write_file
 
 LARGEST_LINES = 512 * 2**20
 """Bytes. A trial takes a few kilobytes, so this is enough for a hundred thousand trials."""

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
 
 SEED, CHOSEN_FRAMES, STARTS = 1234, 5, 5
 TRIALS = CHOSEN_FRAMES * STARTS

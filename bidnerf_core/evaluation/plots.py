@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bidnerf_core.evaluation.errors import CRITERIA
 from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.groups import Group, situation_titles, situations
 from bidnerf_core.evaluation.plot_style import (
@@ -23,6 +22,7 @@ from bidnerf_core.evaluation.plot_style import (
     styled,
 )
 from bidnerf_core.evaluation.summary import NEVER, applies, steps_of, success_of
+from bidnerf_core.results.errors import CRITERIA
 
 COLUMNS, PANEL = 3, (3.6, 2.7)  # inches
 DrawPanel = Callable[[Any, list[Group]], None]

@@ -19,8 +19,8 @@ import torch
 
 import bidnerf_core
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import read_file, write_file
-from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.io.files import read_file, write_file
+from bidnerf_core.io.serialization import from_plain, to_plain
 
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
 SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")

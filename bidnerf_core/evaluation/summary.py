@@ -7,8 +7,8 @@ import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from bidnerf_core.evaluation.errors import CRITERIA, Rate, Reduced, steps_to_success, success_rate
 from bidnerf_core.evaluation.trial import TrialResult
+from bidnerf_core.results.errors import CRITERIA, Rate, Reduced, steps_to_success, success_rate
 
 NEVER = math.inf
 """Steps to success of a trial that did not succeed."""

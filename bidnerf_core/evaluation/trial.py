@@ -9,10 +9,10 @@ from typing import Any, TypeAlias
 
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.evaluation.closed_form_data import is_closed_form
-from bidnerf_core.evaluation.errors import PoseError
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.evaluation.fingerprint import InputDigests
+from bidnerf_core.results.errors import PoseError
+from bidnerf_core.scenes.closed_form_data import is_closed_form
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 LARGEST_COUNT = 2**63 - 1

@@ -16,11 +16,11 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import opened, parse_settings, run_trial
-from bidnerf_core.field import levels
-from bidnerf_core.frames import View
-from bidnerf_core.pixels import draw, uniform
-from bidnerf_core.se3 import SE3
-from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.fields.contract import levels
+from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.pixels import draw, uniform
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.settings import to_flat
 
 COUNTED_RAYS = 2048

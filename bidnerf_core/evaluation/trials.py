@@ -17,22 +17,21 @@ from torch import Tensor
 
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
+from bidnerf_core.devices import one_thread, working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.closed_form_data import closed_form_data, closed_form_map, is_closed_form
-from bidnerf_core.evaluation.errors import PoseError, pose_error
 from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.evaluation.fingerprint import InputDigests, folder_digest, views_digest
 from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trial, TrialResult
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.moving import working_device
-from bidnerf_core.se3 import SE3
-from bidnerf_core.serialization import from_plain, to_plain
+from bidnerf_core.maps.storage import Map, MapInfo, cameras_of, load_info, load_map
+from bidnerf_core.results.errors import PoseError, pose_error
+from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat
-from bidnerf_core.storage import Map, MapInfo, cameras_of, load_info, load_map
-from bidnerf_core.threads import one_thread
 
 
 def run_trial(trial: Trial) -> TrialResult:

@@ -11,7 +11,8 @@ from dataclasses import astuple, dataclass
 
 import torch
 
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.method_settings import RenderedThresholds
@@ -21,7 +22,6 @@ from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.mapping.calibration import UNSTRETCHED, Calibration
 from bidnerf_core.mapping.casting import trace
-from bidnerf_core.se3 import SE3
 
 WELL_BEFORE = 0.04
 """Share of the extent by which a line of sight must meet the surface too early to count as a violation."""

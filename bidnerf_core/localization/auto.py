@@ -12,8 +12,9 @@ import math
 import time
 from dataclasses import replace
 
-from bidnerf_core.depth_sensor import find_depth_sensor
+from bidnerf_core.depth.sensors import find_depth_sensor
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
     LandmarkThresholds,
@@ -45,7 +46,6 @@ from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.localization.twin_rejection import between_twins, twin_rejection
-from bidnerf_core.se3 import SE3
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
 """Outcomes of a pose by landmarks that no other measurement can put right: with wrong intrinsics, aligning points with the

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from bidnerf_core.depth_sensor import DEPTH_SENSORS
+from bidnerf_core.depth.sensors import DEPTH_SENSORS
 from bidnerf_core.localization.by_colour import ByColourConfig
 from bidnerf_core.settings import EXPERT, OneOf, Range, Settings
 

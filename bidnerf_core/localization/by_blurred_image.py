@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.devices import moved
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.ambiguous_intrinsics import may_be_miscalibrated
 from bidnerf_core.localization.by_landmarks import is_sharp
 from bidnerf_core.localization.confidence import TRUSTED
@@ -26,8 +28,6 @@ from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.solvers.levenberg_marquardt import Descent, descend
-from bidnerf_core.moving import moved
-from bidnerf_core.se3 import SE3
 
 WIDTH = 100
 """Pixels of the longer side of the images that are compared."""

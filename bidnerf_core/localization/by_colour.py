@@ -10,6 +10,7 @@ from typing import Annotated
 import torch
 from torch import Generator
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import rendered_verdict
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.covariance import INDEPENDENT, position_deviation
@@ -23,7 +24,6 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult, refine
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import EXPERT, Range, Settings
 
 

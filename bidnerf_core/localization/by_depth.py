@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Generator
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.confidence import judged
@@ -29,7 +30,6 @@ from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.se3 import SE3
 
 WORSE = 0.05
 """Largest increase in the cost on the surface due to refinement; beyond it, field and surface contradict each other."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Generator
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import BLANK, is_blank
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.by_colour import (
@@ -34,7 +35,6 @@ from bidnerf_core.localization.search.by_images import (
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.se3 import SE3
 
 COMPARED_WIDTH = 96
 """Longer side (pixels) of the thumbnails on which answers of all rounds are compared: that of the first round's last stage."""

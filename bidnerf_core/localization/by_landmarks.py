@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import enumeration
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
     LandmarkThresholds,
@@ -44,7 +45,6 @@ from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.calibration import Calibration
-from bidnerf_core.se3 import SE3
 
 POINTS = 2000
 """Largest number of measured points that are fused."""

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
+from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.se3 import SE3
 
 INDEPENDENT = 10
 """Number of independent measurements in an image. The errors of a map and of a sensor are correlated over large parts of an

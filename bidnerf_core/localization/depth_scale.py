@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.depth_sensor import DepthSensorModel
+from bidnerf_core.depth.sensors import DepthSensorModel
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.se3 import SE3
 
 LANDMARK_SCALE_NOISE = 0.01
 """Relative standard deviation of the depth scale that a few landmarks give, from the right pose."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.robust import Robust
+from bidnerf_core.geometry.robust import Robust
 
 EXPOSURE_ROUNDS = 6
 """Rounds of robust reweighting in which the exposure is fitted."""

@@ -8,6 +8,8 @@ import time
 
 import torch
 
+from bidnerf_core.fields.residuals import Objective
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import BLANK, descent_verdict, is_blank
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
@@ -17,8 +19,6 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome
 from bidnerf_core.localization.solvers.adam import follow_gradient
 from bidnerf_core.localization.solvers.history import History
-from bidnerf_core.residuals import Objective
-from bidnerf_core.se3 import SE3
 
 PAPERS_REACH = ReachSettings()
 """The paper's objective, with nothing added."""

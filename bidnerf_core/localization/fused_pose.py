@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.rendered import RenderedCost
 from bidnerf_core.localization.covariance import INDEPENDENT, LEAST_VARIANCE, position_deviation
@@ -20,7 +21,6 @@ from bidnerf_core.localization.depth_scale import (
 )
 from bidnerf_core.localization.fusion import RENDERED_MEASUREMENTS, SCALED_MEASUREMENTS
 from bidnerf_core.localization.normal_equations import NormalEquations
-from bidnerf_core.se3 import SE3
 
 LEAST_DECREASE = 0.3
 """Predicted decrease of the sum of all terms below which a step is the last."""

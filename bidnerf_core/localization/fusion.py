@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE
 from bidnerf_core.localization.normal_equations import Cost, Scaled
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.se3 import SE3
 
 SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
 """Numbers of independent measurements that a view's points on the surface, and its rendered rays, count as."""

@@ -10,20 +10,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.constants import constant
-from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel, find_depth_sensor
+from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel, find_depth_sensor
+from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import device_of
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.contract import device_of
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only, has_distances
 from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
 from bidnerf_core.localization.problem import SceneMap, on_device, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.observations import Observations
-from bidnerf_core.rendering import render
-from bidnerf_core.se3 import SE3
 
 WARM_UP_RAYS = 64
 

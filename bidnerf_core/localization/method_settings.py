@@ -6,11 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.localization.pivots import PivotName
-from bidnerf_core.localization.solvers.history import AnswerName
-from bidnerf_core.pixels import DrawerName
-from bidnerf_core.residuals import (
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.residuals import (
     DEPTH_RESIDUALS,
     Objective,
     colour_term,
@@ -18,7 +15,10 @@ from bidnerf_core.residuals import (
     free_space_term,
     opacity_term,
 )
-from bidnerf_core.robust import Robust, RobustName
+from bidnerf_core.frames.pixels import DrawerName
+from bidnerf_core.geometry.robust import Robust, RobustName
+from bidnerf_core.localization.pivots import PivotName
+from bidnerf_core.localization.solvers.history import AnswerName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
 RENDERED_DEPTH_SHARE = 0.038

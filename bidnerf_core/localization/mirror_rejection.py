@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.by_landmarks import corrected
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
@@ -12,7 +13,6 @@ from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence, mirror_image
-from bidnerf_core.se3 import SE3
 
 MIRROR_LOG_ODDS = 3.0
 """Log odds beyond which renderings decide between an image and its mirror image."""

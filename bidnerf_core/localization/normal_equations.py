@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
 
 ROUNDING = 1e-9
 """Damping that is always added; along a direction on which the cost does not depend, the step is then 0."""

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.frames.pixels import measured_middle
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.pixels import measured_middle
-from bidnerf_core.se3 import SE3
 
 PivotName = Literal["scene", "camera", "world"]
 

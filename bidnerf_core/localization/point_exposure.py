@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from bidnerf_core.geometry.robust import Robust
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.exposure import clipped, robust_exposure
-from bidnerf_core.robust import Robust
-from bidnerf_core.se3 import SE3
 
 STRONGEST, MOST_BIAS = 4.0, 0.25
 """Largest gain (the least is its inverse) and largest bias of an exposure: two stops, and a quarter of the range."""

@@ -10,15 +10,15 @@ from typing import Protocol, TypeVar, runtime_checkable
 import torch
 from torch import nn
 
-from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
+from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
+from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import RadianceField, SceneBounds, device_of, levels
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, levels
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.moving import moved, working_device
-from bidnerf_core.observations import Observations
-from bidnerf_core.se3 import SE3
 
 _Item = TypeVar("_Item")
 _Map = TypeVar("_Map", bound="SceneMap")

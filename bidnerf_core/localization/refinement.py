@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf_core.devices import may_wait, without_waiting
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import sandwich_covariance
@@ -25,8 +27,6 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.centring import centred
 from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
-from bidnerf_core.se3 import SE3
-from bidnerf_core.waiting import may_wait, without_waiting
 
 
 @dataclass(frozen=True, eq=False)

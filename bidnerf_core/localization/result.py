@@ -11,11 +11,11 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.files import write_file
-from bidnerf_core.frames import Frame
-from bidnerf_core.se3 import SE3
-from bidnerf_core.serialization import to_plain
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.serialization import to_plain
 
 
 class Outcome(StrEnum):

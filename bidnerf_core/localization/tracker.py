@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -48,7 +49,6 @@ from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.features import Sift, grey_image
-from bidnerf_core.se3 import SE3
 
 START = 0.03, 0.1
 """Standard deviations of a start whose uncertainty is not given: share of the scene's extent, and radians."""

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import torch
 
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.by_landmarks import LandmarkAnswer, corrected, fused_answer
 from bidnerf_core.localization.problem import Problem
@@ -16,7 +17,6 @@ from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Twin, Unguided
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.se3 import SE3
 
 TWIN_LOG_ODDS = 10.0
 """Log odds beyond which renderings decide between two places.

@@ -10,10 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import RadianceField, SceneBounds
-from bidnerf_core.frames import View
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.fields.voxel_grid import VoxelGrid
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.cell_size import chosen_grid, comparison_noise, finest_cell, spacing
 from bidnerf_core.mapping.posed_depth import (
     WITNESSES,
@@ -25,9 +27,7 @@ from bidnerf_core.mapping.posed_depth import (
 from bidnerf_core.mapping.surface_map import SurfaceMap
 from bidnerf_core.mapping.surfel_index import MOST_CELLS, SurfelIndex
 from bidnerf_core.mapping.surfels import fused_surfels, merged
-from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import Above, Range, Settings
-from bidnerf_core.voxel_grid import VoxelGrid
 
 
 @dataclass(frozen=True)

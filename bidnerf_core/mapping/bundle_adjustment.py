@@ -16,9 +16,9 @@ from scipy.sparse import block_diag, bsr_array, csc_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.triangulation import Sightings
-from bidnerf_core.rolling_shutter import STILL, MotionPrior, poses_of_rows
-from bidnerf_core.se3 import SE3
 
 ADJUSTMENT_STEPS = 30
 """Largest number of steps; from poses that are off by a few pixels, about ten suffice."""

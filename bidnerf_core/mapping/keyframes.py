@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import torch
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.field import RadianceField, SceneBounds, device_of
-from bidnerf_core.frames import Frame, View
-from bidnerf_core.pixels import draw, uniform
-from bidnerf_core.rendering import render, render_image
-from bidnerf_core.se3 import SE3
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of
+from bidnerf_core.fields.rendering import render, render_image
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import draw, uniform
+from bidnerf_core.geometry.se3 import SE3
 
 Camera = tuple[Intrinsics, SE3]
 """Intrinsics and T_world_camera."""

@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.depth_sensor import UNKNOWN
-from bidnerf_core.frames import Frame
+from bidnerf_core.depth.sensors import UNKNOWN
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.robust import MAD_TO_SIGMA
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
-from bidnerf_core.robust import MAD_TO_SIGMA
 
 DEPTH_EDGE = 0.05
 """Largest relative change of the depth around a keypoint; more indicates a depth edge."""

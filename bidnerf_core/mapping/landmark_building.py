@@ -12,8 +12,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import SeenLandmarks, View
+from bidnerf_core.frames.frame import SeenLandmarks, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.features import SIFT, Features
 from bidnerf_core.mapping.keypoint_depth import keypoint_depth_noise, measured_depth, placed
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks, seen_landmarks
@@ -30,8 +32,6 @@ from bidnerf_core.mapping.triangulation import (
     refined_points,
 )
 from bidnerf_core.mapping.view_pairs import likely_pairs_of_poses
-from bidnerf_core.rolling_shutter import AT_REST, exposure_times
-from bidnerf_core.se3 import SE3
 from bidnerf_core.settings import Above, Range, Settings
 
 _Item = TypeVar("_Item")

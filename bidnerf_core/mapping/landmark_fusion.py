@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.frames import SeenLandmarks
+from bidnerf_core.camera.rolling_shutter import poses_of_rows
+from bidnerf_core.frames.frame import SeenLandmarks
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.tracks import PosedKeypoints
 from bidnerf_core.mapping.triangulation import Sightings
-from bidnerf_core.rolling_shutter import poses_of_rows
-from bidnerf_core.se3 import SE3
 
 
 @dataclass(frozen=True, eq=False)

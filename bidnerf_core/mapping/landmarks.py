@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.moving import moved, working_device
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.devices import moved, working_device
 
 
 @dataclass(frozen=True)

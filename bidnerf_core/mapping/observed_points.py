@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.camera.rolling_shutter import moved_points
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.calibration import Calibration
-from bidnerf_core.rolling_shutter import moved_points
-from bidnerf_core.se3 import SE3
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.reprojection import LinearizedErrors, ReprojectionErrors, State
 from bidnerf_core.mapping.robust_equations import Array, RobustEquations, damped_solution
-from bidnerf_core.rolling_shutter import STILL, MotionPrior
-from bidnerf_core.se3 import SE3
 
 RESECTION_STEPS = 20
 """Largest number of steps; from a good start, four or five suffice."""

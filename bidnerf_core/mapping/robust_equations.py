@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bidnerf_core.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry.robust import MAD_TO_SIGMA
 
 Array = np.ndarray
 

@@ -11,10 +11,10 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from bidnerf_core.devices import moved, working_device
+from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.mapping.surfel_index import SurfelIndex
 from bidnerf_core.mapping.surfels import Surfels, surfel_bytes
-from bidnerf_core.moving import moved, working_device
-from bidnerf_core.voxel_grid import VoxelGrid
 
 REACH = 0.7
 """Radius of a surfel, as a fraction of its distance from its fourth neighbour."""

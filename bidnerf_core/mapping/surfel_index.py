@@ -18,9 +18,9 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.moving import moved
-from bidnerf_core.voxel_grid import VoxelGrid
+from bidnerf_core.fields.voxel_grid import VoxelGrid
 
 BLOCK_SIDE = 8
 """Cells along the side of a block."""

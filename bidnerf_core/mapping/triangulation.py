@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry.robust import MAD_TO_SIGMA
 
 TRIANGULATION_STEPS = 8
 """Number of Gauss-Newton steps; from the linear solution, four or five are enough."""

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.frames import View
-from bidnerf_core.se3 import SE3
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 
 
 def likely_pairs(views: Sequence[View], neighbours: int) -> Int[Tensor, "p 2"]:

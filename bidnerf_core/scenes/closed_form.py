@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.scenes.primitives import Primitive
-from bidnerf_core.se3 import SE3
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 
 import torch
 
-from bidnerf_core.field import SceneBounds
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.scenes.closed_form import ClosedFormScene, Hits, views
 from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.scenes.primitives import Box, Cylinder, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import Colour, Faces, Texture, blotches, checker, stripes
 from bidnerf_core.scenes.trajectories import look_around, look_at, orbit
-from bidnerf_core.se3 import SE3
 
 __all__ = [
     "ClosedFormScene",

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.scenes.textures import Texture, dominant_axis
-from bidnerf_core.se3 import SE3
 
 PARALLEL_BELOW = 1e-12
 """Components of a direction below this are set to it, to avoid division by zero; the change of the ray is negligible."""

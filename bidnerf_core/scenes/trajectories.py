@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.se3 import SE3
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.geometry.se3 import SE3
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 """Angle (rad) whose successive multiples fill a circle evenly, however many there are."""

@@ -11,7 +11,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from bidnerf_core.field import RadianceField, SceneBounds, levels
+from bidnerf_core.devices import without_waiting
+from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
 from bidnerf_core.localization.bid import BidConfig
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.sampled import SampledLoss
@@ -30,11 +31,10 @@ from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.testing.elsewhere import DEVICE, DeviceFault, Elsewhere
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views
+from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
 from bidnerf_core.testing.values import close
-from bidnerf_core.waiting import without_waiting
 
 CHECKED_RAYS = 48
 OFF = (0.05, -0.03, 0.04, 0.01, -0.02, 0.01)

@@ -12,9 +12,9 @@ from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend
-from bidnerf_core.field import RadianceField
-from bidnerf_core.frames import View
-from bidnerf_core.rendering import render
+from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.frames.frame import View
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.scene import BOUNDS, camera_rays, rgbd_views
 from bidnerf_core.training import Progress, TrainingState, TrainingStopped

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.field import RadianceField, Rays, RaySamples
-from bidnerf_core.rendering import Rendering, render
+from bidnerf_core.fields.contract import RadianceField, Rays, RaySamples
+from bidnerf_core.fields.rendering import Rendering, render
 from bidnerf_core.testing.faults import calling, require_that, sample
 from bidnerf_core.testing.scene import SIDE, awkward_rays, joined, picked
 from bidnerf_core.testing.values import close

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.field import Rays, widened
-from bidnerf_core.frames import View
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.fields.contract import Rays, widened
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.scenes.closed_form import views as seen_from
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.se3 import SE3
 
 SIZE = 24
 CAMERA = Intrinsics(32.0, 32.0, SIZE / 2, SIZE / 2, SIZE, SIZE)

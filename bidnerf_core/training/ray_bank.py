@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from bidnerf_core.field import Rays, SceneBounds
-from bidnerf_core.frames import SPARSE, View
-from bidnerf_core.moving import moved
-from bidnerf_core.observations import Observations
-from bidnerf_core.rolling_shutter import AT_REST, exposure_times, poses_of_rows
-from bidnerf_core.se3 import SE3
+from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times, poses_of_rows
+from bidnerf_core.devices import moved
+from bidnerf_core.fields.contract import Rays, SceneBounds
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.frame import SPARSE, View
+from bidnerf_core.geometry.se3 import SE3
 
 MEASURED_SHARE = 0.25
 """Fraction of a batch's rays that are drawn from pixels with depth, if these are so few that hardly any would be drawn

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.field import SceneBounds
-from bidnerf_core.frames import View
-from bidnerf_core.mapping.capture_photos import detail_kept
-from bidnerf_core.rendering import Rendering
+from bidnerf_core.captures.photos import detail_kept
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.fields.rendering import Rendering
+from bidnerf_core.frames.frame import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.colour_transform import ColourTransforms
 from bidnerf_core.training.loss import distortion, supervised_loss

@@ -9,7 +9,7 @@ import torch
 from bidnerf_core.errors import unknown_name
 from bidnerf_core.evaluation.faults import camera, colour, depth, scene, whole_image
 from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault, WholeNumbers
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.settings import Above, Range
 
 FACTOR = Above(0.0, 100.0)

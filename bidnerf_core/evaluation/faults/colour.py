@@ -13,7 +13,7 @@ from kornia.filters import gaussian_blur2d
 from PIL import Image
 from torch import Generator, Tensor
 
-from bidnerf_core.frames import Frame
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization.costs.thumbnails import KERNEL_REACH
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 from torch import Generator
 
-from bidnerf_core.frames import Frame
-from bidnerf_core.orientation import Orientation
+from bidnerf_core.camera.orientation import Orientation
+from bidnerf_core.frames.frame import Frame
 
 
 def mirrored(frame: Frame, on: float, generator: Generator) -> Frame:

@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.geometry.robust import geman_mcclure_inlier
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.thumbnails import Thumbnail, gaussian_blurred, slopes, smooth
 from bidnerf_core.localization.costs.view_renderers import ViewRenderer
 from bidnerf_core.localization.exposure import Exposure, clipped, fit_exposure
 from bidnerf_core.localization.normal_equations import NormalEquations
-from bidnerf_core.robust import geman_mcclure_inlier
-from bidnerf_core.se3 import SE3
 
 UNKNOWN_COST = 0.7
 """Cost of a pixel for which the map renders nothing."""

@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.field import RadianceField, Rays, RaySamples
-from bidnerf_core.observations import Observations
-from bidnerf_core.rendering import Rendering, render_samples
-from bidnerf_core.residuals import Residual
-from bidnerf_core.sampling import rows_of
-from bidnerf_core.se3 import SE3
-from bidnerf_core.waiting import may_wait
+from bidnerf_core.devices import may_wait
+from bidnerf_core.fields.contract import RadianceField, Rays, RaySamples
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.rendering import Rendering, render_samples
+from bidnerf_core.fields.residuals import Residual
+from bidnerf_core.fields.sampling import rows_of
+from bidnerf_core.geometry.se3 import SE3
 
 MOST_AT_ONCE = 2**18
 """Number of samples, copies included, up to which all channels are differentiated in one pass."""

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.geometry.se3 import SE3, se3_right_jacobian
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.se3 import SE3, se3_right_jacobian
 
 
 @dataclass(frozen=True, eq=False)

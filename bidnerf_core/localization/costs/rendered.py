@@ -8,8 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.constants import constant
-from bidnerf_core.field import RadianceField, Rays
+from bidnerf_core.devices import constant
+from bidnerf_core.fields.contract import RadianceField, Rays
+from bidnerf_core.fields.residuals import Objective
+from bidnerf_core.fields.sampling import AroundDepth, Resampled
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
 from bidnerf_core.localization.costs.weighted_rays import RayCounts, WeightedRays, draw_weighted_rays
 from bidnerf_core.localization.exposure import Exposure, clipped, robust_exposure
@@ -23,9 +26,6 @@ from bidnerf_core.localization.method_settings import (
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.residuals import Objective
-from bidnerf_core.sampling import AroundDepth, Resampled
-from bidnerf_core.se3 import SE3
 
 MISS_SCALES = 3.0
 """Depth residual, in depth scales, of a ray that meets nothing: an outlier's, but less than the whole distance."""

@@ -8,20 +8,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from bidnerf_core.blurring import Blurred
-from bidnerf_core.constants import constant
-from bidnerf_core.field import RadianceField, Rays, SceneBounds, widened
-from bidnerf_core.frames import Frame
+from bidnerf_core.devices import constant
+from bidnerf_core.fields.blurring import Blurred
+from bidnerf_core.fields.contract import RadianceField, Rays, SceneBounds, widened
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.fields.residuals import Objective, masked_mean
+from bidnerf_core.fields.sampling import Resampled, Stratified
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.frames.pixels import PixelDrawer, draw, drawer
+from bidnerf_core.geometry.robust import Robust
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import DescentSettings, ReachSettings
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import PixelDrawer, draw, drawer
-from bidnerf_core.rendering import render
-from bidnerf_core.residuals import Objective, masked_mean
-from bidnerf_core.robust import Robust
-from bidnerf_core.sampling import Resampled, Stratified
-from bidnerf_core.se3 import SE3
 
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""

@@ -9,15 +9,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
-from bidnerf_core.frames import View
+from bidnerf_core.devices import moved
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.pixels import observe
+from bidnerf_core.geometry.robust import geman_mcclure_inlier
+from bidnerf_core.geometry.se3 import SE3, skew
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.moving import moved
-from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import observe
-from bidnerf_core.robust import geman_mcclure_inlier
-from bidnerf_core.se3 import SE3, skew
 
 SURFEL_RADIUS = 1.5
 """Radius of a surfel's disc, in cells of the surface's grid."""

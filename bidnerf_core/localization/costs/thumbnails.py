@@ -12,10 +12,10 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, interpolate, pad
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.constants import constant
-from bidnerf_core.frames import View
-from bidnerf_core.se3 import SE3
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.devices import constant
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 
 KERNEL_REACH = 3.0
 """Radius of a blurring kernel in standard deviations."""

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.constants import constant
-from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.devices import constant
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.fields.rendering import render
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.casting import cast
-from bidnerf_core.rendering import render
 
 CHUNK = 16384
 """Number of rays that are rendered at a time."""

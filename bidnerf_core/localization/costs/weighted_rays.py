@@ -10,11 +10,11 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from bidnerf_core.frames import View
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.residuals import Objective
+from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.pixels import DrawerName, draw, drawer
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.observations import Observations
-from bidnerf_core.pixels import DrawerName, draw, drawer
-from bidnerf_core.residuals import Objective
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.frames import View
+from bidnerf_core.devices import moved
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.images import ColourScales, ImageCost
 from bidnerf_core.localization.costs.thumbnails import Thumbnail, thumbnail
 from bidnerf_core.localization.costs.view_renderers import FieldRenderer, SurfaceRenderer, ViewRenderer
@@ -19,8 +21,6 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.casting import Cast, cast
-from bidnerf_core.moving import moved
-from bidnerf_core.se3 import SE3
 
 APART, TURNED = 0.15, math.radians(20)
 """Two poses farther apart than this (share of the extent, radians) are different answers."""

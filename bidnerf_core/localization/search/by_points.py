@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf_core.devices import moved
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import FINEST
 from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_points
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.moving import moved
-from bidnerf_core.se3 import SE3
 
 JUDGED = 0.02
 """Scale of the distances by which poses are compared, as a share of the scene's extent."""

@@ -18,10 +18,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.ransac import focal_consensus
 from bidnerf_core.mapping.calibration import ANY, UNSTRETCHED, Calibration, Stretch
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.se3 import SE3
 
 UNSUSPECTED = 0.8
 """Least share of agreeing matches at which a pose is not suspected."""

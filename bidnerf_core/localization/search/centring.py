@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.field import RadianceField, SceneBounds
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.linearization import flattened
-from bidnerf_core.observations import Observations
-from bidnerf_core.rendering import render
-from bidnerf_core.se3 import SE3
 
 
 @torch.no_grad()

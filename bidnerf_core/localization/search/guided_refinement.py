@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.evident_motion import EvidentMotion, evident_motion, share_moving
 from bidnerf_core.localization.search.guided import (
@@ -38,8 +40,6 @@ from bidnerf_core.mapping.calibration import (
 from bidnerf_core.mapping.features import NORM
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
-from bidnerf_core.rolling_shutter import STILL, MotionPrior
-from bidnerf_core.se3 import SE3
 
 RADII = (3.0, 1.5)
 """Radii of the rounds of guided matching, in units of the inlier threshold."""

@@ -10,12 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.devices import moved, without_waiting
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.normal_equations import Cost
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
-from bidnerf_core.moving import moved
-from bidnerf_core.se3 import SE3
-from bidnerf_core.waiting import without_waiting
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Generator, Tensor
 from torch.quasirandom import SobolEngine
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.se3 import SE3
 
 
 @dataclass(frozen=True, eq=False)

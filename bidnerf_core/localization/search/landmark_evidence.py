@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import GuidedPose
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Unguided
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.se3 import SE3
 
 LEAST_DEPTHS = 6
 """Least number of measured depths that determine a depth scale."""

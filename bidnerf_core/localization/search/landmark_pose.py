@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.search.camera_fit import UNSUSPECTED, CameraFit, better_camera
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.mapping.calibration import GIVEN, UNSTRETCHED, Calibration, Stretch
 from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.se3 import SE3
 
 ESTIMATED_INFLATION = 3.0
 """Factor on the covariance of poses whose intrinsics were estimated too.

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
 from bidnerf_core.localization.search.map_camera import MapCamera, map_camera
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import View
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_images
 from bidnerf_core.localization.search.guided_refinement import confirmed, refined_pose, visible_and_matching
 from bidnerf_core.localization.search.landmark_evidence import described, log10_agreement
@@ -24,7 +25,6 @@ from bidnerf_core.localization.search.twins import twin_of
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.features import SIFT, Features
-from bidnerf_core.se3 import SE3
 
 STRONGEST = 700
 """Number of keypoints, the strongest of an image, that are matched first; all are matched only if these do not suffice."""

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from bidnerf_core.devices import moved
 from bidnerf_core.mapping.features import squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.moving import moved
 
 EXHAUSTIVE = 4_000
 """The number of landmarks up to which the search is exhaustive, and no cells are built."""

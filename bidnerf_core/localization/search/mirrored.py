@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.camera.orientation import Orientation
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.correspondences import query_images
 from bidnerf_core.localization.search.landmark_evidence import log10_agreement
@@ -15,8 +17,6 @@ from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.calibration import FIXED
 from bidnerf_core.mapping.features import SIFT, Features
-from bidnerf_core.orientation import Orientation
-from bidnerf_core.se3 import SE3
 
 KEYPOINTS = 700
 """Number of keypoints, the strongest of a mirrored image, that are matched."""

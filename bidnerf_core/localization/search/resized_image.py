@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from bidnerf_core.camera_shapes import stretched_cameras
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.camera.shapes import stretched_cameras
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.evident_motion import SHARE_MOVING
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
@@ -24,7 +25,6 @@ from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.mapping.calibration import FIXED
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood, resect
-from bidnerf_core.rolling_shutter import STILL, MotionPrior
 
 CONSENSUS = 0.6
 """Share of the matches required in the end that have to agree with minimal samples: these are inexact, and know no motion."""

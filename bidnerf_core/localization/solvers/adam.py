@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from bidnerf_core.constants import constant
+from bidnerf_core.devices import constant, without_waiting
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.method_settings import AdamSettings
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.solvers.cuda_graph import WARM_UP, captured
 from bidnerf_core.localization.solvers.history import WINDOW, History
-from bidnerf_core.se3 import SE3
-from bidnerf_core.waiting import without_waiting
 
 Loss = Callable[[SE3], Tensor]
 

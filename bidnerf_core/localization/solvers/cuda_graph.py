@@ -15,7 +15,7 @@ from threading import Lock
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.constants import noted
+from bidnerf_core.devices import noted
 
 WARM_UP = 3
 """Steps to take before one is captured: caches are filled and kernels loaded in these, which a capture does not allow."""

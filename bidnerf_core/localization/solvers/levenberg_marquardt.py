@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.devices import may_wait
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.normal_equations import Cost, NormalEquations
-from bidnerf_core.se3 import SE3
-from bidnerf_core.waiting import may_wait
 
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
 

@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.depth_sensor import EXACT
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.depth.sensors import EXACT
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.pixels import observe
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
@@ -22,8 +24,6 @@ from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.tracking.motion import PoseEstimate
 from bidnerf_core.localization.tracking.single_pose import retracted
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.pixels import observe
-from bidnerf_core.se3 import SE3
 
 SURFACE_BIAS = 0.5
 """Share of the variance of a pose by depth that consecutive frames share."""

@@ -6,9 +6,9 @@ import math
 
 import torch
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.tracking.motion import Motion
-from bidnerf_core.se3 import SE3
 
 METHOD = "track"
 """Method name of the poses that a tracker finds."""

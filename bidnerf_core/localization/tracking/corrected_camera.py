@@ -6,8 +6,8 @@ import math
 from dataclasses import astuple, dataclass, replace
 from typing import Any
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import Frame
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization.result import Localization
 
 

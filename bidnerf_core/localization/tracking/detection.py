@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import Frame
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
 from bidnerf_core.localization.search.evident_motion import share_moving
@@ -33,7 +34,6 @@ from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL
 from bidnerf_core.mapping.features import Features
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.resection import resect
-from bidnerf_core.se3 import SE3
 
 NEARBY = EXHAUSTIVE
 """Largest number of landmarks that are compared with an image: those seen in the most images of the map."""

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Generator
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.depth_sensor import UNKNOWN, DepthSensorModel
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
 from bidnerf_core.localization.covariance import INDEPENDENT
@@ -45,7 +46,6 @@ from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.se3 import SE3
 
 WIDEST = 0.4
 """Largest radius, as a share of the image's diagonal, within which landmarks are sought around their prediction."""

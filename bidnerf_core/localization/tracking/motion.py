@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.tracking.single_pose import retracted, update_between
-from bidnerf_core.se3 import SE3
 
 SPEED, TURN_RATE = 1.0, 1.0
 """Standard deviations of an unknown velocity, per second: reaches (distances to what the camera sees), and radians."""

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import torch
 
-from bidnerf_core.depth_sensor import UNKNOWN, DepthNoise
-from bidnerf_core.frames import Frame
+from bidnerf_core.depth.sensors import UNKNOWN, DepthNoise
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.landmark_query import pixel_threshold
 from bidnerf_core.localization.tracking.detection import flow_evidence
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, fit_pose
 from bidnerf_core.mapping.keypoint_depth import measured_depth
-from bidnerf_core.se3 import SE3
 
 LEAST_CORNERS = 20
 """Least number of corners that must agree with a motion."""

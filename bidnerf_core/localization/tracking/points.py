@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.camera import Intrinsics
-from bidnerf_core.frames import Frame
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.rolling_shutter import STILL, exposure_times, transposed_exposure_times
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.evident_motion import SHARE_MOVING, EvidentMotion, evident_motion
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.mapping.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.mapping.resection import ReprojectionFit, resect
-from bidnerf_core.rolling_shutter import STILL, exposure_times, transposed_exposure_times
-from bidnerf_core.se3 import SE3
 
 LEAST_FOLLOWED = 6
 """Least number of points from which a pose is estimated."""

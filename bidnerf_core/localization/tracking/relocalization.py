@@ -7,7 +7,8 @@ import time
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames import Frame, View
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
@@ -16,7 +17,6 @@ from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.twin_rejection import between_twins
-from bidnerf_core.se3 import SE3
 
 FIRST_FULL_SEARCH = 4
 """The number of lost frames after which the whole surface is searched; then again whenever that number has doubled."""

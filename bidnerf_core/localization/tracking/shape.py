@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE
@@ -23,7 +24,6 @@ from bidnerf_core.localization.tracking.alignment import ALIGNED_STEP, DEPTH_MEA
 from bidnerf_core.localization.tracking.motion import PoseEstimate
 from bidnerf_core.localization.tracking.single_pose import retracted
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.se3 import SE3
 
 WEAK = 0.1
 """Share of the mean information of the three best directions below which a direction is left to the prediction."""

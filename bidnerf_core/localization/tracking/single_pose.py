@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.rotations import left_jacobian, rotation_matrix, rotation_vector
-from bidnerf_core.se3 import SE3
+from bidnerf_core.geometry.rotations import left_jacobian, rotation_matrix, rotation_vector
+from bidnerf_core.geometry.se3 import SE3
 
 
 def retracted(T: SE3, tangent: Float[Tensor, "6"]) -> SE3:

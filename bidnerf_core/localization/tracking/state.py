@@ -13,7 +13,8 @@ from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.files import write_file
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.tracking.alignment import CloudInCamera
@@ -22,7 +23,6 @@ from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
 from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
-from bidnerf_core.se3 import SE3
 
 STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 4
 CLOUD = ("points", "rgb", "origins", "coloured")

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.field import SceneBounds
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.maps.storage import load_info, load_map
 from bidnerf_core.registry import load_backend
-from bidnerf_core.storage import load_info, load_map
 from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, rgb_views
 from bidnerf_core.training import Silent

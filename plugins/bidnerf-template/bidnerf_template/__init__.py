@@ -9,10 +9,10 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from bidnerf_core.field import FieldValues, SceneBounds, device_of
-from bidnerf_core.frames import View
-from bidnerf_core.rendering import render
-from bidnerf_core.sampling import Stratified
+from bidnerf_core.fields.contract import FieldValues, SceneBounds, device_of
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.fields.sampling import Stratified
+from bidnerf_core.frames.frame import View
 from bidnerf_core.training import RayBank, Report, StepOutcome, fit, supervised_loss
 
 __all__ = ["TemplateBackend", "TemplateConfig", "TemplateField", "backend"]

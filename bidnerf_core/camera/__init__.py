@@ -1,0 +1,1 @@
+"""Cameras: intrinsics, where they come from, orientation, and rolling shutters."""

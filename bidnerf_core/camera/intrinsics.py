@@ -1,0 +1,223 @@
+"""Pinhole cameras with lens distortion.
+
+Camera axes are OpenCV's: x right, y down, z forward. Pixel (column u, row v) of an image has its centre at
+(u + 0.5, v + 0.5); intrinsics are given for that convention.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from numbers import Integral, Real
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.calibration import distort_points, undistort_points
+from torch import Tensor
+
+from bidnerf_core.camera.orientation import QUARTER_TURNS, Orientation
+from bidnerf_core.devices import constant
+from bidnerf_core.errors import InputError
+
+LARGEST_SIZE = 1_000_000
+"""Columns or rows of an image."""
+SMALLEST_FOCAL, LARGEST_PIXELS = 1e-6, 1e9
+"""Limits of focal lengths and of the distance of the principal point, in pixels. Beyond them, float32 overflows."""
+LARGEST_FOCAL = 1000
+"""Focal length of a telescope, in sizes of the image: a field of view of 0.06 degrees."""
+LARGEST_COEFFICIENT = 1e6
+"""Limit of a distortion coefficient; those of rational models reach some hundreds."""
+ASPECT_TOLERANCE = 0.005
+"""Relative difference of two aspect ratios that passes for the rounding of a resized image."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Focal lengths, principal point and size in pixels; distortion as OpenCV orders it (k1, k2, p1, p2[, k3 ...])."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._check_types()
+        for name in ("fx", "fy"):
+            value = getattr(self, name)
+            if not SMALLEST_FOCAL <= value <= LARGEST_PIXELS:
+                raise InputError(f"focal length {name} is {value}, {_expected_focal(value)}")
+        if not (1 <= self.width <= LARGEST_SIZE and 1 <= self.height <= LARGEST_SIZE):
+            expected = f"1x1 to {LARGEST_SIZE}x{LARGEST_SIZE}"
+            raise InputError(f"image size is {self.width}x{self.height}, expected {expected}")
+        for name in ("cx", "cy"):
+            value = getattr(self, name)
+            if not abs(value) <= LARGEST_PIXELS:
+                raise InputError(f"principal point {name} is {value}, expected pixels near the image")
+        if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.distortion):
+            raise InputError(f"distortion is {self.distortion}, expected coefficients of a real lens")
+        if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
+            raise InputError(
+                f"distortion has {len(self.distortion)} coefficients, expected 0, 4, 5, 8, 12 or 14"
+            )
+
+    def _check_types(self) -> None:
+        """Raise ``InputError`` for what is no number, and for sizes that are not whole."""
+        for name in ("fx", "fy", "cx", "cy"):
+            _require(name, getattr(self, name), Real, "a number of pixels")
+        for name in ("width", "height"):
+            _require(name, getattr(self, name), Integral, "a whole number of pixels")
+        if not isinstance(self.distortion, tuple | list):
+            raise InputError(f"distortion is a {type(self.distortion).__name__}, expected coefficients")
+        for value in self.distortion:
+            _require("distortion", value, Real, "coefficients of a real lens")
+
+    @staticmethod
+    def from_focal(focal: float, width: int, height: int) -> Intrinsics:
+        """Return a camera without distortion; ``focal`` is in pixels, the principal point in the middle of the image."""
+        _require_size("width", width)
+        _require_size("height", height)
+        _require("focal length", focal, Real, "a number of pixels")
+        if focal > LARGEST_FOCAL * max(width, height):
+            raise InputError(
+                f"focal length is {focal} px for an image of {width}x{height}, expected at most {LARGEST_FOCAL} times its longer side"
+            )
+        return Intrinsics(focal, focal, width / 2, height / 2, width, height)
+
+    @staticmethod
+    def from_hfov(degrees: float, width: int, height: int) -> Intrinsics:
+        """Return a camera without distortion that sees ``degrees`` from the left edge of the image to the right one."""
+        _require("horizontal field of view", degrees, Real, "degrees between 0 and 180")
+        _require_size("width", width)
+        if not 0 < degrees < 180:
+            raise InputError(
+                f"horizontal field of view is {degrees}, expected degrees between 0 and 180 (both excluded)"
+            )
+        focal = focal_length(width, math.radians(degrees))
+        if not SMALLEST_FOCAL <= focal <= LARGEST_PIXELS:
+            found = f"horizontal field of view is {degrees}, which makes a focal length of {focal:.3g} pixels"
+            raise InputError(f"{found}, {_expected_focal(focal)}")
+        return Intrinsics.from_focal(focal, width, height)
+
+    def matrix(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "3 3"]:
+        return torch.tensor([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=dtype)
+
+    def unproject(self, pixels: Float[Tensor, "*p 2"]) -> Float[Tensor, "*p 3"]:
+        """Return the points on the plane z = 1 that appear at ``pixels`` (u, v); they are not unit vectors."""
+        if self.distortion:
+            exact = pixels.reshape(-1, 2).double()
+            flat = undistort_points(exact, *self._distortion_at(exact), num_iters=20)
+            pixels = flat.to(pixels.dtype).reshape(pixels.shape)
+        x = (pixels[..., 0] - self.cx) / self.fx
+        y = (pixels[..., 1] - self.cy) / self.fy
+        return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+    def project(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 2"]:
+        """Return the pixels (u, v) of points in the camera frame; not finite for points at or behind the camera."""
+        z = torch.where(points[..., 2] > 0, points[..., 2], torch.nan)
+        u = points[..., 0] / z * self.fx + self.cx
+        v = points[..., 1] / z * self.fy + self.cy
+        pixels = torch.stack([u, v], dim=-1)
+        if self.distortion:
+            exact = pixels.reshape(-1, 2).double()
+            flat = distort_points(exact, *self._distortion_at(exact))
+            pixels = flat.to(pixels.dtype).reshape(pixels.shape)
+        return pixels
+
+    def pixel_centres(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "h w 2"]:
+        v, u = torch.meshgrid(
+            torch.arange(self.height, dtype=dtype) + 0.5,
+            torch.arange(self.width, dtype=dtype) + 0.5,
+            indexing="ij",
+        )
+        return torch.stack([u, v], dim=-1)
+
+    def scaled(self, factor: float) -> Intrinsics:
+        """Return the camera of an image that is ``factor`` times as large."""
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """Return the camera of the same image resampled to another size."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y, width=width, height=height
+        )
+
+    def quarter_turns(self) -> tuple[Intrinsics, ...]:
+        """Return this camera turned by a quarter, to one side and to the other; none if its sensor is tilted (14 coefficients)."""
+        return () if any(self.distortion[TAU_X:]) else tuple(map(self.upright, QUARTER_TURNS))
+
+    def centre_crop(self, width: int, height: int) -> Intrinsics:
+        """Return the camera of the largest centred part of the image that has the shape of another size, at that size."""
+        scale = max(width / self.width, height / self.height)
+        return replace(
+            self, fx=self.fx * scale, fy=self.fy * scale, cx=width / 2 + (self.cx - self.width / 2) * scale,
+            cy=height / 2 + (self.cy - self.height / 2) * scale, width=width, height=height,
+        )  # fmt: skip
+
+    def upright(self, orientation: Orientation) -> Intrinsics:
+        """Return the camera of the upright image; this one is of the image as it is stored.
+
+        Raises ``InputError`` where an image with a tilted sensor (14 distortion coefficients) is transposed.
+        """
+        camera = self
+        if orientation.mirrors_columns:
+            distortion = _negated(camera.distortion, P2, S1, S2, TAU_Y)
+            camera = replace(camera, cx=camera.width - camera.cx, distortion=distortion)
+        if orientation.mirrors_rows:
+            distortion = _negated(camera.distortion, P1, S3, S4, TAU_X)
+            camera = replace(camera, cy=camera.height - camera.cy, distortion=distortion)
+        return camera._transposed() if orientation.transposes else camera
+
+    def _transposed(self) -> Intrinsics:
+        if any(self.distortion[TAU_X:]):
+            raise InputError("a camera with a tilted sensor cannot be rotated, expected an upright image")
+        order = [TRANSPOSED.get(place, place) for place in range(len(self.distortion))]
+        distortion = tuple(self.distortion[place] for place in order)
+        return Intrinsics(self.fy, self.fx, self.cy, self.cx, self.height, self.width, distortion)
+
+    def _distortion_at(self, points: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
+        """Return the camera matrix (3 3) and the distortion coefficients, where ``points`` lie."""
+        rows = (self.fx, 0.0, self.cx, 0.0, self.fy, self.cy, 0.0, 0.0, 1.0)
+        return constant(rows, points).reshape(3, 3), constant(tuple(self.distortion), points)
+
+
+def _require(name: str, value: object, kind: type, expected: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, kind):
+        raise InputError(f"{name} is {value!r:.60}, expected {expected}")
+
+
+def _expected_focal(value: float) -> str:
+    if value > LARGEST_PIXELS:
+        return f"expected at most {LARGEST_PIXELS:g} pixels"
+    if 0 < value < SMALLEST_FOCAL:
+        return f"expected at least {SMALLEST_FOCAL:g} pixels"
+    return "expected a positive number of pixels"
+
+
+def _require_size(name: str, value: object) -> None:
+    _require(name, value, Integral, "a whole number of pixels")
+    if not 1 <= int(value) <= LARGEST_SIZE:  # type: ignore[call-overload]
+        raise InputError(f"{name} is {value!r:.30}, expected 1 to {LARGEST_SIZE} pixels")
+
+
+P1, P2, S1, S2, S3, S4, TAU_X, TAU_Y = 2, 3, 8, 9, 10, 11, 12, 13
+"""Places of those distortion coefficients that depend on the directions of the axes."""
+TRANSPOSED = {P1: P2, P2: P1, S1: S3, S2: S4, S3: S1, S4: S2}
+
+
+def _negated(distortion: tuple[float, ...], *places: int) -> tuple[float, ...]:
+    return tuple(-value if place in places else value for place, value in enumerate(distortion))
+
+
+def focal_length(pixels: int, angle: float) -> float:
+    """Return the focal length (pixels) with which ``pixels`` columns or rows span ``angle`` (radians)."""
+    return pixels / 2 / math.tan(angle / 2)
+
+
+def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) may be of one image at two resolutions."""
+    ratio = size[0] * other[1] / (size[1] * other[0])
+    return abs(ratio - 1) <= ASPECT_TOLERANCE

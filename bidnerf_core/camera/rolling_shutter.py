@@ -1,0 +1,92 @@
+"""Rolling shutters: the rows of an image are exposed one after another, while the camera moves.
+
+The motion is the right update of the camera's pose from the first row to the last (translation first, in the camera's frame),
+at a constant velocity; the pose itself is that of the middle row (Hedborg et al., Rolling shutter bundle adjustment, CVPR
+2012).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.geometry.rotations import cross_matrix
+from bidnerf_core.geometry.se3 import SE3
+
+MOVE, TURN = 0.005, 0.01
+"""Typical motion of a hand-held camera while its rows are exposed (a few hundredths of a second): translation along each axis
+as a share of the distance of what it sees, and rotation about each axis in radians.
+"""
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """Standard deviations of the motion from the first row to the last."""
+
+    move: float = 0.0  # metres
+    turn: float = 0.0  # radians
+
+    @property
+    def deviations(self) -> Float[Tensor, "6"]:
+        return torch.tensor([self.move] * 3 + [self.turn] * 3, dtype=torch.float64)
+
+    @staticmethod
+    def usual(distance: float) -> MotionPrior:
+        """Return the prior of a hand-held camera that views things at a ``distance`` (metres)."""
+        return MotionPrior(MOVE * distance, TURN)
+
+
+AT_REST = torch.zeros(6, dtype=torch.float64)
+"""No motion."""
+STILL = MotionPrior()
+"""The prior of a camera that does not move, or whose rows are all exposed at once."""
+
+
+def exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
+    """Return the time at which each pixel was exposed, as a share of the readout time: -0.5 to 0.5, zero at the middle row.
+
+    Sensors are wider than they are high, so the sensor's rows are the columns of a portrait image; square images count as
+    landscape. The direction of the readout does not matter: reversing it reverses the motion.
+    """
+    return _times_along(pixels, camera, 0 if camera.height > camera.width else 1)
+
+
+def transposed_exposure_times(pixels: Float[Tensor, "m 2"], camera: Intrinsics) -> Float[Tensor, "m"]:
+    """Return ``exposure_times`` for rows along the other axis, as in a portrait crop of a landscape image."""
+    return _times_along(pixels, camera, 1 if camera.height > camera.width else 0)
+
+
+def _times_along(pixels: Float[Tensor, "m 2"], camera: Intrinsics, axis: int) -> Float[Tensor, "m"]:
+    return pixels[:, axis].double() / (camera.width, camera.height)[axis] - 0.5
+
+
+def poses_of_rows(times: Float[Tensor, "m"], motion: Float[Tensor, "*m 6"]) -> SE3:
+    """Return T_middle_row, the pose of the camera at each moment in the frame of the camera at the middle row.
+
+    ``motion`` is that of one image, or of the image of each moment.
+    """
+    return SE3.exp(times[:, None] * motion.to(times))
+
+
+def moved_points(
+    points: Float[Tensor, "m 3"], times: Float[Tensor, "m"], motion: Float[Tensor, "6"]
+) -> Float[Tensor, "m 3"]:
+    """Return points in the frame of the camera at their times of exposure, given in the camera's frame at the middle row."""
+    found = moved_array(points.double().numpy(), times.numpy(), motion.numpy())
+    return torch.from_numpy(found).to(points.dtype)
+
+
+def moved_array(
+    points: Float[np.ndarray, "m 3"], times: Float[np.ndarray, "m"], motion: Float[np.ndarray, "6"]
+) -> Float[np.ndarray, "m 3"]:
+    """Return ``moved_points`` for NumPy arrays, with the inverse of the exponential map to second order."""
+    turning = cross_matrix(motion[3:]).T
+    velocity = motion[:3] + points @ turning
+    share = times[:, None]
+    moved: np.ndarray = points - share * velocity + 0.5 * share**2 * (velocity @ turning)
+    return moved

@@ -1,0 +1,193 @@
+"""The cameras of a map's training images, as ``map.json`` stores them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
+
+MOST_NAMED = 6
+"""Largest number of images that a sentence names."""
+
+MatrixRows = tuple[tuple[float, float, float, float], ...]
+"""The rows of a 4x4 matrix."""
+RowMotion = tuple[float, float, float, float, float, float]
+"""The motion of a camera while its rows were exposed, see ``rolling_shutter``: metres, then radians."""
+
+
+@dataclass(frozen=True)
+class StoredCamera:
+    """Camera and pose of a training image: a viewpoint from which the scene is known to be visible."""
+
+    name: str
+    intrinsics: Intrinsics
+    T_world_camera: MatrixRows
+    given_T_world_camera: MatrixRows | None = None  # the dataset's pose, where training refined it
+    moved_pixels: float | None = None  # median motion (pixels) of the image's points by the refinement
+    # of the camera from the first row to the last, where refinement estimated it
+    motion: RowMotion | None = None
+
+    @property
+    def pose(self) -> SE3:
+        """T_world_camera, float64."""
+        return _pose(self.T_world_camera)
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether all poses are rigid transforms."""
+        rows = [
+            self.T_world_camera,
+            *([] if self.given_T_world_camera is None else [self.given_T_world_camera]),
+        ]
+        return all(len(part) == 4 and bool(_pose(part).is_rigid()) for part in rows)
+
+    def posed(self, view: View) -> View:
+        """Return the view at this pose, and with this motion."""
+        motion = None if self.motion is None else torch.tensor(self.motion, dtype=torch.float64)
+        return replace(view, T_ref_camera=self.pose, motion=motion)
+
+    @property
+    def update(self) -> Float[Tensor, "6"] | None:
+        """The right update (translation in metres first) from the given to the refined pose; None where the pose was kept."""
+        if self.given_T_world_camera is None:
+            return None
+        return (_pose(self.given_T_world_camera).inverse() @ self.pose).log()
+
+    @property
+    def moved(self) -> MovedCamera | None:
+        """How far refinement moved the camera; None where the given pose was kept."""
+        if (update := self.update) is None:
+            return None
+        metres, radians = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
+        return MovedCamera(self.name, metres, math.degrees(radians), self.moved_pixels or 0.0, self.motion)
+
+
+@dataclass(frozen=True)
+class MovedCamera:
+    """The distance of an image's refined pose from the given one."""
+
+    name: str
+    translation: float  # metres
+    rotation_deg: float
+    pixels: float  # median distance by which points move in the image
+    motion: RowMotion | None = None  # of the camera from the first row of the image to the last
+
+
+@dataclass(frozen=True)
+class PoseConsistency:
+    """The fit of the given poses, and of adjusted ones, to the keypoints that images share."""
+
+    noise_before: float  # pixels: standard deviation of the keypoints about their points at the given poses
+    noise_after: float
+
+    @property
+    def inconsistency(self) -> float:
+        """The deviation of keypoints (pixels) that errors of the given poses add to the keypoints' own noise."""
+        return max(0.0, self.noise_before**2 - self.noise_after**2) ** 0.5
+
+
+@dataclass(frozen=True)
+class PoseRefinement(PoseConsistency):
+    """The consistency of the poses given for a map's images, and which poses training used."""
+
+    refined: bool  # whether training used the adjusted poses
+    replaced: tuple[str, ...] = ()  # images with a wrong given pose, localized by the others' landmarks
+
+
+def stored_cameras(views: Sequence[View]) -> tuple[StoredCamera, ...]:
+    """Return the cameras of training views in the form that ``map.json`` holds."""
+    return tuple(
+        StoredCamera(v.frame.name, v.frame.intrinsics, _rows(v.T_ref_camera), motion=_six(v.motion))
+        for v in views
+    )
+
+
+def as_given(cameras: Sequence[StoredCamera]) -> tuple[StoredCamera, ...]:
+    """Return the cameras with the poses that the dataset gives."""
+    return tuple(
+        StoredCamera(c.name, c.intrinsics, c.given_T_world_camera or c.T_world_camera) for c in cameras
+    )
+
+
+def moved_from(
+    given: Sequence[View], refined: Sequence[StoredCamera], pixels: Sequence[float]
+) -> tuple[StoredCamera, ...]:
+    """Return the refined cameras; those whose pose changed also record the pose of the ``given`` view."""
+    return tuple(
+        camera
+        if camera.T_world_camera == (rows := _rows(view.T_ref_camera))
+        else replace(camera, given_T_world_camera=rows, moved_pixels=moved)
+        for view, camera, moved in zip(given, refined, pixels, strict=True)
+    )
+
+
+def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> list[str]:
+    """Return a sentence or two on the consistency of the given poses and how far they were moved."""
+    moved = [camera.moved for camera in cameras if camera.moved is not None]
+    wrong = [m for m in moved if m.name in found.replaced]
+    motions = [camera.motion for camera in cameras if camera.motion is not None]
+    cause = "errors of the given poses and motions of the cameras" if motions else "errors of the given poses"
+    error = f"{cause} add {found.inconsistency:.2f} px to the {found.noise_after:.2f} px of keypoints"
+    refined = found.refined and moved
+    kept = "the other poses are kept" if wrong else "the poses are kept"
+    lines = [f"{error}; {_typical_motion(moved)}" if refined else f"{error}; {kept}"]
+    if motions:
+        metres, degrees = _sizes(motions)
+        lines.append(
+            f"the rows of the images were exposed one after another, while the camera moved by {metres:.2g} and"
+            f" {degrees:.2g}° (median)"
+        )
+    if wrong:
+        most = sorted(wrong, key=lambda m: m.pixels, reverse=True)[:MOST_NAMED]
+        listed = ", ".join(f"{m.name} by {m.translation:.3g} and {m.rotation_deg:.2g}°" for m in most)
+        listed += f" and {len(wrong) - MOST_NAMED} more" if len(wrong) > MOST_NAMED else ""
+        lines.append(f"moved to where the landmarks of the other images place them: {listed}")
+    return lines
+
+
+def _sizes(motions: Sequence[RowMotion]) -> tuple[float, float]:
+    """Return the median translation (metres) and rotation (degrees)."""
+    lengths = torch.linalg.vector_norm(torch.tensor(motions).unflatten(-1, (2, 3)), dim=-1)
+    return median(lengths[:, 0].tolist()), math.degrees(median(lengths[:, 1].tolist()))
+
+
+def _typical_motion(moved: Sequence[MovedCamera]) -> str:
+    typical = [
+        median(part) for part in zip(*((m.translation, m.rotation_deg, m.pixels) for m in moved), strict=True)
+    ]
+    most = max(moved, key=lambda m: m.pixels)
+    return (
+        f"the poses are refined by {typical[0]:.3g} and {typical[1]:.2g}° or {typical[2]:.1f} px (median), {most.name} most,"
+        f" by {most.translation:.3g} and {most.rotation_deg:.2g}° or {most.pixels:.1f} px"
+    )
+
+
+def at_stored_poses(views: Sequence[View], cameras: Sequence[StoredCamera]) -> list[View]:
+    """Return the views at their refined poses; a view keeps its pose unless ``cameras`` records a refinement of that pose."""
+    known = {(c.name, c.given_T_world_camera): c for c in cameras if c.given_T_world_camera}
+    found = [known.get((view.frame.name, _rows(view.T_ref_camera))) for view in views]
+    return [view if c is None else c.posed(view) for view, c in zip(views, found, strict=True)]
+
+
+def _six(motion: Float[Tensor, "6"] | None) -> RowMotion | None:
+    if motion is None:
+        return None
+    a, b, c, d, e, f = motion.tolist()
+    return a, b, c, d, e, f
+
+
+def _rows(T: SE3) -> MatrixRows:
+    return tuple(tuple(row) for row in T.matrix().tolist())
+
+
+def _pose(rows: MatrixRows) -> SE3:
+    return SE3.from_matrix(torch.tensor(rows, dtype=torch.float64))

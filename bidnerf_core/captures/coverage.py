@@ -1,0 +1,168 @@
+"""The coverage of a capture: from where its scene was photographed, and from where it was not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.captures.report import Arrangement, CoverageRecord, Gap
+from bidnerf_core.frames.frame import View
+from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedViews
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping.triangulation import Sightings
+
+FACING = 0.9
+"""Share of the cameras that must have the centre in front of them for the capture to be around it."""
+CONVERGING = 0.5
+"""Largest distance at which a typical optical axis passes the centre, as a share of the cameras' distance."""
+OPEN_SIDE = 120.0
+"""Least range of directions without a camera, in degrees, with which a capture is from one side."""
+LEAST_GAP = 15.0
+"""Least width of a gap in degrees: SIFT matches well across narrower ones, which therefore cost nothing."""
+WIDE_GAP = 45.0
+"""Degrees above which a gap counts however irregular the capture is: from its middle, SIFT matches neither side well."""
+RARE = 0.01
+"""Probability that a capture whose cameras are spread at random has a gap that counts."""
+STEEP = 75.0
+"""Degrees above or below the horizon from which on a camera has no azimuth."""
+FEW_POINTS = 50
+"""Number of triangulated points below which a capture shows hardly any distances."""
+FEW = 4
+"""Number of photos below which gaps are not assessed."""
+
+
+def coverage(
+    views: Sequence[View], matched: TrackedKeypoints, seen: TrackedKeypoints, least_parallax: float
+) -> CoverageRecord:
+    """Return how well the views cover their scene.
+
+    ``matched`` are all keypoints that were matched, ``seen`` those that agree on a triangulated point, and
+    ``least_parallax`` is the angle (degrees) between rays below which a point cannot be placed.
+    """
+    angle = parallax_deg(matched)
+    centres = torch.stack([v.T_ref_camera.translation.cpu().double() for v in views])
+    rotations = torch.stack([v.T_ref_camera.rotation.cpu().double() for v in views])
+    up = torch.nn.functional.normalize(-rotations[:, :, 1].sum(0), dim=0)
+    centre, converge = _meeting_point(centres, rotations[:, :, 2])
+    directions = centres - centre if converge else rotations[:, :, 2]
+    arrangement, open_side, gaps, heights = _around(views, directions, up, converge)
+    if angle is not None and angle < least_parallax:
+        arrangement, open_side, gaps = "one place", None, ()
+    views_of = torch.bincount(seen.point).double()
+    cones = _cones_deg(seen.sightings, seen.count)
+    return CoverageRecord(
+        arrangement, _three(centre), _three(up), angle or 0.0, seen.count, _median(views_of),
+        float((views_of == 2).double().mean()) if len(views_of) else 0.0, _median(cones), open_side, gaps, heights,
+    )  # fmt: skip
+
+
+def _around(
+    views: Sequence[View], directions: Float[Tensor, "v 3"], up: Float[Tensor, "3"], converge: bool
+) -> tuple[Arrangement, Gap | None, tuple[Gap, ...], tuple[float, float]]:
+    """Return the arrangement of ``directions`` (of the cameras from the centre, or of their axes) about the vertical.
+
+    It comes with the open side, the gaps and the range of heights (degrees) of a ``CoverageRecord``.
+    """
+    unit = torch.nn.functional.normalize(directions, dim=-1)
+    heights = (unit @ up).clamp(-1, 1).asin().rad2deg()
+    low, high = heights.quantile(torch.tensor([0.05, 0.95], dtype=heights.dtype)).tolist()
+    flat = (heights.abs() < STEEP).nonzero()[:, 0]
+    if len(views) < FEW or len(flat) < FEW:
+        return "unknown", None, (), (low, high)
+    names = [views[i].frame.name for i in flat.tolist()]
+    steps, named = _steps(_azimuths_deg(unit[flat], up), names)
+    hidden = 0.0 if converge else _field_of_view_deg(views)
+    order = steps.argsort(descending=True).tolist()
+    is_open = float(steps[order[0]]) - hidden >= OPEN_SIDE
+    open_side = named[order[0]] if is_open else None
+    # Random directions have exponential steps: of n, one exceeds mean * log(n / p) with probability p.
+    mean = float(steps.median()) / math.log(2)
+    least = hidden + min(max(LEAST_GAP, mean * math.log(len(names) / RARE)), WIDE_GAP)
+    gaps = tuple(named[i] for i in order[int(is_open) :] if float(steps[i]) > least)
+    arrangement: Arrangement = "one side" if is_open else "around" if converge else "inside"
+    return arrangement, open_side, gaps, (low, high)
+
+
+def _steps(azimuths: Float[Tensor, "v"], names: Sequence[str]) -> tuple[Float[Tensor, "v"], list[Gap]]:
+    """Return the angles (degrees) from each direction to the next, once around, and the same as named gaps."""
+    order = azimuths.argsort()
+    steps = torch.diff(azimuths[order], append=azimuths[order[:1]] + 360)
+    ends = [names[i] for i in order.tolist()]
+    pairs = zip(steps.tolist(), ends, ends[1:] + ends[:1], strict=True)
+    return steps, [Gap(round(step, 1), after, before) for step, after, before in pairs]
+
+
+def _azimuths_deg(directions: Float[Tensor, "v 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "v"]:
+    """Return the angles about ``up``, from an arbitrary zero."""
+    first, second = horizontal_axes(up)
+    return torch.atan2(directions @ second, directions @ first).rad2deg()
+
+
+def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Return two unit axes that make a right-handed frame with ``up``."""
+    helper = torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
+    first = torch.nn.functional.normalize(helper - up * (helper @ up), dim=0)
+    return first, torch.linalg.cross(up, first)
+
+
+def _meeting_point(
+    centres: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3"]
+) -> tuple[Float[Tensor, "3"], bool]:
+    """Return the point nearest to the optical axes, and whether they meet there."""
+    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None]
+    matrix = across.sum(0) + 1e-9 * len(axes) * torch.eye(3, dtype=axes.dtype)  # parallel axes meet nowhere
+    point = torch.linalg.solve(matrix, (across @ centres[..., None]).sum(0))[:, 0]
+    away = point - centres
+    before = ((away * axes).sum(-1) > 0).double().mean()
+    missed = torch.linalg.vector_norm(torch.linalg.cross(away, axes), dim=-1)
+    distance = torch.linalg.vector_norm(away, dim=-1)
+    return point, bool(before >= FACING and missed.median() <= CONVERGING * distance.median())
+
+
+def _field_of_view_deg(views: Sequence[View]) -> float:
+    cameras = [view.frame.intrinsics for view in views]
+    return _median(torch.tensor([2 * math.degrees(math.atan(0.5 * c.width / c.fx)) for c in cameras]))
+
+
+def shows_distances(views: Sequence[View], tracked: TrackedViews | None) -> bool:
+    """Return whether views show how far things are: by depth, or from places far enough apart.
+
+    They do not if hardly any point can be triangulated because the rays to the same point differ too little, or if all
+    cameras are exactly in one place.
+    """
+    if any(view.frame.has_depth for view in views):
+        return True
+    centres = torch.stack([view.T_ref_camera.translation.double() for view in views])
+    if float((centres - centres[:1]).abs().max()) <= 0:
+        return False
+    angle = None if tracked is None else parallax_deg(tracked.matched)
+    if tracked is None or angle is None or angle >= DEFAULT_LANDMARKS.parallax:
+        return True
+    return len(tracked.triangulated(DEFAULT_LANDMARKS)[1]) >= FEW_POINTS
+
+
+def parallax_deg(matched: TrackedKeypoints) -> float | None:
+    """Return the median angle of the rays to a matched point; None without points."""
+    return _median(_cones_deg(matched.sightings, matched.count)) if matched.count else None
+
+
+def _cones_deg(sightings: Sightings, count: int) -> Float[Tensor, "n"]:
+    """Return twice the largest angle between the rays of each point and their mean."""
+    rays = sightings.directions()
+    mean = torch.zeros((count, 3), dtype=rays.dtype).index_add_(0, sightings.point, rays)
+    cosine = (torch.nn.functional.normalize(mean, dim=-1)[sightings.point] * rays).sum(-1).clamp(-1, 1)
+    least = torch.ones(count, dtype=rays.dtype).scatter_reduce(0, sightings.point, cosine, "amin")
+    return 2 * least.acos().rad2deg()
+
+
+def _median(values: Float[Tensor, "n"]) -> float:
+    return float(values.median()) if len(values) else 0.0
+
+
+def _three(vector: Float[Tensor, "3"]) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z

@@ -1,0 +1,181 @@
+"""Sharpness and exposure of the photos of a capture, relative to one another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.robust import MAD_TO_SIGMA
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping.view_pairs import likely_pairs
+
+LARGEST = 800
+"""Pixels along the longer side to which photos are reduced: finer detail is of no use to a map."""
+FINE, COARSE = 1.0, 4.0
+"""Standard deviations (pixels) of the Gaussians of the two scales whose energies are compared. The finer one suppresses
+noise, which would pass for detail.
+"""
+SHARPNESS_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
+"""Directions (rows, columns) of the second differences: motion blurs one of them alone."""
+DARKEST = 2 / 255
+"""Brightness below which pixels are equally dark: quantisation leaves nothing to compare."""
+OVEREXPOSED, UNDEREXPOSED = 254 / 255, 4 / 255
+"""Brightness of the brightest channel at or above which, and at or below which, a pixel holds no measurement."""
+GAMMA = 2.2
+"""Exponent from the values of an image to linear light, approximately that of sRGB."""
+ENOUGH_SHARED = 10
+"""Least number of landmarks by which the exposure of a photo is compared; with fewer, whole images are compared."""
+BRIGHTNESS_ROUNDS = 20
+"""Rounds of alternation between the brightness of landmarks and the exposure of photos."""
+NEIGHBOURS = 8
+"""Number of photos from nearby places with which a photo is compared."""
+LEAST_BLUR = 0.5
+"""Least lack of fine detail, in octaves of its energy, of a photo that counts as blurred."""
+OUTLYING = 4.0
+"""Robust standard deviations from the other photos of the capture beyond which a photo stands out."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoMeasures:
+    """Numbers measured in photos, one of each kind per photo."""
+
+    sharpness: Float[Tensor, "v"]  # log2 of fine over coarse energy, in the direction where it is least
+    brightness: Float[Tensor, "v"]  # log2 of the median linear brightness
+    overexposed: Float[Tensor, "v"]  # share of the pixels
+    underexposed: Float[Tensor, "v"]
+
+
+def photo_measures(views: Sequence[View]) -> PhotoMeasures:
+    """Measure each photo by itself."""
+    rows = torch.tensor([_measured(view.frame) for view in views], dtype=torch.float64).reshape(-1, 4)
+    return PhotoMeasures(*rows.unbind(-1))
+
+
+def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
+    """Return the energy of each photo's fine detail as a share of that in photos from nearby.
+
+    It is 1 for all photos but those that stand out as blurred.
+    """
+    sharpness = torch.tensor([_sharpness(_clean(view.frame.rgb).mean(-1)) for view in views])
+    lacking = -above_neighbours(sharpness, nearby(views))
+    return torch.where(standing_out(lacking, LEAST_BLUR), torch.exp2(-lacking), 1.0)
+
+
+def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
+    """Return which values exceed both ``least`` and ``OUTLYING`` robust standard deviations of all about zero."""
+    return values > max(least, OUTLYING * MAD_TO_SIGMA * float(values.abs().median()))
+
+
+def _measured(frame: Frame) -> tuple[float, float, float, float]:
+    image = _clean(frame.rgb)
+    inside = np.ones(image.shape[:2], bool) if frame.alpha is None else frame.alpha.cpu().numpy() > 0.5
+    shown = image[inside] if inside.any() else image.reshape(-1, 3)
+    brightest = shown.max(-1)
+    light = float(np.median(log_light(shown.mean(-1))))
+    return _sharpness(image.mean(-1)), light, float((brightest >= OVEREXPOSED).mean()), float(
+        (brightest <= UNDEREXPOSED).mean()
+    )  # fmt: skip
+
+
+def log_light(values: np.ndarray) -> np.ndarray:
+    """Return log2 of the linear light of image values in [0, 1]."""
+    return GAMMA * np.log2(np.maximum(values, DARKEST))
+
+
+def _sharpness(grey: np.ndarray) -> float:
+    """Return log2 of the ratio of fine to coarse energy, where contrast cancels; the least of four directions."""
+    factor = LARGEST / max(grey.shape)
+    if factor < 1:
+        size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (FINE, COARSE))
+    ratios = [
+        _energy(fine, step, 1) / max(_energy(coarse, step, int(COARSE)), 1e-12) for step in SHARPNESS_STEPS
+    ]
+    return float(np.log2(max(min(ratios), 1e-12)))
+
+
+def _energy(image: np.ndarray, direction: tuple[int, int], step: int) -> float:
+    """Return the mean squared second difference along a direction."""
+    rows, columns = direction[0] * step, direction[1] * step
+    ahead = np.roll(image, (-rows, -columns), (0, 1))
+    behind = np.roll(image, (rows, columns), (0, 1))
+    inner = (ahead + behind - 2 * image)[step:-step, step:-step]
+    return float(np.square(inner).mean()) if inner.size else 0.0
+
+
+def _clean(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
+    image: np.ndarray = rgb.detach().cpu().float().nan_to_num(0.0).clamp(0, 1).numpy()
+    return image
+
+
+def nearby(views: Sequence[View]) -> Bool[Tensor, "v v"]:
+    """Return which photos were taken from nearby places in similar directions."""
+    near = torch.zeros((len(views), len(views)), dtype=torch.bool)
+    if len(views) > 1:
+        i, j = likely_pairs(views, NEIGHBOURS).unbind(-1)
+        near[i, j] = near[j, i] = True
+    return near
+
+
+def above_neighbours(values: Float[Tensor, "v"], near: Bool[Tensor, "v v"]) -> Float[Tensor, "v"]:
+    """Return by how much each value exceeds the median of those nearby; 0 where there are none."""
+    around = torch.where(near, values, torch.nan).nanmedian(dim=1).values if len(values) else values
+    return (values - around).nan_to_num(0.0)
+
+
+def exposures(
+    views: Sequence[View], seen: TrackedKeypoints, brightness: Float[Tensor, "v"], near: Bool[Tensor, "v v"]
+) -> Float[Tensor, "v"]:
+    """Return the exposure of each photo (stops) relative to the median of all.
+
+    The brightness of a landmark in a photo is the landmark's own times the exposure of the photo. Both are found in turn, as
+    medians. Photos that show too few landmarks are compared with their neighbours as a whole.
+    """
+    image, point = seen.image, seen.point
+    light = _light_of_keypoints(views, seen)
+    enough = torch.bincount(image, minlength=len(views)) >= ENOUGH_SHARED
+    found = torch.zeros(len(views), dtype=torch.float64)
+    for _ in range(BRIGHTNESS_ROUNDS):
+        of_points = _medians(light - found[image], point, seen.count)
+        of_images = _medians(light - of_points[point], image, len(views))
+        found = torch.where(enough, of_images, 0.0)
+        found = found - found[enough].median() if bool(enough.any()) else found
+    own = brightness - found
+    compared = near & enough if bool(enough.any()) else near
+    around = torch.where(compared, own, torch.nan).nanmedian(dim=1).values
+    everywhere = own[enough].median() if bool(enough.any()) else brightness.median()
+    whole = brightness - around.nan_to_num(float(everywhere))
+    return torch.where(enough, found, whole)
+
+
+def _light_of_keypoints(views: Sequence[View], seen: TrackedKeypoints) -> Float[Tensor, "m"]:
+    """Return log2 of the linear light about each keypoint."""
+    image, number = seen.image, seen.number
+    pixels = torch.cat([p.keypoints.pixels for p in seen.images])[number]
+    found = torch.zeros(len(image), dtype=torch.float64)
+    for index in image.unique().tolist():
+        own = image == index
+        smooth = cv2.blur(_clean(views[index].frame.rgb).mean(-1), (5, 5))
+        u, v = pixels[own].floor().long().unbind(-1)
+        rows, columns = v.clamp(0, smooth.shape[0] - 1).numpy(), u.clamp(0, smooth.shape[1] - 1).numpy()
+        found[own] = torch.from_numpy(log_light(smooth[rows, columns])).double()
+    return found
+
+
+def _medians(values: Float[Tensor, "m"], index: Int[Tensor, "m"], count: int) -> Float[Tensor, "n"]:
+    """Return the lower median of the values of each index; 0 where there are none."""
+    order = torch.from_numpy(np.lexsort((values.numpy(), index.numpy())))
+    number = torch.bincount(index, minlength=count)
+    first = number.cumsum(0) - number
+    middle = (first + (number - 1).clamp(min=0) // 2).clamp(max=max(0, len(values) - 1))
+    if not len(values):
+        return torch.zeros(count, dtype=torch.float64)
+    return torch.where(number > 0, values[order][middle], 0.0)

@@ -1,0 +1,140 @@
+"""Refinement of the given poses of images by the keypoints that the images share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.captures.cameras import PoseConsistency
+from bidnerf_core.captures.shutter_evidence import common_motion
+from bidnerf_core.geometry.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.mapping.bundle_adjustment import MeasuredSightings, PosePrior, adjusted
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, pose_updates
+from bidnerf_core.mapping.resection import LEAST_NOISE
+from bidnerf_core.mapping.triangulation import noise
+
+ROUNDS = 3
+"""Largest number of adjustments. After each, the keypoints are matched anew, which finds those that wrong poses hid."""
+SETTLED_PIXELS = 0.25
+"""Largest motion of an image in an adjustment (pixels) after which no further one is needed."""
+CORRELATED_KEYPOINTS = 10.0
+"""Number of keypoints that count as one: lenses and rolling shutters cause errors that the keypoints of an image share."""
+LEAST_DEVIATION = 1e-9
+"""Least standard deviation of the poses (metres, radians) that is assumed."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedPoses:
+    """The poses that fit the keypoints best, and how well the given ones do."""
+
+    tracked: TrackedViews  # with these poses, and matched by them
+    pixels: Float[Tensor, "v"]  # median motion in each image of the points that it shows; 0 without points
+    consistency: PoseConsistency  # of the given poses
+
+
+def adjusted_poses(
+    tracked: TrackedViews,
+    config: LandmarkConfig,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    least: float = 0.0,
+) -> AdjustedPoses | None:
+    """Adjust the poses of ``tracked`` images and the points that they show; None if there are too few of either.
+
+    The errors of the given poses are taken as independent of each other, and as large as resection of the images
+    suggests. This prior alone fixes the gauge (position, orientation and scale of the whole), so the mean motion of the images
+    is about zero. If the keypoints show that the cameras moved while the rows of their images were exposed, these motions are
+    estimated too. Otherwise, if the first adjustment finds an inconsistency of less than ``least`` pixels, its poses are
+    returned at once.
+    """
+    given = tracked.T_world_camera
+    seen, points = tracked.triangulated(config)
+    before = max(LEAST_NOISE, noise(seen.sightings, points))
+    deviations = _deviations(seen, points, before)
+    if deviations is None:
+        return None
+    motion = STILL
+    for number in range(ROUNDS):
+        sightings, prior = _measured(seen, points), PosePrior(given, *deviations, motion)
+        fit = adjusted(sightings, points, prior, tracked.T_world_camera, motion=tracked.motion)
+        step = _motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
+        moved = (given.inverse() @ fit.T_world_camera).log()
+        deviations = max(deviations[0], _spread(moved[:, :3])), max(deviations[1], _spread(moved[:, 3:]))
+        pixels = _motion(seen, fit.points, given, fit.T_world_camera)
+        tracked = tracked.at(fit.T_world_camera, fit.motion)
+        noticed = False
+        if motion == STILL and number < ROUNDS - 1:  # later ones could not be estimated any more
+            motion = _common_motion(tracked, config)
+            noticed = motion != STILL
+        if number == 0 and not noticed:
+            found = _found(tracked, pixels, before, config)
+            if found.consistency.inconsistency < least:
+                return found
+        tracked = tracked.matched_anew(config, progress)
+        if float(step.max()) <= SETTLED_PIXELS and not noticed:
+            break
+        seen, points = tracked.triangulated(config)
+    return _found(tracked, pixels, before, config)
+
+
+def _measured(seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> MeasuredSightings:
+    """Return the keypoints without their measured depth, as sightings for an adjustment."""
+    pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
+    unmeasured = torch.zeros(len(seen.point), dtype=torch.float64)
+    return MeasuredSightings(
+        seen.sightings, seen.image, unmeasured, pixel_noise, 1.0, CORRELATED_KEYPOINTS, seen.exposure_times
+    )
+
+
+def _common_motion(tracked: TrackedViews, config: LandmarkConfig) -> MotionPrior:
+    return common_motion(*tracked.triangulated(config), CORRELATED_KEYPOINTS)
+
+
+def _found(
+    tracked: TrackedViews, pixels: Float[Tensor, "v"], before: float, config: LandmarkConfig
+) -> AdjustedPoses:
+    seen, points = tracked.triangulated(config)
+    after = max(LEAST_NOISE, noise(seen.sightings, points))
+    return AdjustedPoses(tracked, pixels, PoseConsistency(before, after))
+
+
+def _deviations(
+    seen: TrackedKeypoints, points: Float[Tensor, "n 3"], pixel_noise: float
+) -> tuple[float, float] | None:
+    """Return the standard deviations of the given poses (metres, radians) along and about each axis."""
+    updates = list(pose_updates(seen, points, pixel_noise).values())
+    if len(updates) < ENOUGH_IMAGES:
+        return None
+    values = torch.stack(updates)
+    return _spread(values[:, :3]), _spread(values[:, 3:])
+
+
+def _spread(values: Float[Tensor, "v 3"]) -> float:
+    """Return a robust standard deviation about zero."""
+    return max(LEAST_DEVIATION, MAD_TO_SIGMA * float(values.abs().median()))
+
+
+def _motion(
+    seen: TrackedKeypoints, points: Float[Tensor, "n 3"], given: SE3, found: SE3
+) -> Float[Tensor, "v"]:
+    """Return the median motion (pixels) in each image of the points that it shows, between two poses of the image."""
+    shown, image = points[seen.point], seen.image
+    focal = seen.sightings.focal[:, None]
+    places = [_projected(T, image, shown) * focal for T in (given, found)]
+    away = torch.linalg.vector_norm(places[1] - places[0], dim=-1)
+    medians = torch.zeros(len(seen.images), dtype=torch.float64)
+    for number in image.unique().tolist():
+        medians[number] = away[image == number].median()
+    return medians
+
+
+def _projected(T: SE3, image: Tensor, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 2"]:
+    local = T[image].inverse().apply(points)
+    return local[:, :2] / local[:, 2:].clamp(min=1e-9)

@@ -1,0 +1,120 @@
+"""Photos of a capture that may be wrongly posed, localized by the landmarks of the other photos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bidnerf_core.captures.report import PhotoProblem, PhotoRecord
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.mirrored import mirror_image
+from bidnerf_core.mapping.features import Features
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
+
+SUSPECT = 0.5
+"""A photo is a suspect if the share of its keypoints that are landmarks is below this fraction of the capture's median."""
+MOST_SUSPECTS = 32
+"""Largest number of photos that are localized anew."""
+POSE_DEVIATIONS, POSE_PIXELS = 6.0, 4.0
+"""Standard deviations, and pixels of image motion, by which a bad pose at least differs from the landmarks' pose.
+
+The latter is twice as far as a match may lie from its epipolar line.
+"""
+TURNED_ANGLE = 60.0
+"""Least rotation about the optical axis, in degrees, of a photo that counts as turned rather than badly posed."""
+ALONG_AXIS = 0.9
+"""Least cosine between that rotation's axis and the optical axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relocation:
+    """A photo's pose by the landmarks of other photos, compared with the given one."""
+
+    update: Float[Tensor, "6"]  # right update from the given pose, translation (metres) first
+    deviations: float  # length of the update, in standard deviations
+    pixels: float  # how far the image moves with the update
+    mirrored: bool = False
+
+    @property
+    def problem(self) -> PhotoProblem | None:
+        angle = float(torch.linalg.vector_norm(self.update[3:]))
+        if self.mirrored:
+            return "mirrored"
+        if self.deviations < POSE_DEVIATIONS or self.pixels < POSE_PIXELS:
+            return None
+        about_axis = abs(float(self.update[5])) >= ALONG_AXIS * angle
+        return "turned" if about_axis and math.degrees(angle) >= TURNED_ANGLE else "badly posed"
+
+    def onto(self, record: PhotoRecord) -> PhotoRecord:
+        """Return the record, completed by how far off the given pose is; a mirrored photo has no pose to compare."""
+        if self.mirrored:
+            return record
+        translation, rotation = (float(torch.linalg.vector_norm(part)) for part in self.update.split(3))
+        return replace(
+            record, pose_translation=translation, pose_rotation_deg=math.degrees(rotation),
+            pose_deviations=self.deviations,
+        )  # fmt: skip
+
+
+def suspects(seen: TrackedKeypoints, count: Int[Tensor, "v"], group: Int[Tensor, "v"]) -> list[int]:
+    """Return the photos outside the largest group, and those whose keypoints are landmarks much more rarely than usual."""
+    keypoints = torch.tensor([len(image.keypoints) for image in seen.images])
+    share = count / keypoints.clamp(min=1)
+    main = group == 0
+    if not bool(main.any()):
+        return []
+    found = (~main | (share < SUSPECT * share[main].median())).nonzero()[:, 0].tolist()
+    step = max(1.0, len(found) / MOST_SUSPECTS)
+    return [found[int(i * step)] for i in range(min(len(found), MOST_SUSPECTS))]
+
+
+def relocated(
+    tracked: TrackedViews,
+    views: Sequence[View],
+    numbers: Sequence[int],
+    features: Features,
+    config: LandmarkConfig,
+) -> dict[int, Relocation]:
+    """Localize the suspects by landmarks that are built without them, as they are and then mirrored."""
+    if not numbers:
+        return {}
+    try:
+        matcher = LandmarkMatcher(tracked.without(numbers).landmarks(config))
+    except InputError:  # what is left shows nothing in common
+        return {}
+    answers: dict[int, Relocation] = {}
+    for number in numbers:
+        for mirrored in (False, True):
+            view = views[number]
+            if mirrored:
+                view = replace(view, frame=mirror_image(view.frame))
+            found = propose(matcher, [View(view.frame, SE3.identity())], features)
+            if found is not None and landmark_verdict(found).accepted:
+                answers[number] = _compared(found, views[number], mirrored)
+                break
+    return answers
+
+
+def _compared(found: LandmarkPose, view: View, mirrored: bool) -> Relocation:
+    T = view.T_ref_camera.to("cpu", torch.float64)
+    update = (T.inverse() @ found.T_world_camera).log()
+    deviations = float((update @ torch.linalg.solve(found.full_covariance, update)).clamp(min=0).sqrt())
+    return Relocation(update, deviations, image_motion(update, view, found.distance), mirrored)
+
+
+def image_motion(update: Float[Tensor, "6"], view: View, distance: float) -> float:
+    """Return how far, in pixels and at most, an update of the pose moves the image of a point at ``distance`` (metres)."""
+    translation, rotation = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
+    return view.frame.intrinsics.fx * (rotation + translation / max(distance, 1e-9))

@@ -1,0 +1,47 @@
+"""Evidence that the images of a capture were taken with a rolling shutter by moving cameras."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, observed_at_rest
+from bidnerf_core.mapping.resection import log_motion_evidence, resect
+from bidnerf_core.mapping.triangulation import noise
+
+MOST_IMAGES = 60
+"""Largest number of images that are examined; they are spread over the capture."""
+MOST_EVIDENCE = 10.0
+"""Largest contribution of an image to the logarithm of the evidence, for or against a motion: no few images decide."""
+
+
+def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlation: float) -> MotionPrior:
+    """Return the prior of the cameras' motions if it is more probable that they moved, else ``STILL``.
+
+    The hypotheses concern the capture as a whole: all images have been exposed row by row, or none. Each image is resected
+    from ``points`` with and without a motion. ``correlation`` is the number of keypoints that count as one.
+    """
+    sightings, image = seen.sightings, seen.image
+    numbers = (torch.bincount(image) >= LEAST_VISIBLE_POINTS).nonzero()[:, 0]
+    if len(numbers) < ENOUGH_IMAGES:
+        return STILL
+    prior = MotionPrior.usual(float(sightings.in_camera(points)[:, 2].median()))
+    pixel_noise, total = noise(sightings, points), 0.0
+    for number in numbers[:: -(-len(numbers) // MOST_IMAGES)].tolist():
+        own = (image == number).nonzero()[:, 0]
+        T = seen.images[number].T_world_camera
+        data = observed_at_rest(sightings[own], points, T)
+        data = replace(data, exposure_times=seen.exposure_times[own])
+        still = resect(data, T, pixel_noise, correlation=correlation)
+        moving = resect(data, T, pixel_noise, correlation=correlation, motion=prior)
+        evidence = log_motion_evidence(data, moving, still, prior, correlation)
+        total += (
+            min(MOST_EVIDENCE, max(-MOST_EVIDENCE, evidence)) if math.isfinite(evidence) else -MOST_EVIDENCE
+        )
+    return prior if total > 0 else STILL

@@ -1,0 +1,93 @@
+"""The poses with which photos train a map: the given ones, or better ones where the photos contradict them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.captures.cameras import PoseConsistency
+from bidnerf_core.captures.links import groups, linked
+from bidnerf_core.captures.pose_refinement import AdjustedPoses, adjusted_poses
+from bidnerf_core.captures.relocated_photos import Relocation, relocated, suspects
+from bidnerf_core.frames.frame import View
+from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
+
+INCONSISTENT = 0.25
+"""Least deviation (pixels) that errors of the given poses must add to that of the keypoints for the poses to be refined.
+Poses by structure from motion or a renderer add less than a tenth.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingPoses:
+    """The poses to train with, and how far they are from the given ones."""
+
+    tracked: TrackedViews  # with these poses
+    pixels: Float[Tensor, "v"]  # median motion of the points in an image; 0 where its pose was kept
+    replaced: list[int]  # images whose given pose was wrong, placed by landmarks of the others
+    refined: bool  # whether all poses were refined
+    consistency: PoseConsistency | None  # of the given poses; None if not known
+
+
+def training_poses(
+    tracked: TrackedViews,
+    views: Sequence[View],
+    least: float = INCONSISTENT,
+    features: Features = SIFT,
+    config: LandmarkConfig | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TrainingPoses:
+    """Return the poses to train with, for ``views`` whose keypoints are ``tracked``.
+
+    A photo that the landmarks of the others find at another place than its given pose is moved there. All poses are refined
+    if errors of the given ones add ``least`` pixels to the deviation of the keypoints; otherwise they are kept.
+    """
+    config = LandmarkConfig() if config is None else config
+    given = tracked.T_world_camera
+    wrong = _wrongly_posed(tracked, views, features, config)
+    if wrong:
+        updates = torch.zeros(len(views), 6, dtype=torch.float64)
+        for number, found in wrong.items():
+            updates[number] = found.update
+        tracked = tracked.at(given.retract(updates)).matched_anew(config, progress)
+    fit = adjusted_poses(tracked, config, progress, least)
+    answer = _chosen(tracked, fit, list(wrong), least)
+    if wrong and fit is not None and not answer.refined:
+        answer = replace(answer, tracked=answer.tracked.matched_anew(config, progress))
+    for number, found in wrong.items():
+        answer.pixels[number] = found.pixels
+    return answer
+
+
+def _chosen(
+    tracked: TrackedViews, fit: AdjustedPoses | None, wrong: list[int], least: float
+) -> TrainingPoses:
+    """Return the refined poses if needed, else the present ones, of which only those that were wrong are refined."""
+    still = torch.zeros(len(tracked.observations.images), dtype=torch.float64)
+    if fit is None:
+        return TrainingPoses(tracked, still, wrong, False, None)
+    if fit.consistency.inconsistency >= least:
+        return TrainingPoses(fit.tracked, fit.pixels, wrong, True, fit.consistency)
+    poses, better = tracked.T_world_camera, fit.tracked.T_world_camera
+    for number in wrong:
+        poses.rotation[number], poses.translation[number] = (
+            better.rotation[number],
+            better.translation[number],
+        )
+    return TrainingPoses(tracked.at(poses) if wrong else tracked, still, wrong, False, fit.consistency)
+
+
+def _wrongly_posed(
+    tracked: TrackedViews, views: Sequence[View], features: Features, config: LandmarkConfig
+) -> dict[int, Relocation]:
+    """Return the photos that the landmarks of the others find at another place, by number."""
+    seen, _ = tracked.triangulated(config)
+    count = torch.bincount(seen.image, minlength=len(views))
+    doubtful = suspects(seen, count, groups(linked(seen)))
+    found = relocated(tracked, views, doubtful, features, config)
+    return {number: photo for number, photo in found.items() if photo.problem in ("badly posed", "turned")}

@@ -1,0 +1,174 @@
+"""A trial of a map's landmarks: localize some of its own images by landmarks that are built without them.
+
+The errors show how accurate poses by landmarks are in this map, and how many keypoints count as one measurement: triangulated
+points, lenses, rolling shutters and the given poses all have errors that the keypoints of an image share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from scipy.stats import chi2
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.acceptance import landmark_verdict
+from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.landmark_building import (
+    DEFAULT_LANDMARKS,
+    LandmarkConfig,
+    TrackedViews,
+    tracked_views,
+)
+from bidnerf_core.mapping.landmarks import HeldOutTrial, LandmarkMap
+
+HELD_OUT, MOST_HELD_OUT = 8, 24
+"""One image in ``HELD_OUT`` is held out, and at most ``MOST_HELD_OUT`` in all."""
+ENOUGH_ANSWERS = 6
+"""Least number of localized images from which scatter is estimated."""
+QUANTILE = 0.9
+"""Quantile of the errors at which their model is fitted: it covers the tails, and one image of ten may have a wrong pose."""
+CORRELATIONS = (1.0, 300.0)
+"""Range of the number of keypoints that count as one measurement."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    found: LandmarkPose
+    update: Float[Tensor, "6"]  # right update from the given pose to the one found
+
+    @property
+    def matches(self) -> int:
+        """The number of correspondences that the pose was refined on."""
+        return len(self.found.correspondences)
+
+
+def build_tried_landmarks(
+    views: Sequence[View],
+    features: Features = SIFT,
+    config: LandmarkConfig = DEFAULT_LANDMARKS,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    report: Callable[[str], None] = lambda sentence: None,
+) -> LandmarkMap:
+    """Build landmarks as ``mapping.landmark_building.build_landmarks`` does, and try them: see ``tried_landmarks``."""
+    return tried_landmarks(tracked_views(views, features, config, progress), views, features, config, report)
+
+
+def tried_landmarks(
+    tracked: TrackedViews,
+    views: Sequence[View],
+    features: Features = SIFT,
+    config: LandmarkConfig = DEFAULT_LANDMARKS,
+    report: Callable[[str], None] = lambda sentence: None,
+) -> LandmarkMap:
+    """Return the landmarks of ``views``, whose keypoints were ``tracked``, after a trial on images that are held out.
+
+    The trial sets ``correlation``, ``usual_matches``, ``calibration_scatter`` and ``trial`` of the landmarks, and enlarges
+    ``pose_covariance`` if errors are larger than any ``correlation`` explains, as where many given poses are wrong. Raises
+    ``InputError`` if there are no landmarks.
+    """
+    landmarks = tracked.landmarks(config, report)
+    held_out = _held_out(len(views))
+    answers = _answers(tracked, views, held_out, features, config)
+    landmarks = replace(landmarks, trial=_trial(answers, len(held_out)))
+    if len(answers) < ENOUGH_ANSWERS:
+        return landmarks
+    usual = float(torch.tensor([float(answer.matches) for answer in answers]).median())
+    landmarks = replace(landmarks, usual_matches=usual)
+    landmarks = replace(landmarks, correlation=_correlation(answers, landmarks))
+    if landmarks.correlation > 0.99 * CORRELATIONS[1]:
+        landmarks = replace(landmarks, pose_covariance=landmarks.pose_covariance + _unexplained(answers))
+    return replace(landmarks, calibration_scatter=_calibration_scatter(answers, landmarks))
+
+
+def _held_out(count: int) -> list[int]:
+    """Return the numbers of the images that are held out, evenly spread."""
+    wanted = min(count // HELD_OUT, MOST_HELD_OUT)
+    return [int((i + 0.5) * count / wanted) for i in range(wanted)]
+
+
+def _answers(
+    tracked: TrackedViews,
+    views: Sequence[View],
+    held_out: Sequence[int],
+    features: Features,
+    config: LandmarkConfig,
+) -> list[_Answer]:
+    """Localize the images that are held out, and return the accepted answers."""
+    if not held_out:
+        return []
+    try:
+        landmarks = tracked.without(held_out).landmarks(config)
+    except InputError:  # what is left shows nothing in common
+        return []
+    plain = replace(landmarks, correlation=1.0, pose_covariance=torch.zeros_like(landmarks.pose_covariance))
+    matcher, answers = LandmarkMatcher(plain), []
+    for number in held_out:
+        T = views[number].T_ref_camera.to("cpu", torch.float64)
+        view = View(views[number].frame, SE3.identity())
+        # Poses that were found without a motion are compared with such poses.
+        found = propose(matcher, [view], features, moving=views[number].motion is not None)
+        if found is not None and landmark_verdict(found).accepted:
+            answers.append(_Answer(found, (T.inverse() @ found.T_world_camera).log()))
+    return answers
+
+
+def _trial(answers: Sequence[_Answer], images: int) -> HeldOutTrial:
+    if not answers:
+        return HeldOutTrial(images)
+    updates = torch.stack([answer.update for answer in answers])
+    translation, rotation = (torch.linalg.vector_norm(part, dim=-1) for part in updates.split(3, dim=-1))
+    return HeldOutTrial(
+        images, len(answers), float(translation.quantile(0.5)), float(rotation.rad2deg().quantile(0.5))
+    )
+
+
+def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
+    """Return the ``correlation`` with which the errors are as large as the covariances of the fits predict."""
+    updates = torch.stack([answer.update for answer in answers])
+    covariances = torch.stack([answer.found.covariance for answer in answers])
+    expected = float(chi2.ppf(QUANTILE, 6))
+    low, high = CORRELATIONS
+    for _ in range(30):  # bisection, geometrically
+        middle = (low * high) ** 0.5
+        factors = _factors(answers, replace(landmarks, correlation=middle))
+        information = torch.linalg.inv(factors[:, None, None] * covariances + landmarks.pose_covariance)
+        squared = torch.einsum("ni,nij,nj->n", updates, information, updates)
+        low, high = (middle, high) if float(squared.quantile(QUANTILE)) > expected else (low, middle)
+    return (low * high) ** 0.5
+
+
+def _unexplained(answers: Sequence[_Answer]) -> Float[Tensor, "6 6"]:
+    """Return the covariance of independent errors along each axis as large as those of the answers."""
+    squared = torch.stack([answer.update for answer in answers]).square()
+    return torch.diag(squared.quantile(QUANTILE, dim=0) / float(chi2.ppf(QUANTILE, 1)))
+
+
+def _factors(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
+    """Return the factors by which to scale the covariances of answers that treat keypoints as independent."""
+    return torch.tensor([landmarks.correlation_of(answer.matches) for answer in answers], dtype=torch.float64)
+
+
+def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "4"]:
+    """Return the standard deviations of the corrections that the images' intrinsics, although right, seem to need.
+
+    What the fits' own uncertainty explains is left out.
+    """
+    apparent = torch.stack([answer.found.miscalibration.apparent for answer in answers])
+    noise = torch.stack([answer.found.miscalibration.noise for answer in answers])
+    explained = _factors(answers, landmarks)[:, None] * noise.square()
+    low, high = torch.full((4,), 1e-5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
+    for _ in range(30):
+        middle = (low * high).sqrt()
+        squared = apparent.square() / (explained + middle.square())
+        above = squared.quantile(QUANTILE, dim=0) > float(chi2.ppf(QUANTILE, 1))
+        low, high = torch.where(above, middle, low), torch.where(above, high, middle)
+    return (low * high).sqrt()

@@ -1,0 +1,1 @@
+"""Depth images, the sensors that measure them, and their noise."""

@@ -1,0 +1,174 @@
+"""Depth images: planar z in metres, and 0 where nothing was measured."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.io.arrays import read_array
+from bidnerf_core.io.images import decode, to_numpy
+
+FARTHEST = 1e9
+"""Metres. No sensor measures more."""
+NOTHING = 1e10
+"""Floating-point values from here on mean "nothing", whatever the unit: Blender's 1e10, the largest float."""
+MILLIMETRE = 0.001
+"""Metres."""
+INTEGER_UNIT, FLOAT_UNIT = MILLIMETRE, 1.0
+"""Metres per step where the user gives no unit."""
+SPIKE, SPIKE_PIXELS = 0.05, 20
+"""Share and number of pixels above which an image's largest value may be the sensor's limit, not a measurement ..."""
+NEAREST_LIMIT, LIMIT_STEP = 4.0, 0.5
+"""... if it is a round number, as ranges in settings and data sheets are: a multiple of 0.5 m, from 4 m on ..."""
+LARGEST_OF_BITS = tuple(2**bits - 1 for bits in range(11, 17))
+"""... or has all bits set, for a sensor of 11 to 16 bits ..."""
+STANDS_OUT = 4
+"""... and is at least this many times as frequent as any other. A wall that faces the camera has a single depth as well, but
+rarely a round one, and images of several flat surfaces have several."""
+SATURATED = np.iinfo(np.uint16).max
+"""A 16-bit sensor writes this for "too far" or "nothing"; 65.535 once it is converted to metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """A depth image, and the values that were found in place of measurements."""
+
+    metres: Float[Tensor, "h w"]  # planar z, 0 where nothing was measured
+    unit: float  # metres per step
+    replaced: dict[str, int]  # how often each kind of value that is not a depth occurred, except zeros
+
+    @property
+    def median(self) -> float | None:
+        """The median of the measured distances (metres), or None where nothing was measured."""
+        measured = self.metres[self.metres > 0]
+        return float(measured.median()) if measured.numel() else None
+
+    def remark(self, unit_assumed: bool) -> str | None:
+        """Return one line on the assumed unit, missing depth and dropped values, or None if there is nothing to report."""
+        parts = []
+        if self.median is None:
+            parts.append("the depth image holds no measurement, so colour alone is used")
+        elif unit_assumed:
+            middle = f"median depth {self.median:.4g} m"
+            parts.append(f"depth_unit is not given, {self.unit:g} m a step is assumed: {middle}")
+        return "; ".join([*parts, *filter(None, [self.dropped])]) or None
+
+    @property
+    def dropped(self) -> str | None:
+        """A clause that lists the values dropped, or None if there were none."""
+        found = ", ".join(f"{count} x {what}" for what, count in self.replaced.items())
+        return f"counted as not measured: {found}" if found else None
+
+
+def read_depth(path: Path, unit: float) -> Float[Tensor, "h w"]:
+    """Read planar z in metres, ``unit`` metres per step; 0 where nothing was measured (see ``depth_image``)."""
+    return read_depth_image(path, unit).metres
+
+
+def read_depth_image(path: Path, unit: float | None) -> DepthImage:
+    """Read a grey image of whole or floating-point numbers, or the ``.npy`` of an array; see ``depth_image``.
+
+    Raises ``InputError`` for anything else.
+    """
+    raw = read_array(path, "a .npy file") if path.suffix.lower() == ".npy" else decode(path)
+    return depth_image(raw, unit, f"{path}: depth")
+
+
+def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> DepthImage:
+    """Convert an array (h, w) or (h, w, 1) of ``unit`` metres per step; None is 0.001 for integers and 1 for floats.
+
+    Values that no sensor measures become 0: NaN, infinite and negative values, the largest of an integer type, 65535 and
+    65.535 of a floating-point one, and floats of more than 1e9 m (1e10, the largest float). So does the largest value of the
+    image where it is a sensor's limit: a round number (``LIMIT_STEP``, ``LARGEST_OF_BITS``) in a twentieth of all pixels or
+    more, far more frequent than any other, but not the only value measured. Raises ``InputError``, whose message begins with
+    ``what``, for arrays of another shape or type and a unit that is not positive.
+    """
+    values = to_numpy(raw)
+    values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
+    if values.ndim != 2 or not values.size or values.dtype.kind not in "uif":
+        found = f"{'x'.join(map(str, values.shape))} of {values.dtype.name}"
+        raise InputError(f"{what} is {found}, expected one channel of whole or floating-point numbers")
+    if unit is None:
+        unit = FLOAT_UNIT if values.dtype.kind == "f" else INTEGER_UNIT
+    if not 0 < unit <= FARTHEST:
+        raise InputError(f"{what}: depth_unit is {unit}, expected a positive number of metres a step")
+    metres = values.astype(np.float64) * unit
+    absent = _absent(values, metres)
+    unmeasured = np.logical_or.reduce([metres == 0, *absent.values()])
+    limit = _at_limit(values, metres, unmeasured)
+    absent |= limit
+    unmeasured = np.logical_or.reduce([unmeasured, *limit.values()])
+    counts = {name: int(mask.sum()) for name, mask in absent.items() if mask.any()}
+    return DepthImage(
+        torch.from_numpy(np.where(unmeasured, 0, metres).astype(np.float32)), float(unit), counts
+    )
+
+
+def _absent(values: np.ndarray, metres: np.ndarray) -> dict[str, np.ndarray]:
+    """Return masks of the values that mean "not measured", by their names in messages; no pixel is in two of them."""
+    if values.dtype.kind != "f":
+        largest = np.iinfo(values.dtype).max
+        saturated = values == largest
+        far = ~saturated & (metres > FARTHEST)
+        return {"negative": values < 0, str(largest): saturated, f"over {FARTHEST:g} m": far}
+    clipped = SATURATED * INTEGER_UNIT
+    absent = {
+        "NaN": np.isnan(values),
+        "infinite": np.isinf(values),
+        "negative": np.isfinite(values) & (values < 0),
+        str(SATURATED): values == SATURATED,
+        f"{clipped:g}": np.abs(values - clipped) < 1e-5,
+        f"{NOTHING:g} or more": np.isfinite(values) & (values >= NOTHING),
+    }
+    known = np.logical_or.reduce(list(absent.values()))
+    return absent | {f"over {FARTHEST:g} m": ~known & (metres > FARTHEST)}
+
+
+def _at_limit(values: np.ndarray, metres: np.ndarray, unmeasured: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the mask of the pixels at the sensor's limit, by its name in messages; empty where there are none."""
+    measured = metres[~unmeasured]
+    if not measured.size:
+        return {}
+    largest = float(measured.max())
+    mask = ~unmeasured & (metres == largest)
+    count = int(mask.sum())
+    steps = round(largest / LIMIT_STEP)
+    is_round = largest >= NEAREST_LIMIT and abs(largest - steps * LIMIT_STEP) < 1e-6 * largest
+    fills_bits = values.dtype.kind != "f" and int(values[mask][0]) in LARGEST_OF_BITS
+    if count < max(SPIKE * values.size, SPIKE_PIXELS) or not (is_round or fills_bits):
+        return {}
+    _, others = np.unique(measured[measured < largest], return_counts=True)
+    if not others.size or count < STANDS_OUT * others.max():
+        return {}
+    return {f"{float(values[mask][0]):g} (the sensor's limit)": mask}
+
+
+class DepthReader:
+    """Reads the depth images of a recording, and warns once about each kind of value that means "not measured".
+
+    ``documented`` are the kinds that the recording's format defines, by their names in ``DepthImage.replaced``; they cause
+    no warning.
+    """
+
+    def __init__(self, documented: Collection[str] = ()) -> None:
+        self._mentioned = set(documented)
+
+    def __call__(self, path: Path, unit: float) -> DepthImage:
+        """Read an image as ``read_depth_image`` does. New kinds of values cause an ``InputWarning``."""
+        found = read_depth_image(path, unit)
+        new = {name: count for name, count in found.replaced.items() if name not in self._mentioned}
+        if new:
+            self._mentioned |= new.keys()
+            dropped = replace(found, replaced=new).dropped
+            warnings.warn(
+                f"{path}: depth: {dropped}, here and in the images that follow", InputWarning, stacklevel=2
+            )
+        return found

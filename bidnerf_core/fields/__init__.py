@@ -1,0 +1,1 @@
+"""Radiance fields: the contract, samplers, rendering, and residuals of renderings."""

@@ -1,0 +1,198 @@
+"""The contract between the core and any radiance field.
+
+Shapes: *r rays, *p points, s samples on a ray. Units: metres (or scene units) in the world frame; density per metre.
+Directions are always unit, so distance along the ray is the only length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Generator, Tensor
+
+from bidnerf_core.devices import constant
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contraction import RaySpacing, contract
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Half-lines and the part of each that may hold matter. ``far <= near`` marks a ray that misses the scene."""
+
+    origins: Float[Tensor, "*r 3"]
+    directions: Float[Tensor, "*r 3"]  # unit
+    near: Float[Tensor, "*r"]  # distance along the ray, not z
+    far: Float[Tensor, "*r"]
+
+    def at(self, distance: Float[Tensor, "*r s"]) -> Float[Tensor, "*r s 3"]:
+        return self.origins[..., None, :] + distance[..., None] * self.directions[..., None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class RaySamples:
+    """Disjoint intervals of each ray, nearest first, each queried at its middle. Those that are not valid have no effect."""
+
+    starts: Float[Tensor, "*r s"]
+    ends: Float[Tensor, "*r s"]
+    valid: Bool[Tensor, "*r s"]
+
+    @property
+    def middles(self) -> Float[Tensor, "*r s"]:
+        return (self.starts + self.ends) / 2
+
+    @property
+    def parts(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The starts, the ends, and whether they are valid."""
+        return self.starts, self.ends, self.valid
+
+    def unflattened(self, shape: torch.Size) -> RaySamples:
+        """Return the samples of rays that were flattened, in their former ``shape``."""
+        return RaySamples(*(part.reshape(*shape, part.shape[-1]) for part in self.parts))
+
+
+@dataclass(frozen=True, eq=False)
+class FieldValues:
+    """Density and colour at points, as seen along directions."""
+
+    density: Float[Tensor, "*p"]  # >= 0, per metre
+    rgb: Float[Tensor, "*p 3"]  # in [0, 1]
+
+
+@runtime_checkable
+class RaySampler(Protocol):
+    """Chooses where on each ray a field is queried. Deterministic without ``jitter``."""
+
+    def __call__(self, rays: Rays, jitter: Generator | None = None) -> RaySamples: ...
+
+
+@runtime_checkable
+class RadianceField(Protocol):
+    """A differentiable scene. Only reverse-mode derivatives are required of it."""
+
+    @property
+    def sampler(self) -> RaySampler: ...
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        """Return density and colour at ``positions`` (metres, world; possibly none) seen along unit ``directions``."""
+        ...
+
+
+def levels(field: RadianceField) -> tuple[RadianceField, ...]:
+    """Return the field's levels of detail, coarsest first; a field that offers none is its own only level."""
+    return tuple(getattr(field, "levels", None) or (field,))
+
+
+def device_of(field: RadianceField) -> torch.device:
+    """Return the device of a field's parameters or buffers, or of the first field in a dataclass that wraps one; else the CPU."""
+    for kind in ("parameters", "buffers"):
+        first = next(iter(getattr(field, kind, tuple)()), None)
+        if isinstance(first, torch.Tensor):
+            return first.device
+    wrapped: list[object] = (
+        [getattr(field, part.name) for part in fields(field)] if is_dataclass(field) else []
+    )
+    inner = next((part for part in wrapped if isinstance(part, RadianceField)), None)
+    return torch.device("cpu") if inner is None else device_of(inner)
+
+
+LARGEST_LENGTH = 1e15
+"""Metres. Squares of larger lengths come close to the largest number of single precision."""
+
+
+@dataclass(frozen=True)
+class SceneBounds:
+    """What may be assumed of a scene before anything is trained. Plain numbers: it is stored as JSON."""
+
+    lower: tuple[float, float, float]  # metres, world: corners of the box that holds all matter
+    upper: tuple[float, float, float]
+    near: float  # metres along a ray: nothing of interest is nearer ...
+    far: float  # ... or farther
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour seen where a ray meets nothing
+    # Whether there is matter beyond the box, as far as ``far``: fields contract what lies outside of the box's cube.
+    contracted: bool = False
+    # Metres: width of what a pixel of the images shows at the usual distance, which tells how fine a field needs to be; 0: unknown.
+    footprint: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
+            raise InputError(
+                f"scene bounds: lower corner {self.lower} is not below upper corner {self.upper}"
+            )
+        if not 0 <= self.near < self.far:
+            raise InputError(f"scene bounds: expected 0 <= near < far, got near {self.near}, far {self.far}")
+        if not self.footprint >= 0:
+            raise InputError(f"scene bounds: footprint is {self.footprint}, expected 0 or more")
+        largest = max(map(abs, (*self.lower, *self.upper, self.far, self.footprint)))
+        if not largest <= LARGEST_LENGTH:
+            raise InputError(
+                f"scene bounds: {largest:g} m is too large, expected at most {LARGEST_LENGTH:g} m"
+            )
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        a, b = self.lower, self.upper
+        return (b[0] - a[0], b[1] - a[1], b[2] - a[2])
+
+    @property
+    def centre(self) -> tuple[float, float, float]:
+        a, b = self.lower, self.upper
+        return ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2, (a[2] + b[2]) / 2)
+
+    @property
+    def side(self) -> float:
+        """Side of the cube around the box (metres)."""
+        return max(self.size)
+
+    def normalized(self, positions: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 3"]:
+        """Return positions (metres, world) scaled so that the modelled space is the cube [-1, 1].
+
+        This is the cube around the box or, where the scene is contracted, all space: the cube around the box then fills the
+        inner half of each axis.
+        """
+        scaled = (positions - constant(self.centre, positions)) * (2 / self.side)
+        return contract(scaled) / 2 if self.contracted else scaled
+
+    def rays(self, origins: Float[Tensor, "*r 3"], directions: Float[Tensor, "*r 3"]) -> Rays:
+        """Return the rays limited to [near, far] and, unless the scene is contracted, to the box (slab method).
+
+        The limits carry no gradient.
+        """
+        with torch.no_grad():
+            if self.contracted:
+                near = torch.full_like(origins[..., 0], self.near)
+                return Rays(origins, directions, near, torch.full_like(near, self.far))
+            enter, leave = self._crossed(origins, directions, self.lower, self.upper)
+            near = enter.clamp(self.near, self.far)
+            far = leave.clamp(max=self.far)
+        return Rays(origins, directions, near, torch.maximum(near, far))
+
+    @torch.no_grad()
+    def spacing(self, rays: Rays) -> RaySpacing:
+        """Return the coordinate along the rays in which a field with these bounds is to be sampled evenly."""
+        origins, directions = rays.origins.detach(), rays.directions.detach()
+        if not self.contracted:
+            return RaySpacing(torch.zeros_like(rays.near), float("inf"))
+        half = self.side / 2
+        lower, upper = (tuple(c + sign * half for c in self.centre) for sign in (-1, 1))
+        enter, leave = self._crossed(origins, directions, lower, upper)
+        return RaySpacing(torch.where(leave > enter, leave, 0).clamp(min=0), half)
+
+    def _crossed(
+        self, origins: Tensor, directions: Tensor, lower: tuple[float, ...], upper: tuple[float, ...]
+    ) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
+        """Return the distances (metres) at which the lines through rays enter and leave a box; they miss it where these
+        are not in order.
+        """
+        tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
+        slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
+        first, second = ((constant(corner, origins) - origins) * slope for corner in (lower, upper))
+        return torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
+
+
+def widened(rays: Rays, factor: float) -> Rays:
+    """Return rays whose interval is ``factor`` times as long (the paper's "wide"), but does not begin behind the camera."""
+    middle, half = (rays.near + rays.far) / 2, (rays.far - rays.near) / 2 * factor
+    return replace(rays, near=(middle - half).clamp(min=0), far=middle + half)

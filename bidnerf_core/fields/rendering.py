@@ -1,0 +1,168 @@
+"""Volume rendering (Mildenhall et al. 2020, eq. 3; BID-NeRF, eq. 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.rolling_shutter import exposure_times, poses_of_rows
+from bidnerf_core.devices import constant, may_wait
+from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySamples, SceneBounds, device_of
+from bidnerf_core.geometry.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """Colour, distance and opacity of each ray."""
+
+    rgb: Float[Tensor, "*r 3"]
+    distance: Float[Tensor, "*r"]  # sum of weight times distance, metres: not divided by the opacity
+    opacity: Float[Tensor, "*r"]  # 0 nothing was met, 1 nothing shines through
+    weights: Float[Tensor, "*r s"]
+    samples: RaySamples
+    density: Float[Tensor, "*r s"] | None = None  # per metre, at the samples
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedImage:
+    """Colour, depth and opacity of each pixel."""
+
+    rgb: Float[Tensor, "h w 3"]
+    depth: Float[Tensor, "h w"]  # planar z, metres; 0 where less than half of the ray was stopped
+    opacity: Float[Tensor, "h w"]
+
+
+def query_samples(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
+    """Return the field's values at the samples (*r s). At samples that are not valid, density is 0.
+
+    There the field is not queried or, where the host must not wait for the device (see ``waiting``), queried at the origin.
+    """
+    valid = samples.valid
+    if not may_wait(valid.device) or bool(valid.all()):
+        return _query_all(field, rays, samples)
+    found = _query_valid(field, rays, samples)
+    rgb = found.values.rgb.new_zeros((valid.numel(), 3)).index_copy(0, found.index, found.values.rgb)
+    return FieldValues(_padded(found.values.density, found.index, valid), rgb.reshape(*valid.shape, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class _ValidSamples:
+    """The valid samples of all rays, one ray after the other, and the field's values there."""
+
+    index: Int[Tensor, "n"]  # number of each among all samples
+    ray: Int[Tensor, "n"]  # number of each sample's ray
+    values: FieldValues
+
+
+def _query_all(field: RadianceField, rays: Rays, samples: RaySamples) -> FieldValues:
+    """Return the values at all samples, either because all are valid or because the host must not wait to count them."""
+    positions = rays.at(samples.middles)
+    directions = rays.directions[..., None, :].expand_as(positions)
+    if may_wait(samples.valid.device):
+        return field.query(positions, directions)
+    found = field.query(torch.where(samples.valid[..., None], positions, 0), directions)
+    return FieldValues(torch.where(samples.valid, found.density, 0), found.rgb)
+
+
+def _query_valid(field: RadianceField, rays: Rays, samples: RaySamples) -> _ValidSamples:
+    count = samples.valid.shape[-1]
+    ray, slot = samples.valid.reshape(-1, count).nonzero(as_tuple=True)
+    index = ray * count + slot
+    # Positions are computed of these samples only: often most of a row is padding.
+    origins, directions = (
+        part.reshape(-1, 3).index_select(0, ray) for part in (rays.origins, rays.directions)
+    )
+    middles = samples.middles.reshape(-1).index_select(0, index)
+    return _ValidSamples(index, ray, field.query(origins + middles[:, None] * directions, directions))
+
+
+def _padded(
+    values: Float[Tensor, "n"], index: Int[Tensor, "n"], valid: Bool[Tensor, "*r s"]
+) -> Float[Tensor, "*r s"]:
+    """Return the values of the valid samples at their places, and 0 at the others."""
+    return values.new_zeros(valid.numel()).index_copy(0, index, values).reshape(valid.shape)
+
+
+def rendering_weights(density: Float[Tensor, "*r s"], samples: RaySamples) -> Float[Tensor, "*r s"]:
+    """Return ``w_i = exp(-sum_{j<i} sigma_j dt_j) (1 - exp(-sigma_i dt_i))`` (eq. 3)."""
+    absorbed = torch.where(
+        samples.valid, density * (samples.ends - samples.starts), torch.zeros_like(density)
+    )
+    before = torch.cumsum(absorbed, dim=-1) - absorbed
+    return torch.exp(-before) * -torch.expm1(-absorbed)
+
+
+def render(
+    field: RadianceField,
+    rays: Rays,
+    background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
+    jitter: Generator | None = None,
+) -> Rendering:
+    """Render rays; differentiable in the field's parameters and in the rays."""
+    return render_samples(field, rays, field.sampler(rays, jitter), background)
+
+
+def render_samples(
+    field: RadianceField,
+    rays: Rays,
+    samples: RaySamples,
+    background: tuple[float, float, float] | Float[Tensor, "*#r 3"] = (0.0, 0.0, 0.0),
+) -> Rendering:
+    """Render rays from given samples, see ``render``."""
+    weights, density, colour = _composed(field, rays, samples)
+    opacity = weights.sum(-1)
+    behind = constant(background, weights) if isinstance(background, tuple) else background.to(weights)
+    rgb = colour + (1 - opacity)[..., None] * behind
+    return Rendering(rgb, (weights * samples.middles).sum(-1), opacity, weights, samples, density)
+
+
+def _composed(
+    field: RadianceField, rays: Rays, samples: RaySamples
+) -> tuple[Float[Tensor, "*r s"], Float[Tensor, "*r s"], Float[Tensor, "*r 3"]]:
+    """Return the weights and densities of the samples, and the sum of weight times colour (eq. 3)."""
+    valid = samples.valid
+    # On other devices a sum over the samples of each ray has no fixed order, and would differ from run to run.
+    if valid.device.type != "cpu" or bool(valid.all()):
+        values = query_samples(field, rays, samples)
+        weights = rendering_weights(values.density, samples)
+        return weights, values.density, (weights[..., None] * values.rgb).sum(-2)
+    found = _query_valid(field, rays, samples)
+    density = _padded(found.values.density, found.index, valid)
+    weights = rendering_weights(density, samples)
+    share = weights.reshape(-1).index_select(0, found.index)[:, None] * found.values.rgb
+    colour = share.new_zeros((rays.near.numel(), 3)).index_add(0, found.ray, share)
+    return weights, density, colour.reshape(*valid.shape[:-1], 3)
+
+
+@torch.no_grad()
+def render_image(
+    field: RadianceField, intrinsics: Intrinsics, T_world_camera: SE3, bounds: SceneBounds, chunk: int = 8192,
+    motion: Float[Tensor, "6"] | None = None,
+) -> RenderedImage:  # fmt: skip
+    """Render a whole image from a pose, ``chunk`` rays at a time.
+
+    ``motion`` is that of the camera from the first row to the last, see ``rolling_shutter``; without it, the camera is at rest.
+    """
+    pixels = intrinsics.pixel_centres().reshape(-1, 2)
+    ray = intrinsics.unproject(pixels)
+    length = torch.linalg.vector_norm(ray, dim=-1)
+    device = device_of(field)
+    T = T_world_camera.to(dtype=torch.float32, device=device)
+    motion = motion if motion is not None and bool(motion.any()) else None
+    times = exposure_times(pixels, intrinsics).to(T.translation).split(chunk)
+    parts = []
+    for directions, when in zip((ray / length[:, None]).to(device).split(chunk), times, strict=True):
+        at = T if motion is None else T @ poses_of_rows(when, motion)
+        turned = at.rotate(directions)
+        rendering = render(field, bounds.rays(at.translation.expand_as(turned), turned), bounds.background)
+        parts.append(
+            torch.cat([rendering.rgb, rendering.distance[:, None], rendering.opacity[:, None]], -1).cpu()
+        )
+    rgb, distance, opacity = torch.cat(parts).split([3, 1, 1], dim=-1)
+    hit = torch.where(opacity > 0.5, distance / opacity.clamp(min=0.5), 0)[:, 0] / length
+    shape = (intrinsics.height, intrinsics.width)
+    return RenderedImage(rgb.clamp(0, 1).reshape(*shape, 3), hit.reshape(shape), opacity.reshape(shape))

@@ -1,0 +1,1 @@
+"""Frames, the photos they are read from, and the selection of their pixels."""

@@ -1,0 +1,237 @@
+"""Images with their cameras, and images with their cameras' poses."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.orientation import UPRIGHT
+from bidnerf_core.camera.source import Raster
+from bidnerf_core.depth.images import depth_image
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.frames.photos import fit_depth, read_photo
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import Background, background_colour, over, pixel_array, split_alpha
+
+SPARSE = 0.05
+"""Share of an image's pixels below which measured depth is sparse: the pixels in between then remain unknown."""
+BLACK = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One RGB or RGB-D image. Depth is planar z in metres, 0 where nothing was measured."""
+
+    name: str
+    # rgb is in [0, 1], already over the background where there was an alpha channel; alpha is 1 where the scene covers
+    # the pixel and 0 where the background shows. rgb has 3 channels, and all have the size of the camera's image, which is
+    # checked here.
+    rgb: Float[Tensor, "h w channels"]
+    intrinsics: Intrinsics
+    depth: Float[Tensor, "dh dw"] | None = None
+    alpha: Float[Tensor, "ah aw"] | None = None
+    camera_source: str | None = None
+    """One line about the source of the intrinsics, in frames that ``open`` returned."""
+
+    focal_is_approximate: bool = False
+    """Whether the focal length is a nominal one, such as that in EXIF, which may be off by several percent."""
+
+    has_colour: bool = True
+    """Whether colours were recorded. Where only depth was, as between the photos of a LiDAR scan, ``rgb`` is black."""
+
+    hidden: Bool[Tensor, "hh hw"] | None = None
+    """The pixels where something that the map does not have hides the scene.
+
+    Depth counts as not measured there. No rays are drawn there, no keypoints are detected and no landmarks are expected;
+    only the thumbnails of a search by colour alone still show it.
+    """
+
+    def __post_init__(self) -> None:
+        if self.rgb.ndim != 3 or self.rgb.shape[-1] != 3:
+            raise InputError(
+                f"frame {self.name}: rgb has shape {tuple(self.rgb.shape)}, expected (height, width, 3); "
+                "Frame.from_numpy takes grey and RGBA"
+            )
+        expected = (self.intrinsics.height, self.intrinsics.width)
+        for what, image in (
+            ("rgb", self.rgb),
+            ("depth", self.depth),
+            ("alpha", self.alpha),
+            ("hidden", self.hidden),
+        ):
+            if image is not None and tuple(image.shape[:2]) != expected:
+                found = f"{image.shape[1]}x{image.shape[0]}"
+                raise InputError(
+                    f"frame {self.name}: {what} is {found}, its camera expects {expected[1]}x{expected[0]}"
+                )
+        if self.hidden is not None:
+            self._hide(self.hidden)
+
+    def _hide(self, hidden: Bool[Tensor, "h w"]) -> None:
+        if hidden.dtype != torch.bool or bool(hidden.all()):
+            found = "all true" if hidden.dtype == torch.bool else f"of {hidden.dtype}"
+            raise InputError(
+                f"frame {self.name}: hidden is {found}, expected booleans that leave something visible"
+            )
+        if self.depth is not None and bool((self.depth[hidden.to(self.depth.device)] != 0).any()):
+            depth = torch.where(hidden.to(self.depth.device), 0, self.depth)
+            object.__setattr__(self, "depth", depth)
+
+    @staticmethod
+    def open(
+        path: str | Path,
+        *,
+        depth: str | Path | None = None,
+        camera: Intrinsics | str | Path | None = None,
+        focal: float | None = None,
+        hfov: float | None = None,
+        assumed: Sequence[Intrinsics] = (),
+        depth_unit: float | None = None,
+        background: Background = BLACK,
+        largest: int | None = None,
+    ) -> Frame:
+        """Read a photo, turn it upright according to its EXIF orientation, and find its camera.
+
+        The camera is ``camera`` (intrinsics, or a file: ``transforms.json``, ``cameras.json``, COLMAP's ``cameras.txt``),
+        or has the focal length ``focal`` (pixels of the image file), or the horizontal field of view ``hfov`` (degrees, of
+        the upright image); at most one of them. Without them it comes from the focal length in EXIF or, where there is none,
+        from the ``assumed`` cameras, for instance those of a map's landmarks (``map.landmarks.cameras``). A camera of another
+        resolution is scaled, and one of the image as stored is turned with it. ``camera_source`` of the result describes in
+        one line where the camera comes from.
+
+        ``depth`` is an image or a ``.npy`` file of planar z, in steps of ``depth_unit`` metres. Without a unit, 0.001 m is
+        assumed for integers and 1 m for floats, with an ``InputWarning``, which also lists values that mean "nothing
+        measured" (NaN, infinite, negative, 65535, 1e10 and the like); they become 0. Depth of another resolution is resampled
+        to the nearest measurement. ``background`` (rgb in [0, 1], "white" or "black") lies behind transparent pixels. Where
+        the longer side has more than ``largest`` pixels, the image is reduced to that size.
+
+        Raises ``InputError`` where a file is not readable or has more than 100 megapixels, where the camera is not known or
+        given twice, and where camera or depth belong to an image of another aspect ratio.
+        """
+        path = Path(path)
+        photo = read_photo(
+            path,
+            depth=None if depth is None else Path(depth),
+            camera=camera,
+            focal=focal,
+            hfov=hfov,
+            assumed=assumed,
+            depth_unit=depth_unit,
+            background=background,
+            largest=largest,
+        )
+        if photo.remark is not None:
+            warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=2)
+        source = photo.camera
+        return Frame(
+            path.stem,
+            photo.rgb,
+            source.intrinsics,
+            photo.depth,
+            photo.alpha,
+            source.description,
+            source.approximate,
+        )
+
+    @staticmethod
+    def from_numpy(
+        rgb: np.ndarray | Tensor,
+        camera: Intrinsics,
+        *,
+        depth: np.ndarray | Tensor | None = None,
+        depth_unit: float | None = None,
+        alpha: np.ndarray | Tensor | None = None,
+        name: str = "image",
+        background: Background = BLACK,
+    ) -> Frame:
+        """Make a frame from NumPy arrays or torch tensors.
+
+        ``rgb`` is (h, w) or (h, w, 1 to 4): uint8 in [0, 255], uint16 in [0, 65535], or floats in [0, 1]; a second or
+        fourth channel is alpha, which may be given as ``alpha`` (h, w) instead. Colours are straight (not premultiplied) and
+        laid over ``background``. ``depth`` (planar z) and ``depth_unit`` are as in ``open``, as is scaling of ``camera``.
+
+        Raises ``InputError`` for other types and shapes, NaN, floats outside [0, 1], and where camera or depth belong to
+        an image of another aspect ratio.
+        """
+        where = f"frame {name}"
+        colour, cover = split_alpha(pixel_array(rgb, f"{where}: rgb"))
+        if alpha is not None:
+            if cover is not None:
+                raise InputError(
+                    f"{where}: rgb has an alpha channel, and alpha is given; expected one of them"
+                )
+            cover = _mask(alpha, (colour.shape[1], colour.shape[0]), where)
+        raster = Raster(colour.shape[1], colour.shape[0], UPRIGHT)
+        intrinsics = raster.upright(camera)
+        if intrinsics is None:
+            found, expected = f"{raster.width}x{raster.height}", f"{camera.width}x{camera.height}"
+            raise InputError(
+                f"{where}: rgb is {found}, its camera expects {expected} or a size of the same aspect ratio"
+            )
+        metres = None
+        if depth is not None:
+            measured = depth_image(depth, depth_unit, f"{where}: depth")
+            metres = fit_depth(measured, raster, raster.size, f"{where}: depth")
+            if remark := measured.remark(depth_unit is None):
+                warnings.warn(f"{where}: {remark}", InputWarning, stacklevel=2)
+        return Frame(name, over(colour, cover, background_colour(background)), intrinsics, metres, cover)
+
+    def to(self, device: torch.device | str) -> Frame:
+        """Return the frame with its images on ``device``; the frame itself where they lie there."""
+        others = (self.depth, self.alpha, self.hidden)
+        depth, alpha, hidden = (None if image is None else image.to(device) for image in others)
+        rgb = self.rgb.to(device)
+        if all(a is b for a, b in zip((rgb, depth, alpha, hidden), (self.rgb, *others), strict=True)):
+            return self
+        return replace(self, rgb=rgb, depth=depth, alpha=alpha, hidden=hidden)
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether any depth was measured."""
+        return self.depth is not None and bool((self.depth > 0).any())
+
+    @property
+    def has_dense_depth(self) -> bool:
+        """Whether depth was measured at more than a few points."""
+        return self.depth is not None and float((self.depth > 0).float().mean()) >= SPARSE
+
+
+def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Float[Tensor, "h w"]:
+    values = pixel_array(alpha, f"{where}: alpha")
+    if values.shape[2] != 1 or (values.shape[1], values.shape[0]) != size:
+        found = "x".join(map(str, values.shape))
+        raise InputError(f"{where}: alpha is {found}, expected {size[1]}x{size[0]} as rgb (rows x columns)")
+    return values[..., 0]
+
+
+@dataclass(frozen=True, eq=False)
+class SeenLandmarks:
+    """Landmarks that an image shows, and their distances from its camera."""
+
+    pixels: Float[Tensor, "n 2"]  # column and row; the centre of the first pixel is (0.5, 0.5)
+    distance: Float[Tensor, "n"]  # metres from the camera, not z
+    deviation: Float[Tensor, "n"]  # metres: standard deviation of the distance
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame and the pose of its camera in some reference frame: the world, or the last camera of a rig."""
+
+    frame: Frame
+    T_ref_camera: SE3
+    landmarks: SeenLandmarks | None = None  # those from which training takes distances
+    motion: Float[Tensor, "6"] | None = None
+    """Motion of the camera while its rows were exposed one after another, see ``rolling_shutter``; the pose is then that of
+    the middle row."""
+
+    def to(self, device: torch.device | str) -> View:
+        """Return the view with its images and its pose on ``device``."""
+        return replace(self, frame=self.frame.to(device), T_ref_camera=self.T_ref_camera.to(device))

@@ -1,0 +1,137 @@
+"""A user's own photo: upright pixels, their camera, and depth of the same size."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.exif import read_exif
+from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
+from bidnerf_core.camera.source import CameraSource, Raster, find_camera
+from bidnerf_core.depth.images import DepthImage, read_depth_image
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.images import (
+    HEIF_SUFFIXES,
+    IMAGE_SUFFIXES,
+    Background,
+    background_colour,
+    over,
+    read_header,
+    read_image,
+    reduced,
+    resampled,
+)
+
+DEPTH_STEM = ".depth"
+"""``NAME.depth.png`` is the depth of ``NAME.png``, as ``bidnerf render`` writes it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """An upright image in [0, 1] over its background, its camera, and what was measured and assumed."""
+
+    rgb: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"] | None  # 1 where the scene covers the pixel
+    camera: CameraSource
+    depth: Float[Tensor, "h w"] | None  # planar z in metres, 0 where nothing was measured
+    remark: str | None  # one line on the assumptions that were made about depth
+
+
+def read_photo(
+    path: Path,
+    *,
+    depth: Path | None = None,
+    camera: Intrinsics | str | Path | None = None,
+    focal: float | None = None,
+    hfov: float | None = None,
+    assumed: Sequence[Intrinsics] = (),
+    depth_unit: float | None = None,
+    background: Background = (0.0, 0.0, 0.0),
+    largest: int | None = None,
+) -> Photo:
+    """Read an image file and find its camera, as ``Frame.open`` describes it; raises ``InputError`` as that does."""
+    colour_behind = background_colour(background)
+    header, exif = read_header(path), read_exif(path)
+    raster = Raster(header.width, header.height, exif.orientation)
+    source = find_camera(str(path), raster, exif, camera, focal, hfov, assumed)
+    measured = None if depth is None else read_depth_image(depth, depth_unit)
+    source, size = _limited(source, largest)
+    colour, alpha = read_image(path)
+    rgb = _sized(exif.orientation.upright(over(colour, alpha, colour_behind)), size)
+    if alpha is not None:
+        alpha = _sized(exif.orientation.upright(alpha), size)
+    if measured is None:
+        return Photo(rgb, alpha, source, None, None)
+    fitted = fit_depth(measured, raster, size, f"{depth}: depth")
+    return Photo(rgb, alpha, source, fitted, measured.remark(depth_unit is None))
+
+
+def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what: str) -> Float[Tensor, "h w"]:
+    """Turn a depth image upright and give it ``size`` (width, height) by taking the nearest measurement.
+
+    Depth whose shape fits the stored image is turned as that is. Raises ``InputError``, which begins with ``what``, where
+    the aspect ratio is that of another image.
+    """
+    metres = measured.metres
+    given = (metres.shape[1], metres.shape[0])
+    if same_aspect(given, raster.size):
+        metres = raster.orientation.upright(metres)
+    elif not same_aspect(given, raster.upright_size):
+        expected = "x".join(map(str, raster.upright_size))
+        raise InputError(
+            f"{what} is {given[0]}x{given[1]}, its image {expected}; expected the same aspect ratio"
+        )
+    return metres if tuple(metres.shape) == size[::-1] else resampled(metres, *size)
+
+
+def photos_in(folder: str | Path) -> tuple[list[Path], list[Path]]:
+    """Return the image files of a folder and its other files, both in natural order (``2.jpg`` before ``10.jpg``).
+
+    Depth images (``NAME.depth.png``), hidden files and whatever is not an image by its ending are among the others;
+    folders inside are left out. Raises ``InputError`` where ``folder`` is not a folder that may be read.
+    """
+    try:
+        files = sorted(
+            (file for file in Path(folder).iterdir() if file.is_file()),
+            key=lambda file: natural_order(file.name),
+        )
+    except FileNotFoundError as error:
+        raise InputError(f"{folder}: no such folder") from error
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{folder}: {reason}, expected a folder of photos") from error
+    photos = [file for file in files if _is_photo(file)]
+    return photos, [file for file in files if not _is_photo(file)]
+
+
+def _is_photo(file: Path) -> bool:
+    hidden = file.name.startswith(".")  # such as the "._IMG_1.JPG" of macOS
+    image = file.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+    return image and not hidden and not file.stem.endswith(DEPTH_STEM)
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Return a sort key that compares digits as numbers."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)]
+
+
+def _limited(source: CameraSource, largest: int | None) -> tuple[CameraSource, tuple[int, int]]:
+    """Return the camera and the size (width, height) of an image whose longer side has at most ``largest`` pixels."""
+    camera = source.intrinsics
+    if largest is not None and not (isinstance(largest, int) and largest >= 1):
+        raise InputError(f"largest is {largest!r}, expected a positive whole number of pixels")
+    longer = max(camera.width, camera.height)
+    if largest is None or longer <= largest:
+        return source, (camera.width, camera.height)
+    camera = camera.scaled(largest / longer)
+    return replace(source, intrinsics=camera), (camera.width, camera.height)
+
+
+def _sized(image: Float[Tensor, "h w *c"], size: tuple[int, int]) -> Float[Tensor, "nh nw *c"]:
+    return image if tuple(image.shape[:2]) == size[::-1] else reduced(image, *size)

@@ -1,0 +1,1 @@
+"""Rigid transforms, similarities and robust statistics."""

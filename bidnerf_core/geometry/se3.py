@@ -1,0 +1,211 @@
+"""Rigid transforms.
+
+Convention, stated here once: ``T_a_b`` takes points of frame b to frame a, so that adjacent letters cancel:
+``p_world = T_world_camera.apply(p_camera)`` and ``T_a_c = T_a_b @ T_b_c``. A tangent vector is (translation rho,
+rotation phi), metres and radians; an update is a *right* update, ``T.retract(xi) = T @ SE3.exp(xi)``, that is, a motion
+written in the local frame of the camera (Sola et al. 2018, "A micro Lie theory", which also gives every formula here).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
+from torch import Tensor
+
+from bidnerf_core.devices import constant
+
+SERIES_BELOW = 1e-2
+"""Angles (rad) under which coefficients come from their series: sin and cos cancel there, in value and derivative."""
+
+
+@dataclass(frozen=True, eq=False)
+class SE3:
+    """A rigid transform, or a batch of them: ``x -> rotation @ x + translation``."""
+
+    rotation: Float[Tensor, "*b 3 3"]
+    translation: Float[Tensor, "*b 3"]  # metres
+
+    @staticmethod
+    def identity(dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> SE3:
+        return SE3(torch.eye(3, dtype=dtype, device=device), torch.zeros(3, dtype=dtype, device=device))
+
+    @staticmethod
+    def from_matrix(matrix: Float[Tensor, "*b 4 4"]) -> SE3:
+        """Return the transform of a homogeneous matrix, which is not checked; ``is_rigid`` does that."""
+        return SE3(matrix[..., :3, :3], matrix[..., :3, 3])
+
+    @staticmethod
+    def exp(tangent: Float[Tensor, "*b 6"]) -> SE3:
+        """Return the exponential map (Sola et al., eq. 172): ``[exp(phi), V(phi) rho]``."""
+        rho, phi = tangent[..., :3], tangent[..., 3:]
+        return SE3(axis_angle_to_rotation_matrix(phi), _matvec(so3_left_jacobian(phi), rho))
+
+    def log(self) -> Float[Tensor, "*b 6"]:
+        """Return the inverse of ``exp``, with the rotation angle in [0, pi] (eq. 173)."""
+        phi = rotation_matrix_to_axis_angle(self.rotation)
+        return torch.cat([_matvec(so3_left_jacobian_inverse(phi), self.translation), phi], dim=-1)
+
+    def matrix(self) -> Float[Tensor, "*b 4 4"]:
+        top = torch.cat([self.rotation, self.translation[..., None]], dim=-1)
+        bottom = constant((0.0, 0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 4)
+        return torch.cat([top, bottom], dim=-2)
+
+    def __matmul__(self, other: SE3) -> SE3:
+        return SE3(self.rotation @ other.rotation, self.apply(other.translation))
+
+    def inverse(self) -> SE3:
+        transposed = self.rotation.mT
+        return SE3(transposed, -_matvec(transposed, self.translation))
+
+    def apply(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*q 3"]:
+        """Transform points from the right-hand frame to the left-hand one; the batch broadcasts against leading axes."""
+        return _matvec(self.rotation, points) + self.translation
+
+    def rotate(self, vectors: Float[Tensor, "*p 3"]) -> Float[Tensor, "*q 3"]:
+        """Rotate directions, which the translation does not affect."""
+        return _matvec(self.rotation, vectors)
+
+    def retract_linearly(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
+        """Return ``retract`` to first order in ``tangent``: cheaper, with the same value and derivative at 0; not rigid elsewhere."""
+        rho, phi = tangent[..., :3], tangent[..., 3:]
+        return SE3(self.rotation + self.rotation @ skew(phi), self.translation + _matvec(self.rotation, rho))
+
+    def retract(self, tangent: Float[Tensor, "*c 6"]) -> SE3:
+        """Return the right update ``self @ exp(tangent)``."""
+        return self @ SE3.exp(tangent)
+
+    def adjoint(self) -> Float[Tensor, "*b 6 6"]:
+        """Return the adjoint matrix, for which ``T exp(xi) T^-1 = exp(adjoint(T) xi)`` (eq. 175)."""
+        turned = skew(self.translation) @ self.rotation
+        top = torch.cat([self.rotation, turned], dim=-1)
+        bottom = torch.cat([torch.zeros_like(self.rotation), self.rotation], dim=-1)
+        return torch.cat([top, bottom], dim=-2)
+
+    def normalized(self) -> SE3:
+        """Return the nearest rigid transform: rounding makes long products drift off the group."""
+        u, _, vh = torch.linalg.svd(self.rotation)
+        sign = torch.ones_like(self.translation)
+        sign = torch.cat([sign[..., :2], torch.linalg.det(u @ vh)[..., None]], dim=-1)
+        return SE3(u @ (sign[..., None] * vh), self.translation)
+
+    def polished(self) -> SE3:
+        """Return the transform without the rounding of a product: a Newton-Schulz step towards the nearest rotation.
+
+        It needs no factorization, for which a host waits. The rotation must be orthonormal but for rounding.
+        """
+        R = self.rotation
+        return SE3(1.5 * R - 0.5 * R @ (R.mT @ R), self.translation)
+
+    def is_rigid(self, tolerance: float = 1e-3) -> Bool[Tensor, "*b"]:
+        """Return whether the transform is finite and its rotation orthonormal to ``tolerance``, with determinant 1."""
+        eye = torch.eye(3, dtype=self.rotation.dtype, device=self.rotation.device)
+        off = (self.rotation.mT @ self.rotation - eye).abs().amax(dim=(-1, -2))
+        finite = torch.isfinite(self.translation).all(dim=-1)
+        return finite & (off <= tolerance) & (torch.linalg.det(self.rotation) > 0)
+
+    def detach(self) -> SE3:
+        return SE3(self.rotation.detach(), self.translation.detach())
+
+    @property
+    def device(self) -> torch.device:
+        return self.translation.device
+
+    def to(self, *args: Any, **kwargs: Any) -> SE3:
+        """Convert to another dtype or device, given as for ``Tensor.to``."""
+        return SE3(self.rotation.to(*args, **kwargs), self.translation.to(*args, **kwargs))
+
+    def __getitem__(self, index: Any) -> SE3:
+        """Return a part of the batch; indices refer to batch axes only."""
+        return SE3(self.rotation[index], self.translation[index])
+
+    @staticmethod
+    def stack(transforms: list[SE3]) -> SE3:
+        return SE3(
+            torch.stack([t.rotation for t in transforms]), torch.stack([t.translation for t in transforms])
+        )
+
+    @staticmethod
+    def cat(batches: list[SE3]) -> SE3:
+        """Concatenate batches along one axis."""
+        return SE3(torch.cat([b.rotation for b in batches]), torch.cat([b.translation for b in batches]))
+
+
+def skew(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Return the matrix [a]x, for which ``skew(a) @ b = a x b``."""
+    x, y, z = vector.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+
+
+def so3_left_jacobian(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Return V(phi) (eq. 145): ``I + (1 - cos t)/t^2 [phi]x + (t - sin t)/t^3 [phi]x^2``."""
+    squared, small, angle = _guarded_angle(phi)
+    b = torch.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - angle.cos()) / angle**2)
+    c = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - angle.sin()) / angle**3)
+    return _polynomial(phi, b, c)
+
+
+def so3_left_jacobian_inverse(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Return V(phi)^-1 (eq. 146): ``I - 1/2 [phi]x + (1/t^2 - (1 + cos t) / (2 t sin t)) [phi]x^2``."""
+    squared, small, angle = _guarded_angle(phi)
+    half = angle / 2  # (1 + cos t) / sin t = 1 / tan(t / 2): finite at pi
+    series = 1 / 12 + squared / 720 + squared**2 / 30240
+    c = torch.where(small, series, (1 - half / half.tan()) / angle**2)
+    return _polynomial(phi, torch.full_like(c, -0.5), c)
+
+
+def se3_left_jacobian(tangent: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]:
+    """Return J, for which ``exp(xi + d) = exp(J d) exp(xi)`` to first order.
+
+    See eqs. 179-180, and Barfoot, "State estimation for robotics", 7.86.
+    """
+    rho, phi = tangent[..., :3], tangent[..., 3:]
+    jacobian = so3_left_jacobian(phi)
+    top = torch.cat([jacobian, _coupling(rho, phi)], dim=-1)
+    return torch.cat([top, torch.cat([torch.zeros_like(jacobian), jacobian], dim=-1)], dim=-2)
+
+
+def se3_right_jacobian(tangent: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]:
+    """Return J, for which ``exp(xi + d) = exp(xi) exp(J d)`` to first order: the left Jacobian at ``-xi`` (eq. 76)."""
+    return se3_left_jacobian(-tangent)
+
+
+def _coupling(rho: Float[Tensor, "*b 3"], phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Return Q(rho, phi), eq. 180."""
+    squared, small, angle = _guarded_angle(phi)
+    sin, cos = angle.sin(), angle.cos()
+    a = torch.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - sin) / angle**3)
+    b = torch.where(small, -1 / 24 + squared / 720 - squared**2 / 40320, (1 - angle**2 / 2 - cos) / angle**4)
+    tail = torch.where(
+        small, -1 / 120 + squared / 5040 - squared**2 / 362880, (angle - sin - angle**3 / 6) / angle**5
+    )
+    r, p = skew(rho), skew(phi)
+    pr, rp, prp = p @ r, r @ p, p @ r @ p
+    return (
+        r / 2
+        + a[..., None, None] * (pr + rp + prp)
+        - b[..., None, None] * (p @ pr + rp @ p - 3 * prp)
+        - 0.5 * (b - 3 * tail)[..., None, None] * (prp @ p + p @ prp)
+    )
+
+
+def _guarded_angle(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Squared angle, where it is small, and an angle that is 1 there: neither branch of a ``where`` may divide by 0."""
+    squared = (phi * phi).sum(-1)
+    small = squared < SERIES_BELOW**2
+    return squared, small, torch.where(small, torch.ones_like(squared), squared).sqrt()
+
+
+def _polynomial(phi: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Return ``I + b [phi]x + c [phi]x^2``."""
+    s = skew(phi)
+    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
+    return eye + b[..., None, None] * s + c[..., None, None] * (s @ s)
+
+
+def _matvec(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector[..., None])[..., 0]

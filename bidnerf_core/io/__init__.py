@@ -1,0 +1,1 @@
+"""Reading what users name, and writing whole files: text, JSON, images, arrays."""

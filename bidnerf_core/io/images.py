@@ -1,0 +1,246 @@
+"""Image files and arrays of pixels as tensors. Every image file of the library is decoded here."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from PIL import Image, UnidentifiedImageError
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import open_binary
+
+Background: TypeAlias = str | Sequence[float]
+"""A background as users give it: "white", "black" or an rgb triple in [0, 1]."""
+
+LARGEST_IMAGE = 100_000_000
+"""Pixels. A small file can describe an image of any size, so the size is checked before memory is allocated."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV")
+FULL_SCALE = {"bool": 1, "uint8": 255, "uint16": 65535}
+COLOUR_ROUNDING = 1e-3
+"""How far a floating-point channel may exceed [0, 1], as happens in resampling and colour conversion."""
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """The properties of an image file that are known before its pixels are decoded."""
+
+    width: int
+    height: int
+    has_alpha: bool
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Read size and channels, but no pixels. Raises ``InputError`` where ``read_image`` would for the same reason."""
+    with open_image(path) as image:
+        has_alpha = image.mode in ("LA", "RGBA", "PA") or (image.mode == "P" and image.has_transparency_data)
+        return ImageHeader(image.width, image.height, has_alpha)
+
+
+def read_image(path: Path) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+    """Read straight (not premultiplied) colour in [0, 1], and alpha where there is such a channel.
+
+    Grey becomes three channels. The raster is the stored one, whatever the EXIF orientation. Raises ``InputError`` where
+    the file is not a complete image of 1 to 4 channels of 8 bits (or 16 bits of grey), or is too large.
+    """
+    return channels(decode(path), f"{path}: image decodes to")
+
+
+def channels(raw: np.ndarray, finding: str) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+    """Scale an array (h, w) or (h, w, 1 to 4) of unsigned integers to colour in [0, 1] and alpha.
+
+    ``finding`` is the beginning of the message of the ``InputError`` that other arrays raise.
+    """
+    count = raw.shape[2] if raw.ndim == 3 else 1
+    if raw.ndim not in (2, 3) or not 1 <= count <= 4 or raw.dtype.name not in FULL_SCALE:
+        found = f"{'x'.join(map(str, raw.shape))} of {raw.dtype.name}"
+        raise InputError(f"{finding} {found}, expected grey, RGB or RGBA of 8 bit")
+    scaled = raw.reshape(*raw.shape[:2], count).astype(np.float32)
+    scaled /= FULL_SCALE[raw.dtype.name]
+    return split_alpha(torch.from_numpy(scaled))
+
+
+def split_alpha(
+    values: Float[Tensor, "h w c"],
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+    """Split grey, grey with alpha, RGB or RGBA (1 to 4 channels) into colour and alpha."""
+    count = values.shape[-1]
+    alpha = values[..., -1].clone() if count in (2, 4) else None
+    colour = values[..., : count - 1] if alpha is not None else values
+    return colour.expand(*colour.shape[:2], 3).contiguous(), alpha
+
+
+def pixel_array(pixels: np.ndarray | Tensor, what: str) -> Float[Tensor, "h w c"]:
+    """Scale an array of pixels, grey (h, w) or with 1 to 4 channels in the last axis, to [0, 1].
+
+    Takes uint8 in [0, 255], uint16 in [0, 65535], bool, and floats in [0, 1]. Raises ``InputError`` for other types and
+    shapes, for NaN, and for floats outside [0, 1]; ``what`` opens the message.
+    """
+    raw = to_numpy(pixels)
+    if raw.ndim not in (2, 3) or 0 in raw.shape or (raw.ndim == 3 and raw.shape[2] > 4):
+        hint = "; move the channels last" if raw.ndim == 3 and raw.shape[0] <= 4 else ""
+        raise InputError(
+            f"{what} has shape {tuple(raw.shape)}, expected (height, width) or (height, width, 1 to 4){hint}"
+        )
+    if raw.dtype.kind != "f" and raw.dtype.name not in FULL_SCALE:
+        raise InputError(
+            f"{what} is of {raw.dtype.name}, expected uint8 in [0, 255], uint16 or floats in [0, 1]"
+        )
+    if raw.dtype.kind == "f":
+        _check_unit_range(raw, what)
+    scaled = raw.reshape(*raw.shape[:2], -1).astype(np.float32) / FULL_SCALE.get(raw.dtype.name, 1)
+    return torch.from_numpy(scaled).clamp(0, 1)
+
+
+def to_numpy(array: np.ndarray | Tensor) -> np.ndarray:
+    """Return the values of a NumPy array or torch tensor (any device and dtype) as a NumPy array. Raises ``InputError``."""
+    if not isinstance(array, Tensor):
+        try:
+            return np.asarray(array)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"got a {type(array).__name__}, expected an array of numbers") from error
+    values = array.detach().cpu()
+    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()
+
+
+def _check_unit_range(raw: np.ndarray, what: str) -> None:
+    if not np.isfinite(raw).all():
+        count = int((~np.isfinite(raw)).sum())
+        raise InputError(f"{what} has {count} values that are NaN or infinite, expected floats in [0, 1]")
+    low, high = float(raw.min()), float(raw.max())
+    if low < -COLOUR_ROUNDING or high > 1 + COLOUR_ROUNDING:
+        hint = "; divide by 255, or give uint8" if 1 < high <= 255 and low >= 0 else ""
+        raise InputError(f"{what} has floats from {low:g} to {high:g}, expected [0, 1]{hint}")
+
+
+def over(
+    colour: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"] | None, background: Sequence[float]
+) -> Float[Tensor, "h w 3"]:
+    """Composite straight (not premultiplied) colour over ``background``."""
+    if alpha is None:
+        return colour
+    cover = alpha[..., None]
+    return colour * cover + colour.new_tensor(background) * (1 - cover)
+
+
+def background_colour(background: Background) -> tuple[float, float, float]:
+    """Return the rgb triple that ``background`` stands for. Raises ``InputError`` where it is not a colour."""
+    expected = 'expected "white", "black" or three numbers in [0, 1]'
+    if isinstance(background, str):
+        if background not in NAMED_BACKGROUNDS:
+            raise InputError(f"background is {background!r}, {expected}")
+        return NAMED_BACKGROUNDS[background]
+    values = tuple(float(value) for value in background)
+    if len(values) != 3 or not all(math.isfinite(value) and 0 <= value <= 1 for value in values):
+        raise InputError(f"background is {values}, {expected}")
+    return values[0], values[1], values[2]
+
+
+def reduced(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "nh nw *c"]:
+    """Reduce an image to a smaller size; each new pixel is the mean over the area that it covers."""
+    rows = _area_weights(image.shape[0], height) @ image.reshape(image.shape[0], -1).numpy()
+    columns = rows.reshape(height, image.shape[1], -1).swapaxes(0, 1).reshape(image.shape[1], -1)
+    small = (_area_weights(image.shape[1], width) @ columns).reshape(width, height, *image.shape[2:])
+    return torch.from_numpy(small.swapaxes(0, 1).copy())
+
+
+def _area_weights(old: int, new: int) -> csr_array:
+    """Return a matrix (new, old): the share of each new pixel, along an axis, that lies in each old one."""
+    edges = np.union1d(np.arange(old + 1), np.linspace(0, old, new + 1))
+    middles, lengths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+    places = ((middles * new / old).astype(int), middles.astype(int))
+    return csr_array(((lengths * new / old).astype(np.float32), places), shape=(new, old))
+
+
+def resampled(image: Shaped[Tensor, "h w"], width: int, height: int) -> Shaped[Tensor, "nh nw"]:
+    """Give an image another size; each new pixel has the value of the nearest old one."""
+    rows = ((torch.arange(height) + 0.5) * image.shape[0] / height).long()
+    columns = ((torch.arange(width) + 0.5) * image.shape[1] / width).long()
+    return image[rows][:, columns]
+
+
+def decode(path: Path) -> np.ndarray:
+    """Decode the first image of a file as it is stored: (h, w) or (h, w, channels) of the file's own type.
+
+    Raises ``InputError`` where the file is not a whole image, and for colour spaces other than grey and RGB.
+    """
+    with open_image(path) as image:
+        if image.mode in OTHER_COLOURS:
+            raise InputError(f"{path}: image is {image.mode}, expected grey, RGB or RGBA")
+        if image.mode in ("P", "PA"):
+            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+        pixels = np.array(image)
+        sixteen_bits = image.format == "PNG" and pixels.dtype == np.int32  # Pillow before 11.3
+        return pixels.astype(np.uint16) if sixteen_bits else pixels
+
+
+@contextlib.contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
+    """Open an image file; its pixels are decoded when they are first used, within the context.
+
+    Raises ``InputError`` where there is no such regular file, where it is not readable as an image, and where the image has
+    more than ``LARGEST_IMAGE`` pixels, which the header shows before memory is allocated.
+    """
+    if path.suffix.lower() in HEIF_SUFFIXES:
+        _register_heif(path)
+    with open_binary(path, "an image file") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow's warnings about large images, odd EXIF, palettes
+        try:
+            with Image.open(file) as image:
+                _check_pixels(path, image.width, image.height)
+                yield image
+        except InputError:
+            raise
+        except Image.DecompressionBombError as error:
+            raise _too_large(path, "more than 178 megapixels") from error
+        except Exception as error:  # decoders may raise anything, even SyntaxError
+            raise InputError(
+                f"{path}: not readable as an image ({_why_unreadable(file, error)}), expected a whole image file"
+            ) from error
+
+
+def _why_unreadable(file: BinaryIO, error: Exception) -> str:
+    if os.fstat(file.fileno()).st_size == 0:
+        return "the file is empty"
+    if isinstance(error, UnidentifiedImageError):  # its text has the repr of the open file
+        return "its content is of no known image format"
+    return reason(error)
+
+
+def _check_pixels(path: Path, width: int, height: int) -> None:
+    if width * height > LARGEST_IMAGE:
+        raise _too_large(path, f"{width}x{height}, {width * height / 1e6:.0f} megapixels")
+
+
+def _too_large(path: Path, size: str) -> InputError:
+    return InputError(f"{path}: image is {size}, expected at most {LARGEST_IMAGE // 10**6} megapixels")
+
+
+def _register_heif(path: Path) -> None:
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise InputError(
+            f"{path}: reading HEIC needs the package pillow-heif (pip install pillow-heif); or convert the photo to JPEG"
+        ) from error
+    pillow_heif.register_heif_opener()
+
+
+def reason(error: Exception) -> str:
+    """Return the first line of a decoder's message, which may have many."""
+    text = str(error).strip()
+    return text.splitlines()[0][:120] if text else type(error).__name__

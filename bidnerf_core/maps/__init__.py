@@ -1,0 +1,1 @@
+"""Maps: their storage, training and baking."""

@@ -1,0 +1,1 @@
+"""Results: errors, trajectories, pose files and overlays."""

@@ -1,0 +1,132 @@
+"""Errors of poses (``T_world_camera``), and the criteria by which they count as success."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class PoseError:
+    """The translation and rotation error of one pose, or of a batch: of all steps of a run, for example."""
+
+    translation: Float[Tensor, "*b"]  # metres between the camera centres
+    rotation_deg: Float[Tensor, "*b"]  # geodesic angle, degrees, 0 to 180
+
+    def __getitem__(self, index: Any) -> PoseError:
+        return PoseError(self.translation[index], self.rotation_deg[index])
+
+
+def pose_error(found: SE3, true: SE3) -> PoseError:
+    """Return the error of ``found`` in float64; batches broadcast. It is not finite where a pose is not."""
+    found, true = found.to(dtype=torch.float64), true.to(dtype=torch.float64)
+    distance = torch.linalg.vector_norm(found.translation - true.translation, dim=-1)
+    return PoseError(distance, torch.rad2deg(rotation_angle(true.rotation.mT @ found.rotation)))
+
+
+def normalized_error_squared(
+    found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"]
+) -> Float[Tensor, "*b"]:
+    """Return ``xi^T C^-1 xi`` with ``true = found exp(xi)``.
+
+    It follows a chi-squared distribution with 6 degrees of freedom if the covariance C is consistent (Bar-Shalom et al. 2001,
+    "Estimation with applications to tracking and navigation", 5.4.2). It is infinite or NaN where the covariance has no
+    inverse.
+    """
+    xi = (found.to(dtype=torch.float64).inverse() @ true.to(dtype=torch.float64)).log()
+    solved, _ = torch.linalg.solve_ex(covariance.double(), xi[..., None])
+    return (xi * solved[..., 0]).sum(-1)
+
+
+def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """Return the angle in radians, 0 to pi. ``acos`` of the trace would lose half of the digits near either end."""
+    skewed = rotation - rotation.mT
+    twice_axis = torch.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], dim=-1)
+    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return torch.atan2(torch.linalg.vector_norm(twice_axis, dim=-1), trace - 1)  # twice sine and cosine
+
+
+@runtime_checkable
+class Criterion(Protocol):
+    """Decides whether an error counts as success, given the error of the start. A pose that is not finite never succeeds."""
+
+    def __call__(self, error: PoseError, start: PoseError) -> Bool[Tensor, "*b"]: ...
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The criterion of a translation error of at most ``fraction`` of the start's (BID-NeRF, section IV)."""
+
+    fraction: float
+
+    def __call__(self, error: PoseError, start: PoseError) -> Bool[Tensor, "*b"]:
+        return (error.translation <= self.fraction * start.translation) & error.rotation_deg.isfinite()
+
+
+@dataclass(frozen=True)
+class Within:
+    """The criterion of a rotation and a translation error below fixed thresholds, wherever the start was."""
+
+    rotation_deg: float
+    translation: float  # metres
+
+    def __call__(self, error: PoseError, start: PoseError) -> Bool[Tensor, "*b"]:
+        return (error.rotation_deg < self.rotation_deg) & (error.translation < self.translation)
+
+
+CRITERIA: dict[str, Criterion] = {
+    "10%": Reduced(0.1),
+    "5deg 0.05": Within(5.0, 0.05),
+    "1deg 0.02": Within(1.0, 0.02),
+}
+"""The criteria that are reported side by side: that of the paper, a common one and a strict one."""
+
+
+def steps_to_success(trace: PoseError, criterion: Criterion) -> int | None:
+    """Return the first step from which the criterion holds to the end; None if it does not hold at the end.
+
+    ``trace`` has one axis: entry 0 is the start's error, entry n the error after step n.
+    """
+    if trace.translation.dim() != 1 or len(trace.translation) == 0:
+        shape = tuple(trace.translation.shape)
+        raise InputError(
+            f"steps to success: expected errors of the start and of each step, got shape {shape}"
+        )
+    failures = (~criterion(trace, trace[0])).nonzero()
+    first = int(failures[-1]) + 1 if len(failures) else 0
+    return first if first < len(trace.translation) else None
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A share of successes and the ends of its Wilson interval."""
+
+    successes: int
+    trials: int
+    low: float
+    high: float
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.trials
+
+    def __str__(self) -> str:
+        count = f"{self.successes} of {self.trials}"
+        return f"{self.rate:.1%} ({count}; {self.low:.1%} to {self.high:.1%})"
+
+
+def success_rate(successes: int, trials: int, confidence: float = 0.95) -> Rate:
+    """Return the share of successes with Wilson's interval (Wilson 1927)."""
+    if not (trials >= 1 and 0 <= successes <= trials):
+        raise InputError(f"success rate: {successes} of {trials}, expected 0 to n of at least one trial")
+    from scipy.stats import binomtest  # here, because its import takes longer than any help page should
+
+    interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+    return Rate(successes, trials, float(interval.low), float(interval.high))

@@ -1,0 +1,118 @@
+"""Errors of trajectories: raw, after alignment (ATE), and of the motion between frames (RPE).
+
+The measures are those of Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems". Poses in a map need no
+alignment, so their raw error is what counts; the others make them comparable with odometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.similarity import fit_similarity
+from bidnerf_core.results.errors import PoseError, pose_error
+
+LEAST_POSES = 3
+"""Minimum number of poses from which an alignment is determined."""
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Median, 95th percentile and root mean square of translation and rotation errors."""
+
+    translation_median: float  # metres
+    translation_p95: float
+    translation_rmse: float
+    rotation_deg_median: float
+    rotation_deg_p95: float
+    rotation_deg_rmse: float
+
+    @staticmethod
+    def of(errors: PoseError) -> ErrorSummary:
+        """Return the summary of a batch of errors. Raises ``InputError`` for an empty one."""
+        if not errors.translation.numel():
+            raise InputError("no errors to summarise, expected those of at least one pose")
+        return ErrorSummary(*_three(errors.translation), *_three(errors.rotation_deg))
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """The errors of a trajectory; a measure is None where there are too few poses for it."""
+
+    poses: int
+    raw: ErrorSummary
+    ate: float | None  # metres: root mean square distance after a rigid alignment
+    rpe: ErrorSummary | None  # of the motion between consecutive poses
+
+    @staticmethod
+    def of(found: SE3, true: SE3) -> TrajectoryErrors:
+        """Compare poses ``T_world_camera`` (n), in chronological order. Raises ``InputError`` where there are none."""
+        count = len(found.translation)
+        distances = alignment_errors(found, true) if count >= LEAST_POSES else None
+        return TrajectoryErrors(
+            count,
+            ErrorSummary.of(pose_error(found, true)),
+            None if distances is None else float(distances.square().mean().sqrt()),
+            ErrorSummary.of(relative_errors(found, true)) if count > 1 else None,
+        )
+
+
+def rigid_alignment(found: SE3, true: SE3) -> SE3:
+    """Return the T_true_found that brings the camera centres of ``found`` (n) nearest to those of ``true``, without scaling.
+
+    Raises ``InputError`` where all centres coincide.
+    """
+    source, target = found.translation.double(), true.translation.double()
+    rotation = fit_similarity(source, target).T_target_source.rotation
+    return SE3(rotation, target.mean(0) - rotation @ source.mean(0))
+
+
+def alignment_errors(found: SE3, true: SE3) -> Float[Tensor, "n"] | None:
+    """Return the absolute trajectory error of each pose: its distance (metres) from the truth after a rigid alignment.
+
+    Returns None where the camera did not move, so that the rotation is undetermined.
+    """
+    try:
+        T_true_found = rigid_alignment(found, true)
+    except InputError:
+        return None
+    aligned = T_true_found.apply(found.translation.double())
+    return torch.linalg.vector_norm(aligned - true.translation.double(), dim=-1)
+
+
+def relative_errors(found: SE3, true: SE3, apart: int = 1) -> PoseError:
+    """Return the relative pose errors (n - apart), those of the motion from each pose to the one ``apart`` places later.
+
+    Sturm et al. 2012, eq. 2. Raises ``InputError`` where the trajectory is too short.
+    """
+    if not 1 <= apart < len(found.translation):
+        raise InputError(f"relative errors of {len(found.translation)} poses that are {apart} apart")
+    found, true = found.to(torch.float64), true.to(torch.float64)
+    moved = [T[:-apart].inverse() @ T[apart:] for T in (found, true)]
+    return pose_error(moved[0], moved[1])
+
+
+def spans(flags: Sequence[bool]) -> list[tuple[int, int]]:
+    """Return the runs of true flags as (first, last), both included."""
+    found: list[tuple[int, int]] = []
+    for place, flag in enumerate(flags):
+        if flag and found and found[-1][1] == place - 1:
+            found[-1] = (found[-1][0], place)
+        elif flag:
+            found.append((place, place))
+    return found
+
+
+def _three(values: Float[Tensor, "n"]) -> tuple[float, float, float]:
+    values = values.double()
+    return (
+        float(values.quantile(0.5)),
+        float(values.quantile(0.95)),
+        float(values.square().mean().sqrt()),
+    )
