@@ -10,10 +10,14 @@ from jaxtyping import install_import_hook
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the library does, which is imported after torch here
 
-# Before the first import of the project: only modules that are imported afterwards are checked.
-install_import_hook(
-    ["bidnerf_core", "bidnerf_adanerf", "bidnerf_hashgrid", "bidnerf_vanilla"], "shape_checks.checked"
-)
+SHAPES = "BIDNERF_SHAPES"
+"""Set to 1, it turns on run-time checks of shapes and types, which take nearly half of the time of all tests."""
+
+if os.environ.get(SHAPES) == "1":
+    # Before the first import of the project: only modules that are imported afterwards are checked.
+    install_import_hook(
+        ["bidnerf_core", "bidnerf_adanerf", "bidnerf_hashgrid", "bidnerf_vanilla"], "shape_checks.checked"
+    )
 
 import pytest
 import torch
