@@ -20,83 +20,98 @@ except Exception:
     os.environ.setdefault("TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 if TYPE_CHECKING:
-    from bidnerf_core.camera.intrinsics import Intrinsics
-    from bidnerf_core.errors import InputError, InputWarning
-    from bidnerf_core.fields.contract import (
-        FieldValues,
-        RadianceField,
-        Rays,
-        RaySampler,
-        RaySamples,
-        SceneBounds,
-        levels,
-    )
-    from bidnerf_core.fields.observations import Observations
-    from bidnerf_core.fields.rendering import render, render_image
-    from bidnerf_core.frames.frame import Frame, View
-    from bidnerf_core.geometry.se3 import SE3
-    from bidnerf_core.localization import Localization, Localizer, Outcome, Tracker, TrackerConfig
-    from bidnerf_core.maps.storage import Map, load_map
-    from bidnerf_core.registry import list_backends, load_backend
+    from bidnerf_core.camera.intrinsics import Intrinsics as Intrinsics
+    from bidnerf_core.datasets import Dataset as Dataset
+    from bidnerf_core.datasets import FrameSequence as FrameSequence
+    from bidnerf_core.datasets import open_dataset as open_dataset
+    from bidnerf_core.datasets import open_sequence as open_sequence
+    from bidnerf_core.datasets import write_transforms as write_transforms
+    from bidnerf_core.errors import Cancelled as Cancelled
+    from bidnerf_core.errors import InputError as InputError
+    from bidnerf_core.errors import InputWarning as InputWarning
+    from bidnerf_core.evaluation.protocols import perturb as perturb
+    from bidnerf_core.fields.contract import FieldValues as FieldValues
+    from bidnerf_core.fields.contract import RadianceField as RadianceField
+    from bidnerf_core.fields.contract import Rays as Rays
+    from bidnerf_core.fields.contract import RaySampler as RaySampler
+    from bidnerf_core.fields.contract import RaySamples as RaySamples
+    from bidnerf_core.fields.contract import SceneBounds as SceneBounds
+    from bidnerf_core.fields.contract import levels as levels
+    from bidnerf_core.fields.observations import Observations as Observations
+    from bidnerf_core.fields.rendering import render as render
+    from bidnerf_core.fields.rendering import render_image as render_image
+    from bidnerf_core.frames.frame import Frame as Frame
+    from bidnerf_core.frames.frame import View as View
+    from bidnerf_core.geometry.se3 import SE3 as SE3
+    from bidnerf_core.localization import AutoConfig as AutoConfig
+    from bidnerf_core.localization import Localization as Localization
+    from bidnerf_core.localization import Localizer as Localizer
+    from bidnerf_core.localization import Outcome as Outcome
+    from bidnerf_core.localization import Tracker as Tracker
+    from bidnerf_core.localization import TrackerConfig as TrackerConfig
+    from bidnerf_core.localization import settings_of as settings_of
+    from bidnerf_core.maps.storage import Map as Map
+    from bidnerf_core.maps.storage import load_map as load_map
+    from bidnerf_core.progress import Progress as Progress
+    from bidnerf_core.progress import ProgressCallback as ProgressCallback
+    from bidnerf_core.registry import list_backends as list_backends
+    from bidnerf_core.registry import load_backend as load_backend
+    from bidnerf_core.results.errors import PoseError as PoseError
+    from bidnerf_core.results.errors import pose_error as pose_error
+    from bidnerf_core.results.pose_files import write_poses as write_poses
 
 HOMES = {
-    "camera.intrinsics": ("Intrinsics",),
-    "errors": ("InputError", "InputWarning"),
-    "fields.contract": (
-        "FieldValues",
-        "RadianceField",
-        "RaySampler",
-        "RaySamples",
-        "Rays",
-        "SceneBounds",
-        "levels",
-    ),
-    "frames.frame": ("Frame", "View"),
-    "localization": ("Localization", "Localizer", "Outcome", "Tracker", "TrackerConfig"),
-    "fields.observations": ("Observations",),
-    "registry": ("list_backends", "load_backend"),
-    "fields.rendering": ("render", "render_image"),
-    "geometry.se3": ("SE3",),
-    "maps.storage": ("Map", "load_map"),
+    "AutoConfig": "localization",
+    "Cancelled": "errors",
+    "Dataset": "datasets",
+    "FieldValues": "fields.contract",
+    "Frame": "frames.frame",
+    "FrameSequence": "datasets",
+    "InputError": "errors",
+    "InputWarning": "errors",
+    "Intrinsics": "camera.intrinsics",
+    "Localization": "localization",
+    "Localizer": "localization",
+    "Map": "maps.storage",
+    "Observations": "fields.observations",
+    "Outcome": "localization",
+    "PoseError": "results.errors",
+    "Progress": "progress",
+    "ProgressCallback": "progress",
+    "RadianceField": "fields.contract",
+    "RaySampler": "fields.contract",
+    "RaySamples": "fields.contract",
+    "Rays": "fields.contract",
+    "SE3": "geometry.se3",
+    "SceneBounds": "fields.contract",
+    "Tracker": "localization",
+    "TrackerConfig": "localization",
+    "View": "frames.frame",
+    "levels": "fields.contract",
+    "list_backends": "registry",
+    "load_backend": "registry",
+    "load_map": "maps.storage",
+    "open_dataset": "datasets",
+    "open_sequence": "datasets",
+    "perturb": "evaluation.protocols",
+    "pose_error": "results.errors",
+    "render": "fields.rendering",
+    "render_image": "fields.rendering",
+    "settings_of": "localization",
+    "write_poses": "results.pose_files",
+    "write_transforms": "datasets",
 }
-"""The modules that define the public names. They are imported when a name is first used (PEP 562): importing torch takes
-seconds, and ``bidnerf --help`` does not need it."""
+"""The module that defines each public name. It is imported when the name is first used (PEP 562): importing torch takes seconds,
+and ``bidnerf --help`` does not need it. A new name takes a line here and one above, for tools that do not run the code."""
 
-__all__ = [
-    "SE3",
-    "FieldValues",
-    "Frame",
-    "InputError",
-    "InputWarning",
-    "Intrinsics",
-    "Localization",
-    "Localizer",
-    "Map",
-    "Observations",
-    "Outcome",
-    "RadianceField",
-    "RaySampler",
-    "RaySamples",
-    "Rays",
-    "SceneBounds",
-    "Tracker",
-    "TrackerConfig",
-    "View",
-    "levels",
-    "list_backends",
-    "load_backend",
-    "load_map",
-    "render",
-    "render_image",
-]
+__all__ = sorted(HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in HOMES.items():
-        if name in names:
-            found = globals()[name] = getattr(importlib.import_module(f"{__name__}.{module}"), name)
-            return found
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = getattr(importlib.import_module(f"{__name__}.{HOMES[name]}"), name)
+    return found
 
 
 def __dir__() -> list[str]:

@@ -14,6 +14,10 @@ class InputWarning(UserWarning):
     """An input was ambiguous and a convention was assumed; the message is one line that states which."""
 
 
+class Cancelled(Exception):
+    """Work stopped because its ``cancel`` returned True; what could be kept was saved, and the message says what."""
+
+
 def unknown_name(what: str, name: str, known: Collection[str]) -> InputError:
     """Return the error for a name that is not among ``known``; it suggests the known name with the most similar spelling."""
     listed = f", expected one of {', '.join(known)}"
