@@ -8,14 +8,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parent.parent
 PACKAGES = [ROOT / "bidnerf_core", *sorted(f.parent for f in (ROOT / "backends").glob("*/__init__.py"))]
 FILES = sorted(file for package in PACKAGES for file in package.rglob("*.py"))
 LONGEST = 500
 
-every_file = pytest.mark.parametrize("file", FILES, ids=[str(f.relative_to(ROOT)) for f in FILES])
+TREES = {f.relative_to(ROOT).as_posix(): ast.parse(f.read_text(encoding="utf-8")) for f in FILES}
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -28,23 +26,20 @@ def test_imports_follow_the_arrows() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
-def test_every_import_package_is_typed(package: Path) -> None:
-    assert (package / "py.typed").is_file()
+def test_every_import_package_is_typed() -> None:
+    assert [package.name for package in PACKAGES if not (package / "py.typed").is_file()] == []
 
 
-@every_file
-def test_files_are_short_and_say_what_they_are(file: Path) -> None:
-    text = file.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= LONGEST
-    assert ast.get_docstring(ast.parse(text)), "a module starts with a docstring"
+def test_files_are_short_and_say_what_they_are() -> None:
+    lengths = {f.relative_to(ROOT).as_posix(): len(f.read_text(encoding="utf-8").splitlines()) for f in FILES}
+    assert {name: lines for name, lines in lengths.items() if lines > LONGEST} == {}
+    assert [name for name, tree in TREES.items() if not ast.get_docstring(tree)] == []
 
 
-@every_file
-def test_public_functions_are_annotated(file: Path) -> None:
+def test_public_functions_are_annotated() -> None:
     """Also where mypy would infer a type: annotations are what the run-time checks of the tests read."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    assert [name for function in _public(tree) for name in _bare(function)] == []
+    bare = {name: [part for f in _public(tree) for part in _bare(f)] for name, tree in TREES.items()}
+    assert {name: parts for name, parts in bare.items() if parts} == {}
 
 
 BY_NAME = {
@@ -55,14 +50,18 @@ BY_NAME = {
 }
 
 
-@every_file
-def test_only_the_registry_imports_by_name(file: Path) -> None:
+def test_only_the_registry_imports_by_name() -> None:
     """The core reaches a backend through ``load_backend`` alone."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    names = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
-    names |= {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
-    found = names & {"import_module", "__import__", "entry_points"}
-    assert found <= BY_NAME.get(file.relative_to(ROOT).as_posix(), set())
+    found = {
+        name: _names(tree) & {"import_module", "__import__", "entry_points"} for name, tree in TREES.items()
+    }
+    surplus = {name: calls - BY_NAME.get(name, set()) for name, calls in found.items()}
+    assert {name: calls for name, calls in surplus.items() if calls} == {}
+
+
+def _names(tree: ast.Module) -> set[str]:
+    attributes = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    return attributes | {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
 
 
 def _public(tree: ast.Module | ast.ClassDef) -> Iterator[Function]:

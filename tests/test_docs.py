@@ -50,8 +50,6 @@ OTHER_PROGRAMS = {"git", "cd", "cp", "mv", "perl", "pytest"}
 """Programs beside bidnerf, make and pip that the documentation runs; a test follows the template's commands elsewhere."""
 LANGUAGES = {"python", "sh", "toml", "bibtex", "text"}
 
-every_page = pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
-
 
 @dataclass(frozen=True)
 class Block:
@@ -74,6 +72,10 @@ def commands(page: Path) -> Iterator[list[str]]:
             for part in line.split("&&"):
                 if words := shlex.split(part, comments=True):
                     yield words
+
+
+def each(pages: list[Path]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("page", pages, ids=[page.stem for page in pages])
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +131,7 @@ def executed(page: Path) -> dict[str, Any]:
     return namespace
 
 
-@every_page
+@each([page for page in PAGES if blocks(page, "python")])
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.usefixtures("backends_listed_once", "quick_auto")
 def test_python_blocks_run(page: Path, inside: Path) -> None:
@@ -146,14 +148,15 @@ def test_blocks_that_are_not_run_exist() -> None:
     assert set(NOT_RUN) <= found
 
 
-@every_page
-def test_blocks_are_of_known_languages(page: Path) -> None:
-    assert {block.language for block in blocks(page)} <= LANGUAGES
-    for block in blocks(page, "toml"):
-        tomllib.loads(block.text)
+def test_blocks_are_of_known_languages() -> None:
+    found = {page.name: {block.language for block in blocks(page)} - LANGUAGES for page in PAGES}
+    assert {name: unknown for name, unknown in found.items() if unknown} == {}
+    for page in PAGES:
+        for block in blocks(page, "toml"):
+            tomllib.loads(block.text)
 
 
-@every_page
+@each([page for page in PAGES if any(words[0] == "bidnerf" for words in commands(page))])
 @pytest.mark.usefixtures("backends_listed_once", "quick_auto")
 def test_bidnerf_commands_work(page: Path, inside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands that are quick are run on tiny files; the others are parsed."""
@@ -177,20 +180,26 @@ def parsed_only(parser: Any) -> Any:
     return cli
 
 
-@every_page
-def test_other_commands_name_what_exists(page: Path) -> None:
+def test_other_commands_name_what_exists() -> None:
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    for program, *arguments in commands(page):
-        if program == "make":
-            assert set(arguments) <= targets
-        elif program == "pip":
-            assert extras(arguments) <= {*PROJECT["optional-dependencies"], "test"}
-        elif program == "cp":
-            assert (ROOT / arguments[1]).exists()
-        elif program == "python":
-            assert (ROOT / arguments[0]).is_file()
-        else:
-            assert program in {"bidnerf", *OTHER_PROGRAMS}
+    unknown = [
+        f"{page.name}: {shlex.join(c)}" for page in PAGES for c in commands(page) if not exists(c, targets)
+    ]
+    assert unknown == []
+
+
+def exists(command: list[str], targets: set[str]) -> bool:
+    """Return whether a command of the documentation names a target, an extra or a file that there is."""
+    program, *arguments = command
+    if program == "make":
+        return set(arguments) <= targets
+    if program == "pip":
+        return extras(arguments) <= {*PROJECT["optional-dependencies"], "test"}
+    if program == "cp":
+        return (ROOT / arguments[1]).exists()
+    if program == "python":
+        return (ROOT / arguments[0]).is_file()
+    return program in {"bidnerf", *OTHER_PROGRAMS}
 
 
 def extras(arguments: list[str]) -> set[str]:
@@ -228,16 +237,10 @@ def test_links_of_the_readme_lead_somewhere() -> None:
     assert [target for target in targets if not (ROOT / target).exists()] == []
 
 
-@pytest.mark.parametrize(
-    "record", sorted((ROOT / "benchmarks" / "results").glob("*.json")), ids=lambda path: path.stem
-)
-def test_every_record_is_on_the_page_of_results(record: Path) -> None:
-    assert f"`{record.stem}`" in (ROOT / "docs" / "results.md").read_text()
-
-
-@pytest.mark.parametrize("outcome", [outcome for outcome in Outcome if outcome is not Outcome.CONVERGED])
-def test_every_outcome_has_advice(outcome: Outcome) -> None:
-    assert f"\n### {outcome}\n" in (ROOT / "docs" / "troubleshooting.md").read_text()
+def test_every_outcome_has_advice() -> None:
+    text = (ROOT / "docs" / "troubleshooting.md").read_text()
+    refusals = [outcome for outcome in Outcome if outcome is not Outcome.CONVERGED]
+    assert [outcome for outcome in refusals if f"\n### {outcome}\n" not in text] == []
 
 
 def test_commands_and_methods_are_documented() -> None:
