@@ -1,6 +1,6 @@
 """All five methods answer as they did when ``pinned/blobs.json`` was recorded, before localization was rebuilt.
 
-The record was made by the code of that time with ``benchmarks/pinned_poses.py``'s settings, on one thread. What may differ:
+The record was made by the code of that time with ``pinned_poses.py``'s settings, on one thread. What may differ:
 rounding, in another order of sums or on another processor, within the tolerance; and covariances, which are not pinned, since
 those of noise-free scenes are the covariance of rounding errors. Since then only ``auto`` has another record: the surface's
 cells became finer, depth is refined against the surface and the field together, which moved its answers by up to 5e-4, and the
@@ -8,28 +8,21 @@ exposure is estimated with depth as well, which moved those with depth by up to 
 unchanged exposure, and before a plain background, which moved those by colour by up to 2e-4; the search by images fits the exposure in
 more rounds, which moved them by 4e-5.
 A change of a method that is meant to change its answers
-needs a new record (``python benchmarks/pinned_poses.py record``) and a word on why.
+needs a new record (``python tests/pinned_poses.py record``) and a word on why.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib.util
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
+import pinned_poses
+
 HERE = Path(__file__).parent
 RECORD = json.loads((HERE / "pinned" / "blobs.json").read_text())
-
-spec = importlib.util.spec_from_file_location("pinned_poses", HERE.parent / "benchmarks" / "pinned_poses.py")
-assert spec is not None
-assert spec.loader is not None
-pinned_poses = importlib.util.module_from_spec(spec)
-sys.modules["pinned_poses"] = pinned_poses
-spec.loader.exec_module(pinned_poses)
 
 
 @functools.cache
