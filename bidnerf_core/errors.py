@@ -38,3 +38,13 @@ def amount(count: int, noun: str) -> str:
 def enumeration(parts: Sequence[str]) -> str:
     """Return parts as they are listed in a sentence: a, b and c."""
     return " and ".join([*filter(None, [", ".join(parts[:-1])]), *parts[-1:]])
+
+
+def printable(text: str) -> str:
+    """Return ``text`` with a backslash escape in place of each character that could control the terminal.
+
+    These are Unicode's control, format and unassigned characters, such as ESC or the marks that reverse the direction of
+    writing, separators other than the blank, and bytes that are not UTF-8. Names of files and of frames may contain any of
+    them.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -18,7 +18,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.report import CaptureReport, CoverageRecord
 from bidnerf_core.cli import bake as module
 from bidnerf_core.cli import main, train, training_views
-from bidnerf_core.cli.common import read_views
+from bidnerf_core.cli.output import read_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views

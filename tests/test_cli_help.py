@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import tyro
 
-from bidnerf_core.cli import COMMANDS, common, main
+from bidnerf_core.cli import COMMANDS, main, options
 from bidnerf_core.localization.methods import METHODS
 
 CHOICES = {
@@ -39,7 +39,7 @@ def options_of(words: list[str], monkeypatch: pytest.MonkeyPatch) -> list[argpar
         found.extend(action for action in parser._actions if action.dest != "help")
         raise Shown
 
-    monkeypatch.setattr(common, "_called", keep)
+    monkeypatch.setattr(options, "_called", keep)
     with pytest.raises(Shown):
         main([*words, "--help-all"])
     return found

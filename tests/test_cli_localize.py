@@ -17,10 +17,12 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.cli import common, localize, main
+from bidnerf_core.cli import localize, main
+from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.help_page import without_expert_settings
-from bidnerf_core.cli.text import printable
+from bidnerf_core.cli.options import parse
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.errors import printable
 from bidnerf_core.maps.storage import load_info
 from bidnerf_core.settings import EXPERT, Settings
 from commands import Run
@@ -218,7 +220,7 @@ def test_a_folder_that_another_process_writes_into_is_refused(
     bidnerf: Run, shared: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "map"
-    with common.output_folder(out, overwrite=False):
+    with output_folder(out, overwrite=False):
         status, said, err = bidnerf("train", shared / "data", "--out", out, *tiny.options(2))
         assert (status, said, err.count("\n")) == (1, "", 1)
         assert "another bidnerf writes into it" in err
@@ -275,7 +277,7 @@ def test_help_hides_what_experts_need(capsys: pytest.CaptureFixture[str]) -> Non
     assert without_expert_settings(command)[1] == 3
     for option in ("--help", "--help-all"):
         with pytest.raises(SystemExit):
-            common.parse("x", command, [option])
+            parse("x", command, [option])
         page = capsys.readouterr().out
         assert "--plain" in page
         assert "shown, too" in page

@@ -27,11 +27,10 @@ import tiny
 from bidnerf_core import Frame, load_map
 from bidnerf_core.camera.source import read_camera
 from bidnerf_core.cli.starts import read_pose
-from bidnerf_core.cli.text import printable
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.depth.images import read_depth_image
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation.results import read_results
 from bidnerf_core.io.arrays import read_archive, read_array
 from bidnerf_core.io.files import read_file

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 import tiny
-from bidnerf_core.cli import common, main
+from bidnerf_core.cli import main
 from bidnerf_core.evaluation.plot_style import new_figure, save_figure
-from bidnerf_core.io.files import is_temporary, temporary, write_file
+from bidnerf_core.io.files import FileInUse, is_temporary, locked, temporary, write_file
 from bidnerf_core.maps.storage import load_map
 from commands import Run
 from tiny import backends_listed_once  # noqa: F401
@@ -146,7 +146,7 @@ def test_a_disk_that_is_full_at_any_write_leaves_whole_files(
 
 
 def test_a_map_that_another_process_writes_is_not_baked(bidnerf: Run, shared: Path) -> None:
-    with common.locked(shared / "map"):
+    with locked(shared / "map"):
         status, said, err = bidnerf("bake", shared / "map", "--data", shared / "data", *BAKE)
     assert (status, said, err.count("\n")) == (1, "", 1)
     assert "another bidnerf writes into it" in err
@@ -157,15 +157,15 @@ def test_a_lock_ends_with_its_process(shared: Path) -> None:
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
-        with common.locked(shared / "map"):
+        with locked(shared / "map"):
             os.write(writing, b"x")
             signal.pause()
     assert os.read(reading, 1) == b"x"
-    with pytest.raises(common.FolderInUse), common.locked(shared / "map"):
+    with pytest.raises(FileInUse), locked(shared / "map"):
         pass
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    with common.locked(shared / "map"):
+    with locked(shared / "map"):
         pass
     os.close(reading)
     os.close(writing)

@@ -10,8 +10,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
-from bidnerf_core.cli.text import printable
-from bidnerf_core.errors import InputError, InputWarning, spelling_hint
+from bidnerf_core.errors import InputError, InputWarning, printable, spelling_hint
 
 COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",

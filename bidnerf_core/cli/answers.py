@@ -12,7 +12,8 @@ import imageio.v3 as iio
 from torch import Tensor
 
 from bidnerf_core.cli.another_scene import question_about_scene
-from bidnerf_core.cli.common import UsageError, print_json, say, show
+from bidnerf_core.cli.options import UsageError
+from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.queries import Query
 from bidnerf_core.errors import InputError, amount

@@ -6,7 +6,8 @@ from typing import Annotated
 
 from rich.table import Table
 
-from bidnerf_core.cli.common import Flag, option, parse, print_json, print_table
+from bidnerf_core.cli.options import Flag, option, parse
+from bidnerf_core.cli.output import print_json, print_table
 from bidnerf_core.registry import BackendError, BackendInfo, list_backends, load_backend
 
 

@@ -15,23 +15,15 @@ from bidnerf_core.captures.cameras import at_stored_poses, stored_cameras
 from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
-from bidnerf_core.cli.common import (
-    Device,
-    Flag,
-    MapFolder,
-    UsageError,
-    locked,
-    option,
-    parse,
-    read_views,
-    say,
-)
 from bidnerf_core.cli.opened_map import unfinished
+from bidnerf_core.cli.options import Device, Flag, MapFolder, UsageError, option, parse
+from bidnerf_core.cli.output import read_views, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
+from bidnerf_core.io.files import locked
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from bidnerf_core.cli.common import option
+from bidnerf_core.cli.options import option
 from bidnerf_core.datasets import DepthRegistration
 from bidnerf_core.depth.sensors import DEPTH_SENSORS
 

@@ -12,22 +12,19 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
-from bidnerf_core.cli.common import (
+from bidnerf_core.cli.folders import output_folder
+from bidnerf_core.cli.method_options import Preset, chosen_settings
+from bidnerf_core.cli.options import (
     LARGEST_SEED,
     Flag,
     Names,
     UsageError,
     option,
-    output_folder,
     parse,
-    print_json,
-    print_table,
     require,
-    say,
-    show,
     wrong_usage,
 )
-from bidnerf_core.cli.method_options import Preset, chosen_settings
+from bidnerf_core.cli.output import print_json, print_table, say, show
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.bench import changed_settings
 from bidnerf_core.evaluation.comparison import Comparison, MapRow, compare_maps, plan_comparison
@@ -72,7 +69,7 @@ def run(arguments: list[str]) -> None:
         json: Annotated[Flag, option(None, "print one JSON object", "")] = False,
         overwrite: Annotated[Flag, option(None, "replace what is in --out", "")] = False,
         preset: Preset = None,
-        config: Any = settings,
+        config: Any = None,
     ) -> None:
         """Localize the same frames from the same starts in several maps, and compare success, time and memory.
 
@@ -99,8 +96,7 @@ def run(arguments: list[str]) -> None:
         else:
             _print(found)
 
-    compare.__annotations__["config"] = type(settings)
-    parse("compare", compare, arguments)
+    parse("compare", compare, arguments, settings)
 
 
 def read_size(given: str) -> Size:

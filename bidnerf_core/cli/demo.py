@@ -15,20 +15,9 @@ from rich.table import Table
 
 from bidnerf_core.backend import Backend, quick_config
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.cli.common import (
-    DEFAULT_BACKEND,
-    LARGEST_SEED,
-    Flag,
-    UsageError,
-    console,
-    option,
-    output_folder,
-    parse,
-    print_table,
-    require,
-    say,
-    show,
-)
+from bidnerf_core.cli.folders import output_folder
+from bidnerf_core.cli.options import DEFAULT_BACKEND, LARGEST_SEED, Flag, UsageError, option, parse, require
+from bidnerf_core.cli.output import console, print_table, say, show
 from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.progress import timed
 from bidnerf_core.cli.train import train_map

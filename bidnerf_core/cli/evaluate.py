@@ -13,7 +13,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidnerf_core.cli.common import (
+from bidnerf_core.cli.method_options import Preset, chosen_settings
+from bidnerf_core.cli.options import (
     LARGEST_SEED,
     Device,
     Names,
@@ -22,11 +23,9 @@ from bidnerf_core.cli.common import (
     parse,
     require,
     require_different,
-    say,
-    show,
     wrong_usage,
 )
-from bidnerf_core.cli.method_options import Preset, chosen_settings
+from bidnerf_core.cli.output import say, show
 from bidnerf_core.cli.trial_progress import TrialProgress
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.bench import (
@@ -105,7 +104,7 @@ def run(arguments: list[str]) -> None:
         shards: Annotated[int, option("N", "number of parts that the trials are split into")] = 1,
         shard: Annotated[int, option("I", "the part to run, from 0")] = 0,
         preset: Preset = None,
-        config: Any = settings,
+        config: Any = None,
     ) -> None:
         """Localize many frames from perturbed starts, or from none, and write one JSON line per trial.
 
@@ -130,8 +129,7 @@ def run(arguments: list[str]) -> None:
         mine = shard_of(trials_of_all, shard, shards)
         _evaluate(mine, out, workers, dask, command_line("bidnerf evaluate", arguments))
 
-    evaluate.__annotations__["config"] = type(settings)
-    parse("evaluate", evaluate, arguments)
+    parse("evaluate", evaluate, arguments, settings)
 
 
 def _evaluate(trials: list[Trial], out: Path, workers: int | None, dask: str | None, command: str) -> None:

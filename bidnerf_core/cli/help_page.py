@@ -10,7 +10,7 @@ import re
 import sys
 import textwrap
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -26,21 +26,29 @@ def without_expert_settings(function: Callable[..., _T]) -> tuple[Callable[..., 
     Settings are the parameters whose default is a dataclass. The parser removes hidden options altogether, so the returned
     function is only for the page: arguments are parsed with ``function`` itself.
     """
-    signature, hints, left_out = inspect.signature(function), dict(function.__annotations__), 0
-    parameters = dict(signature.parameters)
-    for name, parameter in signature.parameters.items():
+    shorter, left_out = dict[str, Any](), 0
+    for name, parameter in inspect.signature(function).parameters.items():
         if dataclasses.is_dataclass(parameter.default):
-            short, hidden = _short(parameter.default)
-            hints[name], left_out = type(short), left_out + hidden
-            parameters[name] = parameter.replace(default=short, annotation=type(short))
+            shorter[name], hidden = _short(parameter.default)
+            left_out += hidden
+    return retyped(function, shorter), left_out
+
+
+def retyped(function: Callable[..., _T], defaults: Mapping[str, Any]) -> Callable[..., _T]:
+    """Return the function with other defaults, whose types are also the types of their parameters to the parser."""
+    signature, hints = inspect.signature(function), dict(function.__annotations__)
+    parameters = dict(signature.parameters)
+    for name, default in defaults.items():
+        hints[name] = type(default)
+        parameters[name] = parameters[name].replace(default=default, annotation=type(default))
 
     @functools.wraps(function)
-    def shown(*arguments: Any, **options: Any) -> _T:
+    def changed(*arguments: Any, **options: Any) -> _T:
         return function(*arguments, **options)
 
-    shown.__annotations__ = hints
-    shown.__signature__ = signature.replace(parameters=list(parameters.values()))  # type: ignore[attr-defined]
-    return shown, left_out
+    changed.__annotations__ = hints
+    changed.__signature__ = signature.replace(parameters=list(parameters.values()))  # type: ignore[attr-defined]
+    return changed
 
 
 def _short(settings: Any) -> tuple[Any, int]:

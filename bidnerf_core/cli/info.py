@@ -8,7 +8,8 @@ from typing import Annotated, Any
 from bidnerf_core.captures.advice import sentences
 from bidnerf_core.captures.cameras import pose_sentences
 from bidnerf_core.captures.report import CaptureReport
-from bidnerf_core.cli.common import Flag, MapFolder, option, parse, print_json, show
+from bidnerf_core.cli.options import Flag, MapFolder, option, parse
+from bidnerf_core.cli.output import print_json, show
 from bidnerf_core.cli.trial_progress import duration_text
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.capture_figure import draw_capture

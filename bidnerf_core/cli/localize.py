@@ -17,20 +17,11 @@ from bidnerf_core.cli.camera_options import (
     RegisterDepth,
     depth_registration,
 )
-from bidnerf_core.cli.common import (
-    LARGEST_SEED,
-    Flag,
-    MapFolder,
-    Names,
-    UsageError,
-    option,
-    parse,
-    require,
-    say,
-)
 from bidnerf_core.cli.depth_remark import depth_remark
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.opened_map import opened_map
+from bidnerf_core.cli.options import LARGEST_SEED, Flag, MapFolder, Names, UsageError, option, parse, require
+from bidnerf_core.cli.output import say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.queries import (
     DepthPoints,
@@ -120,7 +111,7 @@ def run(arguments: list[str]) -> None:
         json: Annotated[Flag, option(None, "print one JSON object per query, each on a line", "")] = False,
         model_points: SparseChoice = SparseChoice(),
         preset: Preset = None,
-        config: Any = settings,
+        config: Any = None,
     ) -> None:
         """Find the poses of photos, or of frames of a dataset, in a map.
 
@@ -155,8 +146,7 @@ def run(arguments: list[str]) -> None:
         localizer = Localizer(stored, method, config, warm_up=len(source.names) > 1)
         _localize(source, localizer, begin, seed, Answers(stored, output, len(source.names)))
 
-    localize.__annotations__["config"] = type(settings)
-    parse("localize", localize, arguments)
+    parse("localize", localize, arguments, settings)
 
 
 def _depth_points(path: Path, stored: Map, choice: SparseChoice) -> DepthPoints:

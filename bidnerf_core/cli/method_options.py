@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeAlias
 
-from bidnerf_core.cli.common import option, value_of, wrong_usage
+from bidnerf_core.cli.options import option, value_of, wrong_usage
 from bidnerf_core.localization import find_method
 
 Preset: TypeAlias = Annotated[

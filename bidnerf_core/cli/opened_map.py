@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bidnerf_core.cli.common import say
+from bidnerf_core.cli.output import say
 from bidnerf_core.errors import InputError
 from bidnerf_core.maps.storage import Map, load_info, load_map
 

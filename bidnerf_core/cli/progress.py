@@ -25,7 +25,7 @@ from rich.progress import (
 )
 from torch import nn
 
-from bidnerf_core.cli.common import console, say
+from bidnerf_core.cli.output import console, say
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.maps.storage import MapInfo, save_map
 from bidnerf_core.training import Progress as TrainingProgress

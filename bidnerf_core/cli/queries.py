@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.cli.common import UsageError, read_views, require, require_different, say
+from bidnerf_core.cli.options import UsageError, require, require_different
+from bidnerf_core.cli.output import read_views, say
 from bidnerf_core.datasets import READERS, Dataset, DepthRegistration, given_sensor, open_dataset
 from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.dataset import unique_names

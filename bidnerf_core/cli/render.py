@@ -14,23 +14,12 @@ from kornia.metrics import psnr
 from rich.text import Text
 
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
-from bidnerf_core.cli.common import (
-    DataFolder,
-    Flag,
-    MapFolder,
-    Names,
-    console,
-    option,
-    output_folder,
-    parse,
-    read_views,
-    say,
-    show,
-)
+from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.opened_map import opened_map
-from bidnerf_core.cli.text import printable
+from bidnerf_core.cli.options import DataFolder, Flag, MapFolder, Names, option, parse
+from bidnerf_core.cli.output import console, read_views, say, show
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, printable
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
 from bidnerf_core.fields.rendering import RenderedImage, render_image
 from bidnerf_core.frames.frame import Frame, View

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from bidnerf_core.cli.common import UsageError, console, option, output_folder, parse, print_table, show
+from bidnerf_core.cli.folders import output_folder
+from bidnerf_core.cli.options import UsageError, option, parse
+from bidnerf_core.cli.output import console, print_table, show
 from bidnerf_core.errors import InputError
 
 if TYPE_CHECKING:  # the rest is imported when a report is made, since help pages do not need it

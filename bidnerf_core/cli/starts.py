@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.cli.common import UsageError
+from bidnerf_core.cli.options import UsageError
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.geometry.se3 import SE3

@@ -22,19 +22,10 @@ from bidnerf_core.cli.camera_options import (
     RegisterDepth,
     depth_registration,
 )
-from bidnerf_core.cli.common import (
-    Flag,
-    MapFolder,
-    UsageError,
-    option,
-    parse,
-    print_json,
-    print_table,
-    require,
-    say,
-)
 from bidnerf_core.cli.following import STDIN, requests
 from bidnerf_core.cli.opened_map import opened_map
+from bidnerf_core.cli.options import Flag, MapFolder, UsageError, option, parse, require
+from bidnerf_core.cli.output import print_json, print_table, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.cli.tracked_path import TrackedPath, check_out

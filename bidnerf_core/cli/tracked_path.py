@@ -12,7 +12,8 @@ from rich.table import Table
 from torch import Tensor
 
 from bidnerf_core.captures.cameras import as_given
-from bidnerf_core.cli.common import UsageError, say
+from bidnerf_core.cli.options import UsageError
+from bidnerf_core.cli.output import say
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.trajectory_plot import PlottedPath, plot_path
 from bidnerf_core.evaluation.trials import plain_localization

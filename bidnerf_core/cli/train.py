@@ -14,21 +14,20 @@ from bidnerf_core.captures.cameras import as_given, at_stored_poses, stored_came
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.cli.bake import bake_map
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
-from bidnerf_core.cli.common import (
+from bidnerf_core.cli.folders import output_folder
+from bidnerf_core.cli.options import (
     DEFAULT_BACKEND,
     DataFolder,
     Device,
     Flag,
     UsageError,
     option,
-    output_folder,
     parse,
-    read_views,
     require,
-    say,
     value_of,
     wrong_usage,
 )
+from bidnerf_core.cli.output import read_views, say
 from bidnerf_core.cli.progress import CHECKPOINT_SECONDS, StoredTraining
 from bidnerf_core.cli.training_views import RefinementChoice, located, prepared
 from bidnerf_core.datasets import Background, Dataset, DepthRegistration, open_dataset
@@ -123,7 +122,7 @@ def run(arguments: list[str]) -> None:
             Flag, option(None, "leave the surface and the landmarks to 'bidnerf bake'", "")
         ] = False,
         model_points: SparseChoice = SparseChoice(),
-        config: Any = kind(),
+        config: Any = None,
     ) -> None:
         """Make a map of a dataset.
 
@@ -155,8 +154,7 @@ def run(arguments: list[str]) -> None:
             say(f"{out}: saved after step {stopped.step}; the same with --resume goes on from there")
             raise KeyboardInterrupt from stopped
 
-    train.__annotations__["config"] = kind
-    parse("train", train, arguments)
+    parse("train", train, arguments, kind())
 
 
 def train_map(

@@ -17,7 +17,7 @@ from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.captures.pose_conventions import other_convention
 from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.carving import has_outline
-from bidnerf_core.cli.common import say
+from bidnerf_core.cli.output import say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View

@@ -13,7 +13,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from bidnerf_core.cli.common import console, say
+from bidnerf_core.cli.output import console, say
 from bidnerf_core.cli.progress import LINE_EVERY, StoppableBar
 from bidnerf_core.evaluation.summary import succeeded
 from bidnerf_core.evaluation.trial import TrialResult

@@ -6,7 +6,6 @@ opened. Anything else that is not JSON raises an error that names the line, and 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 from collections.abc import Callable, Iterable
@@ -16,7 +15,7 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import open_binary, read_file, read_open_file, write_file
+from bidnerf_core.io.files import FileInUse, open_binary, read_file, read_open_file, take_lock, write_file
 
 LARGEST_LINES = 512 * 2**20
 """Bytes. A trial takes a few kilobytes, so this is enough for a hundred thousand trials."""
@@ -126,14 +125,9 @@ class JsonLinesFile:
             file = self.path.open("a+b")
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written ({error.strerror}), expected a file") from error
-        with contextlib.suppress(ImportError):  # Windows has no such locks
-            import fcntl
-
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                file.close()
-                raise InputError(f"{self.path}: another process is writing it; name another --out") from error
+        if not take_lock(file.fileno()):
+            file.close()
+            raise FileInUse(f"{self.path}: another process is writing it; name another --out")
         file.seek(0)
         return file
 

@@ -7,10 +7,15 @@ import os
 import re
 import secrets
 import stat
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from bidnerf_core.errors import InputError
+
+if sys.platform != "win32":
+    import fcntl
 
 LARGEST_TEXT = 128 * 2**20
 """Bytes. Parsed text takes ten times as much memory as its file, so the size is checked before the file is read."""
@@ -97,6 +102,41 @@ def write_file(path: Path, content: bytes) -> None:
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
     _sync_folder(path.parent)
+
+
+class FileInUse(InputError):
+    """Another process is writing the file, or into the folder."""
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock of a file or folder that exists. Raises ``FileInUse`` where another process holds it."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        if not take_lock(number):
+            raise FileInUse(
+                f"{path}: another bidnerf writes into it, expected another --out, or to wait for its end"
+            )
+        yield
+    finally:
+        os.close(number)
+
+
+def take_lock(number: int) -> bool:
+    """Lock the file of an open descriptor until it is closed; return False if another process holds the lock.
+
+    The system releases the lock even if the process is killed. On Windows, and on file systems without locks, nothing is
+    locked and the result is True.
+    """
+    if sys.platform == "win32":
+        return True
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        pass
+    return True
 
 
 def _sync_folder(folder: Path) -> None:
