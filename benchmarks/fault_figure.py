@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bidnerf_core.evaluation.plot_style import COLOURS, new_figure, styled
 from bidnerf_core.results.errors import success_rate
+from bidnerf_core.results.plot_style import COLOURS, new_figure, styled
 
 DRAWN = {
     "right": ("right", COLOURS[2]),

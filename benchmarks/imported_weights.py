@@ -28,7 +28,6 @@ from kornia.metrics import psnr
 from scipy.stats import binomtest
 
 from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.evaluation.figures import depth_to_rgb, tile
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
@@ -41,6 +40,7 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.maps.storage import Map, load_map
 from bidnerf_core.results.errors import CRITERIA
+from bidnerf_core.results.overlays import depth_to_rgb, tile
 from bidnerf_nerf_pytorch.command import main as import_command
 
 RESULTS = Path(__file__).parent / "results"

@@ -19,8 +19,8 @@ from typing import Any
 from confidence import assessed
 from faults import BOUND, within
 
-from bidnerf_core.evaluation.plot_style import COLOURS, new_figure, styled
 from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.results.plot_style import COLOURS, new_figure, styled
 
 RESULTS = Path(__file__).resolve().parent / "results"
 CRITERIA = {

@@ -11,19 +11,18 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.figures import (
+from bidnerf_core.evaluation.figures import convergence_plot, save_gif
+from bidnerf_core.results.errors import PoseError
+from bidnerf_core.results.overlays import (
     NO_DEPTH,
     as_picture,
     blend,
     chequered,
-    convergence_plot,
+    comparison,
     depth_to_rgb,
     edges,
-    overlay,
-    save_gif,
     tile,
 )
-from bidnerf_core.results.errors import PoseError
 
 
 def disc(column: float, size: int = 40) -> torch.Tensor:
@@ -46,7 +45,7 @@ def test_as_picture_takes_what_there_is() -> None:
 def test_what_is_not_finite_is_clipped() -> None:
     odd = torch.tensor([[[float("nan"), float("inf"), -float("inf")], [-1.0, 2.0, 0.5]]])
     assert as_picture(odd).tolist() == [[[0, 255, 0], [0, 255, 128]]]
-    assert overlay(*[torch.full((8, 8, 3), float("nan"))] * 3).dtype == np.uint8
+    assert comparison(*[torch.full((8, 8, 3), float("nan"))] * 3).dtype == np.uint8
 
 
 @pytest.mark.parametrize("shape", [(0, 4, 3), (4, 0, 3), (4, 4, 4), (4,), (2, 4, 4, 3), (0, 0)])
@@ -55,8 +54,8 @@ def test_what_is_no_image_is_refused(shape: tuple[int, ...]) -> None:
         as_picture(torch.zeros(shape))
 
 
-def test_overlay_is_six_tiles() -> None:
-    picture = overlay(disc(20), disc(10), disc(20))
+def test_a_comparison_is_six_tiles() -> None:
+    picture = comparison(disc(20), disc(10), disc(20))
     one = tile(disc(20), "a")
     assert picture.shape == (2 * one.shape[0], 3 * one.shape[1], 3)
     assert np.array_equal(picture[: one.shape[0], : one.shape[1]][30:], one[30:])  # below the caption
@@ -66,7 +65,7 @@ def test_overlay_is_six_tiles() -> None:
 
 def test_images_of_different_size_are_refused() -> None:
     with pytest.raises(InputError, match="30x30"):
-        overlay(disc(20), disc(10, 30), disc(20))
+        comparison(disc(20), disc(10, 30), disc(20))
     with pytest.raises(InputError, match="expected the same"):
         blend(disc(20), disc(20, 30))
     with pytest.raises(InputError, match="frame 1"):

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, InputError
-from bidnerf_core.evaluation.trajectory_plot import PlottedPath, plot_path
 from bidnerf_core.results.trajectory import (
     ErrorSummary,
     TrajectoryErrors,
@@ -19,6 +18,7 @@ from bidnerf_core.results.trajectory import (
     rigid_alignment,
     spans,
 )
+from bidnerf_core.results.trajectory_plot import PlottedPath, plot_path
 
 
 def walk(count: int = 40, seed: int = 0, noise: float = 0.0) -> SE3:

@@ -14,7 +14,6 @@ from torch import Tensor
 from bidnerf_core.cli.another_scene import question_about_scene
 from bidnerf_core.cli.options import UsageError
 from bidnerf_core.cli.output import print_json, say, show
-from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.queries import Query
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.trials import plain_localization
@@ -23,6 +22,7 @@ from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization
 from bidnerf_core.maps.storage import Map
 from bidnerf_core.results.errors import PoseError, pose_error
+from bidnerf_core.results.overlays import Painter
 from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage
 
 TRANSFORMS = "transforms.json"

@@ -18,7 +18,6 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.options import DEFAULT_BACKEND, LARGEST_SEED, Flag, UsageError, option, parse, require
 from bidnerf_core.cli.output import console, print_table, say, show
-from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.cli.progress import timed
 from bidnerf_core.cli.train import train_map
 from bidnerf_core.errors import InputError
@@ -31,6 +30,7 @@ from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.maps.storage import Map, load_map
 from bidnerf_core.registry import load_backend
 from bidnerf_core.results.errors import PoseError, pose_error
+from bidnerf_core.results.overlays import Painter
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit

@@ -47,10 +47,10 @@ def report(
     """
     from bidnerf_core.evaluation.groups import grouped
     from bidnerf_core.evaluation.page import UNFINISHED, page
-    from bidnerf_core.evaluation.plot_style import require_matplotlib
     from bidnerf_core.evaluation.provenance import read_runs
     from bidnerf_core.evaluation.results import read_results
     from bidnerf_core.io.files import write_file
+    from bidnerf_core.results.plot_style import require_matplotlib
 
     if not results:
         raise UsageError("no file of results, expected at least one that 'bidnerf evaluate' wrote")
@@ -105,9 +105,9 @@ def draw_figures(groups: Sequence[Group], folder: Path, criterion: str) -> list[
     """Write all figures of a report to ``folder`` and return them with their captions."""
     from bidnerf_core.evaluation.fault_figure import draw_faults
     from bidnerf_core.evaluation.page import Figure
-    from bidnerf_core.evaluation.plot_style import CRITERION_NAMES
     from bidnerf_core.evaluation.plots import Figures
     from bidnerf_core.evaluation.summary import applies
+    from bidnerf_core.results.plot_style import CRITERION_NAMES
 
     figures, success = Figures(groups, folder, criterion), CRITERION_NAMES[criterion]
     by_fault = draw_faults(groups, folder)

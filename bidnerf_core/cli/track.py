@@ -33,10 +33,10 @@ from bidnerf_core.cli.tracking_video import TrackingVideo, check_video
 from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, given_sensor, open_sequence
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.evaluation.plot_style import require_matplotlib
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Localizer, Tracker, TrackerConfig
+from bidnerf_core.results.plot_style import require_matplotlib
 
 TRIED = 3
 """Number of unreadable frames at the beginning of a sequence after which it is given up: probably none can be read."""

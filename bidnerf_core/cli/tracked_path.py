@@ -15,7 +15,6 @@ from bidnerf_core.captures.cameras import as_given
 from bidnerf_core.cli.options import UsageError
 from bidnerf_core.cli.output import say
 from bidnerf_core.errors import InputError, amount
-from bidnerf_core.evaluation.trajectory_plot import PlottedPath, plot_path
 from bidnerf_core.evaluation.trials import plain_localization
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
@@ -26,6 +25,7 @@ from bidnerf_core.maps.storage import MapInfo
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage, write_poses
 from bidnerf_core.results.trajectory import ErrorSummary, TrajectoryErrors, spans
+from bidnerf_core.results.trajectory_plot import PlottedPath, plot_path
 
 SAME_POSE = 1e-4
 """Difference of two poses' matrices (metres) that rounding in files may cause."""

@@ -12,12 +12,11 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from bidnerf_core.cli.pictures import Painter
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.figures import tile
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization import Localization
 from bidnerf_core.localization.problem import SceneMap
+from bidnerf_core.results.overlays import Painter, tile
 
 WRITTEN_SUFFIXES = (".mp4", ".mkv", ".webm")
 RATES = 1.0, 60.0

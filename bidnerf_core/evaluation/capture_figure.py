@@ -14,7 +14,7 @@ from torch import Tensor
 from bidnerf_core.captures.coverage import horizontal_axes
 from bidnerf_core.captures.report import CaptureReport, Gap, PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.plot_style import COLOURS, new_figure, styled
+from bidnerf_core.results.plot_style import COLOURS, new_figure, styled
 
 LOOKS: dict[PhotoProblem, tuple[str, str]] = {
     "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),

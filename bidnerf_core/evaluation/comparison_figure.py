@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from bidnerf_core.evaluation.comparison import Comparison, MapRow
-from bidnerf_core.evaluation.plot_style import (
+from bidnerf_core.evaluation.summary import seconds_to_success, usual_criterion
+from bidnerf_core.results.errors import CRITERIA
+from bidnerf_core.results.plot_style import (
     CRITERION_NAMES,
     SHORT_CRITERION_NAMES,
     line_look,
@@ -17,8 +19,6 @@ from bidnerf_core.evaluation.plot_style import (
     styled,
     write_figure,
 )
-from bidnerf_core.evaluation.summary import seconds_to_success, usual_criterion
-from bidnerf_core.results.errors import CRITERIA
 
 COSTS: dict[str, Callable[[MapRow], float]] = {
     "ms a step": lambda row: row.ms_per_step,

@@ -12,9 +12,9 @@ import numpy as np
 
 from bidnerf_core.evaluation.faults import NO_FAULT, find_fault, parse_faults
 from bidnerf_core.evaluation.groups import Group, Situation, situation_titles
-from bidnerf_core.evaluation.plot_style import COLOURS, new_figure, save_figure, styled
 from bidnerf_core.evaluation.summary import ABSOLUTE, Summary, summarize
 from bidnerf_core.results.errors import success_rate
+from bidnerf_core.results.plot_style import COLOURS, new_figure, save_figure, styled
 
 FIGURE_COLUMNS, FAULT_PANEL = 3, (3.6, 2.7)  # inches
 DRAWN_SHARES: dict[str, tuple[Callable[[Summary], int], str]] = {

@@ -1,4 +1,4 @@
-"""Pictures of poses and depth from plain arrays, as 8-bit images; only ``convergence_plot`` needs matplotlib."""
+"""Animations, and plots of convergence, which need matplotlib."""
 
 from __future__ import annotations
 
@@ -9,133 +9,14 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
-from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
-from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.plot_style import line_look, new_figure, styled, write_figure
 from bidnerf_core.io.files import write_file
 from bidnerf_core.results.errors import PoseError
-
-TILE = 240  # pixels: smaller images are enlarged to about this, so that captions fit
-CAPTION, GAP = 22, 6  # pixels
-INK, FRAME, PAPER = (30, 34, 42), (214, 216, 220), (255, 255, 255)
-OBSERVED_EDGES, RENDERED_EDGES = (0, 190, 110), (235, 0, 140)
-NO_DEPTH = (38, 38, 42)  # colour where no depth was measured
-
-# Turbo colour map (Mikhailov 2019), its author's polynomial of degree 5; rows: red, green, blue; columns: 1, x, x^2 ...
-TURBO = (
-    (0.13572138, 4.61539260, -42.66032258, 132.13108234, -152.94239396, 59.28637943),
-    (0.09140261, 2.19418839, 4.84296658, -14.18503333, 4.27729857, 2.82956604),
-    (0.10667330, 12.64194608, -60.58204836, 110.36276771, -89.90310912, 27.34824973),
-)
-
-
-def overlay(
-    observed: ArrayLike | Tensor,
-    start: ArrayLike | Tensor,
-    found: ArrayLike | Tensor,
-    captions: tuple[str, str, str] = ("observed", "rendered at the start", "rendered at the pose found"),
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Return one picture of the observed image, the rendering at the start and the rendering at the pose found.
-
-    Below each image is its comparison with the observed one. Images (h w 3) are as for ``as_picture``.
-    """
-    images = [as_picture(image, what) for image, what in zip((observed, start, found), captions, strict=True)]
-    _require_same_size(images, captions)
-    below = [chequered(images[0], images[2]), blend(images[0], images[1]), blend(images[0], images[2])]
-    notes = [
-        "observed / found, chequered",
-        "edges: photo green, start pink",
-        "edges: photo green, map pink",
-    ]
-    rows = [
-        np.concatenate([tile(image, caption) for image, caption in zip(row, text, strict=True)], axis=1)
-        for row, text in ((images, captions), (below, notes))
-    ]
-    return np.concatenate(rows, axis=0)
-
-
-def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarray, "h w 3"]:
-    """Return an image (h w 3) or (h w) of floats in [0, 1] as 8 bits, clipped; NaN becomes black."""
-    array = _array(image)
-    if array.ndim == 2:
-        array = np.repeat(array[..., None], 3, axis=-1)
-    if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
-        raise InputError(f"{what}: expected an image (height, width, 3), got shape {array.shape}")
-    if array.dtype == np.uint8:
-        return array
-    finite = np.nan_to_num(array.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
-    return (finite.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def depth_to_rgb(
-    depth: ArrayLike | Tensor, near: float | None = None, far: float | None = None
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return depth (h w, metres) in colours from red (near) to blue (far), dark where none was measured (0 or not finite).
-
-    ``near`` and ``far`` (metres) are the ends of the scale; by default the 1st and 99th percentile of the measured depth.
-    """
-    array = _array(depth).astype(np.float64)
-    if array.ndim != 2 or array.size == 0:
-        raise InputError(f"depth: expected an image (height, width), got shape {array.shape}")
-    measured = np.isfinite(array) & (array > 0)
-    if not measured.any():
-        return np.full((*array.shape, 3), NO_DEPTH, dtype=np.uint8)
-    low, high = np.percentile(array[measured], (1, 99))
-    low, high = low if near is None else near, high if far is None else far
-    share = ((np.where(measured, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
-    powers = (0.96 - 0.9 * share)[..., None] ** np.arange(6)  # the ends of the colour map are nearly black
-    return np.where(measured[..., None], as_picture(powers @ np.array(TURBO).T), np.array(NO_DEPTH, np.uint8))
-
-
-def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pale mean of two images, with the edges of each in its own colour; they coincide at the true pose."""
-    a, b = as_picture(observed, "observed"), as_picture(rendered, "rendered")
-    _require_same_size([a, b], ("observed", "rendered"))
-    mixed = 0.55 * (a / 2 + b / 2) + 0.45 * 255
-    for image, colour in ((b, RENDERED_EDGES), (a, OBSERVED_EDGES)):
-        strength = 0.9 * edges(image)[..., None]
-        mixed = mixed * (1 - strength) + strength * np.array(colour)
-    return mixed.clip(0, 255).astype(np.uint8)
-
-
-def chequered(
-    first: ArrayLike | Tensor, second: ArrayLike | Tensor, squares: int = 6
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a chequerboard of two images; contours continue across its squares at the true pose."""
-    a, b = as_picture(first, "first"), as_picture(second, "second")
-    _require_same_size([a, b], ("first", "second"))
-    side = max(1, math.ceil(max(a.shape[:2]) / squares))
-    rows, columns = np.indices(a.shape[:2]) // side
-    return np.where(((rows + columns) % 2 == 0)[..., None], a, b)
-
-
-def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
-    """Return the strength of edges, 0 to 1, scaled so that the strongest tenth stands out."""
-    grey = as_picture(image).astype(np.float64).mean(-1) / 255
-    padded = np.pad(grey, 1, mode="edge")
-    across, down = padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]
-    slope = np.hypot(across, down)
-    bar = max(np.quantile(slope, 0.9), 0.05)
-    return ((slope - 0.7 * bar) / (0.6 * bar)).clip(0, 1)
-
-
-def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the image on white, enlarged if it is small, with its caption above it."""
-    picture = Image.fromarray(as_picture(image))
-    scale = max(1, round(TILE / picture.width))
-    picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
-    canvas = Image.new("RGB", (picture.width + GAP, picture.height + CAPTION + GAP), PAPER)
-    draw = ImageDraw.Draw(canvas)
-    draw.text((GAP, 4), caption, fill=INK, font=ImageFont.load_default(13))
-    canvas.paste(picture, (GAP // 2, CAPTION))
-    draw.rectangle(
-        (GAP // 2 - 1, CAPTION - 1, GAP // 2 + picture.width, CAPTION + picture.height), outline=FRAME
-    )
-    return np.asarray(canvas)
+from bidnerf_core.results.overlays import as_array, as_picture, require_same_size
+from bidnerf_core.results.plot_style import line_look, new_figure, styled, write_figure
 
 
 def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
@@ -145,7 +26,7 @@ def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float 
     pictures = [as_picture(frame, f"frame {i}") for i, frame in enumerate(frames)]
     if not pictures:
         raise InputError(f"{path}: an animation of no frames")
-    _require_same_size(pictures, [f"frame {i}" for i in range(len(pictures))])
+    require_same_size(pictures, [f"frame {i}" for i in range(len(pictures))])
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     content = iio.imwrite("<bytes>", np.stack(pictures), extension=".gif", duration=1000 / fps, loop=0)
     write_file(Path(path), bytes(content))
@@ -172,23 +53,12 @@ def convergence_plot(path: str | Path, traces: Mapping[str, PoseError]) -> None:
         write_figure(figure, Path(path), dpi=130)
 
 
-def _array(values: ArrayLike | Tensor) -> np.ndarray:
-    return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
-
-
 def _draw_errors(axes: Any, errors: Mapping[str, Tensor], unit: str, bar: float) -> None:
     for place, (name, trace) in enumerate(errors.items()):
-        values = _array(trace).astype(np.float64).reshape(-1)
+        values = as_array(trace).astype(np.float64).reshape(-1)
         axes.plot(
             np.where(np.isfinite(values) & (values > 0), values, np.nan), label=name, **line_look(place)
         )
     axes.axhline(bar, color="0.6", linewidth=1, linestyle="--")
     axes.set(yscale="log", xlabel="step", ylabel=f"error in {unit}")
     axes.grid(which="both")
-
-
-def _require_same_size(images: Sequence[np.ndarray], names: Sequence[str]) -> None:
-    for image, name in zip(images, names, strict=True):
-        if image.shape != images[0].shape:
-            found, expected = (f"{x.shape[1]}x{x.shape[0]}" for x in (image, images[0]))
-            raise InputError(f"{name} is {found} pixels, {names[0]} is {expected}: expected the same")

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bidnerf_core.evaluation.groups import Group, Situation, situation_titles, situations
-from bidnerf_core.evaluation.plot_style import CRITERION_NAMES
 from bidnerf_core.evaluation.provenance import Provenance
 from bidnerf_core.evaluation.significance import PairTest, pairwise_tests
 from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summarize
 from bidnerf_core.results.errors import CRITERIA
+from bidnerf_core.results.plot_style import CRITERION_NAMES
 
 MARK = '<meta name="generator" content="bidnerf report">'
 """The mark of a page as a report, which a later report may replace."""

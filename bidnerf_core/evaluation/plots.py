@@ -13,7 +13,9 @@ from jaxtyping import Float
 
 from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.groups import Group, situation_titles, situations
-from bidnerf_core.evaluation.plot_style import (
+from bidnerf_core.evaluation.summary import NEVER, applies, steps_of, success_of
+from bidnerf_core.results.errors import CRITERIA
+from bidnerf_core.results.plot_style import (
     SHORT_CRITERION_NAMES,
     line_look,
     new_figure,
@@ -21,8 +23,6 @@ from bidnerf_core.evaluation.plot_style import (
     save_figure,
     styled,
 )
-from bidnerf_core.evaluation.summary import NEVER, applies, steps_of, success_of
-from bidnerf_core.results.errors import CRITERIA
 
 COLUMNS, PANEL = 3, (3.6, 2.7)  # inches
 DrawPanel = Callable[[Any, list[Group]], None]

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.devices import moved
-from bidnerf_core.evaluation.plot_style import new_figure, styled
 from bidnerf_core.geometry.arcs import mean_up
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.results.plot_style import new_figure, styled
 
 SURFELS = 12_000
 """Maximum number of surfels that are drawn."""

@@ -1,0 +1,201 @@
+"""Pictures of a localization: the photo beside the map as rendered from the pose found, as 8-bit images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy.typing import ArrayLike
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.rendering import render_image
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import reduced
+from bidnerf_core.localization import Localization
+from bidnerf_core.localization.problem import SceneMap
+
+PICTURE_SIDE = 240
+"""Maximum pixels on the longer side; larger photos are reduced, since each rendered pixel takes time."""
+TILE = 240  # pixels: smaller images are enlarged to about this, so that captions fit
+CAPTION, GAP = 22, 6  # pixels
+INK, FRAME, PAPER = (30, 34, 42), (214, 216, 220), (255, 255, 255)
+OBSERVED_EDGES, RENDERED_EDGES = (0, 190, 110), (235, 0, 140)
+NO_DEPTH = (38, 38, 42)  # colour where no depth was measured
+
+# Turbo colour map (Mikhailov 2019), its author's polynomial of degree 5; rows: red, green, blue; columns: 1, x, x^2 ...
+TURBO = (
+    (0.13572138, 4.61539260, -42.66032258, 132.13108234, -152.94239396, 59.28637943),
+    (0.09140261, 2.19418839, 4.84296658, -14.18503333, 4.27729857, 2.82956604),
+    (0.10667330, 12.64194608, -60.58204836, 110.36276771, -89.90310912, 27.34824973),
+)
+
+
+def overlay(
+    scene: SceneMap, frame: Frame, found: Localization | SE3, start: SE3 | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return one picture of a photo, the map as rendered from a pose, and both blended with the edges of each.
+
+    ``found`` is the answer for the photo, whose corrected intrinsics are used if it has any, or a pose ``T_world_camera``.
+    With a ``start``, the picture also shows the rendering from there. The photo is reduced to at most 240 pixels a side.
+    """
+    if isinstance(found, Localization):
+        frame, found = found.frame_as_taken(frame), found.T_world_camera
+    return Painter(scene, frame).overlay(start, found)
+
+
+class Painter:
+    """Draws overlays of one photo with renderings of a map."""
+
+    def __init__(self, map: SceneMap, frame: Frame) -> None:
+        scale = PICTURE_SIDE / max(frame.intrinsics.width, frame.intrinsics.height)
+        self._map = map
+        self._camera = frame.intrinsics if scale >= 1 else frame.intrinsics.scaled(scale)
+        size = (self._camera.width, self._camera.height)
+        self.observed: Float[Tensor, "h w 3"] = frame.rgb if scale >= 1 else reduced(frame.rgb, *size)
+
+    def rendered(self, T_world_camera: SE3) -> Float[Tensor, "h w 3"]:
+        """Render the map as the photo's camera would see it."""
+        return render_image(self._map.field, self._camera, T_world_camera, self._map.bounds).rgb
+
+    def blended(self, T_world_camera: SE3) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the photo blended with the rendering, with the edges of each."""
+        return blend(self.observed, self.rendered(T_world_camera))
+
+    def overlay(self, start: SE3 | None, found: SE3) -> UInt8[np.ndarray, "H W 3"]:
+        """Return the photo and renderings as one picture: ``comparison`` if there is a start, otherwise ``row``."""
+        if start is not None:
+            return comparison(self.observed, self.rendered(start), self.rendered(found))
+        return self.row(self.observed, "observed", found, "rendered at the pose found")
+
+    def row(
+        self, left: Float[Tensor, "h w 3"], left_caption: str, found: SE3, caption: str
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """Return an image, the rendering at the pose found, and its blend with the photo, side by side."""
+        rendered = self.rendered(found)
+        tiles: Sequence[tuple[object, str]] = (
+            (left, left_caption),
+            (rendered, caption),
+            (blend(self.observed, rendered), "edges: photo green, map pink"),
+        )
+        return np.concatenate([tile(image, text) for image, text in tiles], axis=1)  # type: ignore[arg-type]
+
+
+def comparison(
+    observed: ArrayLike | Tensor,
+    start: ArrayLike | Tensor,
+    found: ArrayLike | Tensor,
+    captions: tuple[str, str, str] = ("observed", "rendered at the start", "rendered at the pose found"),
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Return one picture of the observed image, the rendering at the start and the rendering at the pose found.
+
+    Below each image is its comparison with the observed one. Images (h w 3) are as for ``as_picture``.
+    """
+    images = [as_picture(image, what) for image, what in zip((observed, start, found), captions, strict=True)]
+    require_same_size(images, captions)
+    below = [chequered(images[0], images[2]), blend(images[0], images[1]), blend(images[0], images[2])]
+    notes = [
+        "observed / found, chequered",
+        "edges: photo green, start pink",
+        "edges: photo green, map pink",
+    ]
+    rows = [
+        np.concatenate([tile(image, caption) for image, caption in zip(row, text, strict=True)], axis=1)
+        for row, text in ((images, captions), (below, notes))
+    ]
+    return np.concatenate(rows, axis=0)
+
+
+def as_picture(image: ArrayLike | Tensor, what: str = "image") -> UInt8[np.ndarray, "h w 3"]:
+    """Return an image (h w 3) or (h w) of floats in [0, 1] as 8 bits, clipped; NaN becomes black."""
+    array = as_array(image)
+    if array.ndim == 2:
+        array = np.repeat(array[..., None], 3, axis=-1)
+    if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
+        raise InputError(f"{what}: expected an image (height, width, 3), got shape {array.shape}")
+    if array.dtype == np.uint8:
+        return array
+    finite = np.nan_to_num(array.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
+    return (finite.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def depth_to_rgb(
+    depth: ArrayLike | Tensor, near: float | None = None, far: float | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return depth (h w, metres) in colours from red (near) to blue (far), dark where none was measured (0 or not finite).
+
+    ``near`` and ``far`` (metres) are the ends of the scale; by default the 1st and 99th percentile of the measured depth.
+    """
+    array = as_array(depth).astype(np.float64)
+    if array.ndim != 2 or array.size == 0:
+        raise InputError(f"depth: expected an image (height, width), got shape {array.shape}")
+    measured = np.isfinite(array) & (array > 0)
+    if not measured.any():
+        return np.full((*array.shape, 3), NO_DEPTH, dtype=np.uint8)
+    low, high = np.percentile(array[measured], (1, 99))
+    low, high = low if near is None else near, high if far is None else far
+    share = ((np.where(measured, array, low) - low) / max(high - low, 1e-9)).clip(0, 1)
+    powers = (0.96 - 0.9 * share)[..., None] ** np.arange(6)  # the ends of the colour map are nearly black
+    return np.where(measured[..., None], as_picture(powers @ np.array(TURBO).T), np.array(NO_DEPTH, np.uint8))
+
+
+def blend(observed: ArrayLike | Tensor, rendered: ArrayLike | Tensor) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the pale mean of two images, with the edges of each in its own colour; they coincide at the true pose."""
+    a, b = as_picture(observed, "observed"), as_picture(rendered, "rendered")
+    require_same_size([a, b], ("observed", "rendered"))
+    mixed = 0.55 * (a / 2 + b / 2) + 0.45 * 255
+    for image, colour in ((b, RENDERED_EDGES), (a, OBSERVED_EDGES)):
+        strength = 0.9 * edges(image)[..., None]
+        mixed = mixed * (1 - strength) + strength * np.array(colour)
+    return mixed.clip(0, 255).astype(np.uint8)
+
+
+def chequered(
+    first: ArrayLike | Tensor, second: ArrayLike | Tensor, squares: int = 6
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a chequerboard of two images; contours continue across its squares at the true pose."""
+    a, b = as_picture(first, "first"), as_picture(second, "second")
+    require_same_size([a, b], ("first", "second"))
+    side = max(1, math.ceil(max(a.shape[:2]) / squares))
+    rows, columns = np.indices(a.shape[:2]) // side
+    return np.where(((rows + columns) % 2 == 0)[..., None], a, b)
+
+
+def edges(image: ArrayLike | Tensor) -> Float[np.ndarray, "h w"]:
+    """Return the strength of edges, 0 to 1, scaled so that the strongest tenth stands out."""
+    grey = as_picture(image).astype(np.float64).mean(-1) / 255
+    padded = np.pad(grey, 1, mode="edge")
+    across, down = padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]
+    slope = np.hypot(across, down)
+    bar = max(np.quantile(slope, 0.9), 0.05)
+    return ((slope - 0.7 * bar) / (0.6 * bar)).clip(0, 1)
+
+
+def tile(image: ArrayLike | Tensor, caption: str) -> UInt8[np.ndarray, "H W 3"]:
+    """Return the image on white, enlarged if it is small, with its caption above it."""
+    picture = Image.fromarray(as_picture(image))
+    scale = max(1, round(TILE / picture.width))
+    picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
+    canvas = Image.new("RGB", (picture.width + GAP, picture.height + CAPTION + GAP), PAPER)
+    draw = ImageDraw.Draw(canvas)
+    draw.text((GAP, 4), caption, fill=INK, font=ImageFont.load_default(13))
+    canvas.paste(picture, (GAP // 2, CAPTION))
+    draw.rectangle(
+        (GAP // 2 - 1, CAPTION - 1, GAP // 2 + picture.width, CAPTION + picture.height), outline=FRAME
+    )
+    return np.asarray(canvas)
+
+
+def as_array(values: ArrayLike | Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+
+
+def require_same_size(images: Sequence[np.ndarray], names: Sequence[str]) -> None:
+    for image, name in zip(images, names, strict=True):
+        if image.shape != images[0].shape:
+            found, expected = (f"{x.shape[1]}x{x.shape[0]}" for x in (image, images[0]))
+            raise InputError(f"{name} is {found} pixels, {names[0]} is {expected}: expected the same")
