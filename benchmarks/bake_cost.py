@@ -27,7 +27,7 @@ RESULTS = Path(__file__).parent / "results"
 MAIN = """
 import json, sys, time
 from bidnerf_core.cli import main
-from bidnerf_core.evaluation.memory import peak_memory_bytes
+from bidnerf_core.evaluation.trials import peak_memory_bytes
 
 status = main(sys.argv[1:])
 print(json.dumps([time.process_time(), peak_memory_bytes()]))

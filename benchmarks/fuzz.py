@@ -40,9 +40,14 @@ from safetensors import safe_open
 from bidnerf_core import registry
 from bidnerf_core.cli import main as bidnerf
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.memory import STATUS, forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.evaluation.trials import opened, opened_points
+from bidnerf_core.evaluation.trials import (
+    STATUS,
+    forget_peak_memory,
+    opened,
+    opened_points,
+    peak_memory_bytes,
+)
 from bidnerf_core.io.files import is_temporary
 
 RESULTS = Path(__file__).parent / "results"

@@ -34,9 +34,9 @@ from fuzz_cases import BAKED, QUICK, SMALL_FIELD, sound_folder
 from bidnerf_core import Localizer, load_map
 from bidnerf_core.cli import bake, evaluate, main, report, train  # noqa: F401  (before the first fork)
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.memory import STATUS
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.evaluation.trials import STATUS
 from bidnerf_core.io.files import is_temporary
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps.storage import load_info, save_map

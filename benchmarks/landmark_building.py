@@ -20,8 +20,8 @@ import cv2
 import torch
 
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.evaluation.trials import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.landmark_building import build_landmarks
 

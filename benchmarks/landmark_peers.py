@@ -45,9 +45,9 @@ from registration_tuning import as_pose
 
 from bidnerf_core import Map, load_map
 from bidnerf_core.datasets import Dataset, open_dataset
-from bidnerf_core.evaluation.fingerprint import views_digest
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.evaluation.trial import views_digest
 from bidnerf_core.frames.frame import View
 from bidnerf_core.results.errors import pose_error
 

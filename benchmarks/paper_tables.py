@@ -40,8 +40,7 @@ from bidnerf_core.evaluation.bench import (
 from bidnerf_core.evaluation.groups import Group, grouped
 from bidnerf_core.evaluation.provenance import note_run, provenance, script_command, write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.significance import pairwise_tests
-from bidnerf_core.evaluation.summary import summarize
+from bidnerf_core.evaluation.summary import pairwise_tests, summarize
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.localization import METHODS

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.fingerprint import views_digest
+from bidnerf_core.evaluation.trial import views_digest
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.io.files import write_file
 from bidnerf_core.mapping.view_pairs import likely_pairs

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation import parallel_inversion
-from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol, inerf_start
+from bidnerf_core.evaluation.protocols import PROTOCOLS, draw_starts, find_protocol, inerf_start
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.results.errors import pose_error
 
@@ -75,7 +74,7 @@ def test_parallel_draws_what_the_global_generator_of_numpy_does(frames: int) -> 
     np.random.seed(1234)
     chosen = np.random.choice(frames, 5)
     angles, moves = np.random.uniform(-15, 15, (5, 5, 3)), np.random.uniform(-0.25, 0.25, (5, 5, 3))
-    for ours, theirs in zip(parallel_inversion.draw_starts(frames), (chosen, angles, moves), strict=True):
+    for ours, theirs in zip(draw_starts(frames), (chosen, angles, moves), strict=True):
         assert np.array_equal(ours, theirs)
     cases = PROTOCOLS["parallel"].cases(frames, 25, 1234)
     assert cases == [(chosen[i // 5], 1234 + i) for i in range(25)]
@@ -83,7 +82,7 @@ def test_parallel_draws_what_the_global_generator_of_numpy_does(frames: int) -> 
 
 def test_parallel_turns_about_the_axes_of_the_world() -> None:
     """The rotation is scipy's: extrinsic x, then y the other way round, then z, about the camera's own centre."""
-    _, angles, moves = parallel_inversion.draw_starts(50)
+    _, angles, moves = draw_starts(50)
     for i in range(25):
         start = PROTOCOLS["parallel"].start(TRUE, (), 1234 + i, 50)
         assert start is not None
@@ -95,7 +94,7 @@ def test_parallel_turns_about_the_axes_of_the_world() -> None:
 
 def test_parallel_numbers_are_these() -> None:
     """The frames are drawn from the 200 of a NeRF-Synthetic test split."""
-    chosen, angles, moves = parallel_inversion.draw_starts(200)
+    chosen, angles, moves = draw_starts(200)
     assert chosen.tolist() == [47, 38, 53, 116, 152]
     assert angles[0, 0] == pytest.approx([8.140797565872, 10.820093141331, -10.480891031817], abs=1e-11)
     assert moves[4, 4] == pytest.approx([-0.059440863625, -0.084531898589, -0.119538273259], abs=1e-11)

@@ -21,8 +21,7 @@ from bidnerf_core.evaluation.groups import grouped, situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
 from bidnerf_core.evaluation.results import result_line
-from bidnerf_core.evaluation.significance import compare_pair, pairwise_tests
-from bidnerf_core.evaluation.summary import NEVER, median, steps_of, summarize
+from bidnerf_core.evaluation.summary import NEVER, compare_pair, median, pairwise_tests, steps_of, summarize
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.results.errors import success_rate
 

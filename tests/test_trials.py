@@ -15,9 +15,8 @@ import torch
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.trial import Trace, Trial, TrialResult
-from bidnerf_core.evaluation.trials import run_trial
+from bidnerf_core.evaluation.trials import forget_peak_memory, peak_memory_bytes, run_trial
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.results.errors import pose_error

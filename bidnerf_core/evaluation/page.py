@@ -10,8 +10,7 @@ from pathlib import Path
 
 from bidnerf_core.evaluation.groups import Group, Situation, situation_titles, situations
 from bidnerf_core.evaluation.provenance import Provenance
-from bidnerf_core.evaluation.significance import PairTest, pairwise_tests
-from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summarize
+from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, PairTest, Success, pairwise_tests, summarize
 from bidnerf_core.results.errors import CRITERIA
 from bidnerf_core.results.plot_style import CRITERION_NAMES
 

@@ -1,20 +1,28 @@
-"""A trial and its result as plain data: the inputs, and one line of a results file."""
+"""A trial and its result as plain data: the inputs with their digests, and one line of a results file."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
+from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.evaluation.fingerprint import InputDigests
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.results.errors import PoseError
 from bidnerf_core.scenes.closed_form_data import is_closed_form
 
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
+DIGEST_BYTES = 16  # enough that no two inputs share one by chance
 LARGEST_COUNT = 2**63 - 1
 """The largest count. JSON can hold integers that no tensor or float can."""
 
@@ -81,6 +89,15 @@ class Trace:
 
 
 @dataclass(frozen=True)
+class InputDigests:
+    """Digests of the content of a trial's input. Folders may move, and machines may differ; content may not."""
+
+    views: str  # images, depth, intrinsics and true poses of the frames, in hexadecimal
+    points: str | None = None  # files of the COLMAP model that depth points were taken from
+    surface: str | None = None  # file name of the map's baked surface, which is new with every baking
+
+
+@dataclass(frozen=True)
 class TrialResult:
     """One line of results: what ``bidnerf localize --json`` prints, and everything that a report needs.
 
@@ -123,3 +140,41 @@ def _name(folder: str) -> str:
 
 def _parts(folder: str) -> tuple[str, ...]:
     return Path(folder).resolve().parts[1:]
+
+
+def views_digest(views: Sequence[View]) -> str:
+    """Return the digest of the images, depth, alpha, intrinsics and poses of ``views``; it depends on their order."""
+    hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    for view in views:
+        frame = view.frame
+        camera = json.dumps(to_plain(frame.intrinsics), sort_keys=True)
+        hashed.update(f"{frame.name}\n{camera}\n".encode(errors="surrogatepass"))
+        for image in (frame.rgb, frame.depth, frame.alpha, view.T_ref_camera.matrix()):
+            _add_tensor(hashed, image)
+    return hashed.hexdigest()
+
+
+@lru_cache(maxsize=4)
+def folder_digest(folder: str) -> str:
+    """Return the digest of the names and contents of the files that lie directly in ``folder``.
+
+    Raises ``InputError`` where one of them cannot be read.
+    """
+    hashed = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    try:
+        for path in sorted(path for path in Path(folder).iterdir() if path.is_file()):
+            with path.open("rb") as file:
+                content = hashlib.file_digest(file, "blake2b").digest()
+            hashed.update(path.name.encode(errors="surrogateescape") + b"\n" + content)
+    except OSError as error:
+        raise InputError(f"{error.filename or folder}: cannot be read ({error.strerror})") from error
+    return hashed.hexdigest()
+
+
+def _add_tensor(hashed: hashlib.blake2b, tensor: Tensor | None) -> None:
+    if tensor is None:
+        hashed.update(b"none\n")
+        return
+    array = tensor.detach().cpu().contiguous().numpy()
+    hashed.update(f"{array.dtype} {array.shape}\n".encode())
+    hashed.update(array.tobytes())

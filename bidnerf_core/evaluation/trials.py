@@ -6,13 +6,16 @@ and on any machine; two runs of the same trial differ only in ``seconds`` and ``
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import sys
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from bidnerf_core.datasets import Dataset, open_dataset
@@ -20,10 +23,15 @@ from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.devices import one_thread, working_device
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.evaluation.fingerprint import InputDigests, folder_digest, views_digest
-from bidnerf_core.evaluation.memory import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.evaluation.protocols import find_protocol
-from bidnerf_core.evaluation.trial import ScalarPoseError, Trial, TrialResult
+from bidnerf_core.evaluation.trial import (
+    InputDigests,
+    ScalarPoseError,
+    Trial,
+    TrialResult,
+    folder_digest,
+    views_digest,
+)
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.serialization import from_plain, to_plain
@@ -32,6 +40,8 @@ from bidnerf_core.maps.storage import Map, MapInfo, cameras_of, load_info, load_
 from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat
+
+STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def run_trial(trial: Trial) -> TrialResult:
@@ -160,3 +170,30 @@ def _scalars(error: PoseError) -> ScalarPoseError | None:
 
 def _finite(values: Tensor) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
+
+
+def forget_peak_memory() -> None:
+    """Reset the peak where the system supports it; elsewhere it remains the peak since the process began."""
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats()
+    with contextlib.suppress(OSError):
+        RESET.write_text("5")  # proc(5): resets the peak resident set to the present one
+
+
+def peak_memory_bytes() -> int:
+    """Return the peak memory of the GPU where one is in use, else the peak resident memory of this process."""
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        return int(torch.cuda.max_memory_allocated())
+    with contextlib.suppress(OSError):
+        for line in STATUS.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return _peak_since_start()
+
+
+def _peak_since_start() -> int:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
