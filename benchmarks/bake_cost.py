@@ -20,7 +20,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.maps.storage import load_info, load_map
+from bidnerf_core.maps.description import load_info
+from bidnerf_core.maps.map import load_map
 
 RESULTS = Path(__file__).parent / "results"
 # The child measures itself: the child's peak as reported to the parent includes the parent's own.

@@ -39,7 +39,8 @@ from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import STATUS
 from bidnerf_core.io.files import is_temporary
 from bidnerf_core.localization import settings_of
-from bidnerf_core.maps.storage import load_info, save_map
+from bidnerf_core.maps.description import load_info
+from bidnerf_core.maps.files import save_map
 from bidnerf_core.results.plot_style import require_matplotlib
 from bidnerf_core.training import TrainingState
 

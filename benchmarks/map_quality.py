@@ -43,7 +43,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.maps.storage import Map, load_map
+from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.training import fitted_colours
 
 LEAST_LANDMARKS = 30

@@ -56,7 +56,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.localization import Localizer
-from bidnerf_core.maps.storage import Map
+from bidnerf_core.maps.map import Map
 from bidnerf_core.results.errors import CRITERIA, pose_error, success_rate
 
 RESULTS = Path(__file__).parent / "results"

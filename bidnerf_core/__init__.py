@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from bidnerf_core.localization import Tracker as Tracker
     from bidnerf_core.localization import TrackerConfig as TrackerConfig
     from bidnerf_core.localization import settings_of as settings_of
-    from bidnerf_core.maps.storage import Map as Map
-    from bidnerf_core.maps.storage import load_map as load_map
+    from bidnerf_core.maps.map import Map as Map
+    from bidnerf_core.maps.map import load_map as load_map
     from bidnerf_core.progress import Progress as Progress
     from bidnerf_core.progress import ProgressCallback as ProgressCallback
     from bidnerf_core.registry import list_backends as list_backends
@@ -72,7 +72,7 @@ HOMES = {
     "Intrinsics": "camera.intrinsics",
     "Localization": "localization",
     "Localizer": "localization",
-    "Map": "maps.storage",
+    "Map": "maps.map",
     "Observations": "fields.observations",
     "Outcome": "localization",
     "PoseError": "results.errors",
@@ -90,7 +90,7 @@ HOMES = {
     "levels": "fields.contract",
     "list_backends": "registry",
     "load_backend": "registry",
-    "load_map": "maps.storage",
+    "load_map": "maps.map",
     "open_dataset": "datasets",
     "open_sequence": "datasets",
     "perturb": "evaluation.protocols",

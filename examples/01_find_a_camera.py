@@ -9,7 +9,7 @@ import dataclasses
 from bidnerf_core import Intrinsics, Localizer, Map, load_backend
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.localization import settings_of
-from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object, orbit, views
 from bidnerf_core.training import Silent

@@ -16,7 +16,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import settings_of
-from bidnerf_core.maps.storage import MapInfo, save_map
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.files import save_map
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object, orbit, views
 from bidnerf_core.training import Silent, TrainingState

@@ -20,7 +20,7 @@ from bidnerf_core.fields.contract import FieldValues, device_of
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.localization import settings_of
-from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object, orbit, views
 from bidnerf_core.training import RayBank, Silent, StepOutcome, fit, supervised_loss

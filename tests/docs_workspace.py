@@ -20,7 +20,8 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.maps.storage import MapInfo, save_map, save_surface
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.files import save_map, save_surface
 from bidnerf_core.registry import load_backend
 from bidnerf_core.scenes.closed_form import views as views_of
 from bidnerf_core.scenes.demo import demo_object

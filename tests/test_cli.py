@@ -28,7 +28,8 @@ import tiny
 from bidnerf_core.cli import COMMANDS, main, progress
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
-from bidnerf_core.maps.storage import MapInfo, load_info, load_map
+from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.map import load_map
 from bidnerf_core.registry import list_backends, load_backend
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training import Progress

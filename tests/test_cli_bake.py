@@ -22,7 +22,9 @@ from bidnerf_core.cli.output import read_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
-from bidnerf_core.maps.storage import Map, load_info, load_map, save_capture
+from bidnerf_core.maps.description import load_info
+from bidnerf_core.maps.files import save_capture
+from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid

@@ -14,7 +14,7 @@ from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.groups import grouped
 from bidnerf_core.evaluation.results import read_results
-from bidnerf_core.maps.storage import load_info
+from bidnerf_core.maps.description import load_info
 from bidnerf_core.training import Progress
 from commands import CommandResult, Run
 from tiny import backends_listed_once  # noqa: F401

@@ -23,7 +23,7 @@ from bidnerf_core.cli.help_page import without_expert_settings
 from bidnerf_core.cli.options import parse
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import printable
-from bidnerf_core.maps.storage import load_info
+from bidnerf_core.maps.description import load_info
 from bidnerf_core.settings import EXPERT, Settings
 from commands import Run
 from tiny import backends_listed_once  # noqa: F401

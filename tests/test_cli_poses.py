@@ -19,8 +19,8 @@ from bidnerf_core.cli import training_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
-from bidnerf_core.maps.parts import load_capture
-from bidnerf_core.maps.storage import cameras_of, load_info
+from bidnerf_core.maps.description import cameras_of, load_info
+from bidnerf_core.maps.files import load_capture
 from commands import Run
 from landmark_scene import Points, ring
 from test_cli import assert_same_map, stop_at

@@ -23,7 +23,7 @@ from bidnerf_core.captures.cameras import StoredCamera, stored_cameras
 from bidnerf_core.cli.following import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.datasets.trajectories import read_trajectory
-from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.maps.description import MapInfo
 from commands import Run
 from flights import covered, flight
 from textured_field import CAMERA, MapWithLandmarks, textured_map

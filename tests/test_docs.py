@@ -31,7 +31,7 @@ from bidnerf_core.localization import METHODS, AutoConfig, settings_of
 from bidnerf_core.localization.auto import auto
 from bidnerf_core.localization.by_colour import ByColourConfig, ColourRefinementSettings
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training import Silent

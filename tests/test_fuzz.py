@@ -37,8 +37,9 @@ from bidnerf_core.io.files import read_file
 from bidnerf_core.io.images import read_image
 from bidnerf_core.io.records import read_record
 from bidnerf_core.io.serialization import to_plain
-from bidnerf_core.maps.storage import MapInfo, load_info, save_map
-from bidnerf_core.maps.storage import load_map as load
+from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.files import save_map
+from bidnerf_core.maps.map import load_map as load
 from bidnerf_core.maps.tensors import read_tensors
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend

@@ -14,7 +14,7 @@ import pytest
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.io.files import FileInUse, is_temporary, locked, temporary, write_file
-from bidnerf_core.maps.storage import load_map
+from bidnerf_core.maps.map import load_map
 from bidnerf_core.results.plot_style import new_figure, save_figure
 from commands import Run
 from tiny import backends_listed_once  # noqa: F401

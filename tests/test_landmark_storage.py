@@ -18,7 +18,9 @@ from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.maps.storage import MapInfo, load_info, load_map, save_landmarks, save_map, save_surface
+from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.files import save_landmarks, save_map, save_surface
+from bidnerf_core.maps.map import load_map
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend

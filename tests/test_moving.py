@@ -22,7 +22,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from problems import FieldMap

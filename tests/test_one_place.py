@@ -14,7 +14,7 @@ from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.cli.train import train_map
 from bidnerf_core.localization.direction_only import direction_only, has_distances
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
-from bidnerf_core.maps.storage import load_info
+from bidnerf_core.maps.description import load_info
 from bidnerf_hashgrid import backend as hashgrid
 from landmark_scene import Points, looking_in, ring
 from textured_field import MapWithLandmarks, textured_map, unseen

@@ -16,7 +16,8 @@ from bidnerf_core import Frame, Intrinsics, Localizer
 from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.maps.storage import Map, MapInfo
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.map import Map
 from bidnerf_core.results.errors import pose_error
 from commands import Run
 from textured_field import BOUNDS, CAMERA, textured_map, unseen

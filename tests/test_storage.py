@@ -25,15 +25,11 @@ from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
-from bidnerf_core.maps import storage
-from bidnerf_core.maps.storage import (
-    MapInfo,
-    load_info,
-    load_map,
-    load_state,
-    save_map,
-    save_surface,
-)
+from bidnerf_core.maps import files
+from bidnerf_core.maps import map as map_module
+from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.files import load_state, save_map, save_surface
+from bidnerf_core.maps.map import load_map
 from bidnerf_core.registry import load_backend
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.training import TrainingState
@@ -205,7 +201,7 @@ def test_a_save_that_stops_anywhere_leaves_a_whole_map(
         folder.mkdir()
         if before:
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(storage, "write_file", _written)  # not counted
+                patch.setattr(files, "write_file", _written)  # not counted
                 save_map(folder, info(step=5), state(5))
         save_map(folder, info(step=6, complete=complete), state(6))
 
@@ -242,7 +238,7 @@ def test_a_map_that_a_training_replaces_while_it_is_read(
 ) -> None:
     """Between the description and the weights, the next checkpoint comes."""
     save_map(tmp_path, info(step=5), state(5))
-    read = storage.read_tensors
+    read = map_module.read_tensors
     pending = [lambda: save_map(tmp_path, info(step=6), state(6))]
 
     def late(path: Path) -> dict[str, Tensor]:
@@ -250,7 +246,7 @@ def test_a_map_that_a_training_replaces_while_it_is_read(
             pending.pop()()
         return read(path)
 
-    monkeypatch.setattr(storage, "read_tensors", late)
+    monkeypatch.setattr(map_module, "read_tensors", late)
     loaded = load_map(tmp_path)
     assert loaded.info.step == 6
     assert isinstance(loaded.field, nn.Module)

@@ -20,7 +20,9 @@ from bidnerf_core.fields.sampling import Importance, OccupiedOnly, Stratified
 from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_core.frames.frame import View
 from bidnerf_core.io.serialization import from_plain, to_plain
-from bidnerf_core.maps.storage import MapInfo, load_map, save_map
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.files import save_map
+from bidnerf_core.maps.map import load_map
 from bidnerf_core.testing import BackendContract
 from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, SIDE, points, rgb_views, rgbd_views

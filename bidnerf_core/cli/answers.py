@@ -20,7 +20,7 @@ from bidnerf_core.evaluation.trials import plain_localization
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization
-from bidnerf_core.maps.storage import Map
+from bidnerf_core.maps.map import Map
 from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.results.overlays import Painter
 from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage

@@ -29,18 +29,9 @@ from bidnerf_core.mapping.keyframes import Camera, colour_noise, rendered_views
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
 from bidnerf_core.mapping.landmarks import HeldOutTrial
 from bidnerf_core.mapping.pose_scatter import update_scatter
-from bidnerf_core.maps.parts import load_landmarks
-from bidnerf_core.maps.storage import (
-    LandmarkSource,
-    Map,
-    MapInfo,
-    cameras_of,
-    load_info,
-    load_map,
-    save_capture,
-    save_landmarks,
-    save_surface,
-)
+from bidnerf_core.maps.description import LandmarkSource, MapInfo, cameras_of, load_info
+from bidnerf_core.maps.files import load_landmarks, save_capture, save_landmarks, save_surface
+from bidnerf_core.maps.map import Map, load_map
 
 UNLIKE, UNLIKE_ITS_OWN, UNLIKE_ANY = 0.2, 2.0, 0.3
 """Least difference (RMS) between rendered and photographed colours in another scene: as such, and as a multiple of that between

@@ -36,7 +36,7 @@ from bidnerf_core.evaluation.trial_process import Measured
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.localization import METHODS
-from bidnerf_core.maps.storage import load_info
+from bidnerf_core.maps.description import load_info
 from bidnerf_core.results.errors import CRITERIA
 from bidnerf_core.scenes.closed_form_data import is_closed_form
 

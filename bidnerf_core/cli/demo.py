@@ -27,7 +27,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.maps.storage import Map, load_map
+from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.registry import load_backend
 from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.results.overlays import Painter

@@ -45,7 +45,8 @@ def _check_free(out: Path, overwrite: bool) -> None:
 
 def _is_leftover(file: Path) -> bool:
     """Return whether the file was left behind by a process that was killed before the map was complete."""
-    from bidnerf_core.maps.storage import DESCRIPTION, OURS
+    from bidnerf_core.maps.description import DESCRIPTION
+    from bidnerf_core.maps.files import OURS
 
     of_map = OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
     return of_map or is_temporary(file.name)

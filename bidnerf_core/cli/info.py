@@ -17,8 +17,8 @@ from bidnerf_core.fields.contract import SceneBounds, levels
 from bidnerf_core.io.serialization import to_plain
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.surface_map import SurfaceMap
-from bidnerf_core.maps.parts import load_capture
-from bidnerf_core.maps.storage import Map, load_map
+from bidnerf_core.maps.files import load_capture
+from bidnerf_core.maps.map import Map, load_map
 
 
 def run(arguments: list[str]) -> None:

@@ -38,7 +38,7 @@ from bidnerf_core.evaluation.trials import places_of
 from bidnerf_core.localization import METHODS, AutoConfig, Localizer
 from bidnerf_core.localization.methods import require_use_of_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.maps.storage import Map
+from bidnerf_core.maps.map import Map
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from bidnerf_core.cli.output import say
 from bidnerf_core.errors import InputError
-from bidnerf_core.maps.storage import Map, load_info, load_map
+from bidnerf_core.maps.description import load_info
+from bidnerf_core.maps.map import Map, load_map
 
 
 def opened_map(folder: Path) -> Map:

@@ -27,7 +27,8 @@ from torch import nn
 
 from bidnerf_core.cli.output import console, say
 from bidnerf_core.fields.contract import RadianceField
-from bidnerf_core.maps.storage import MapInfo, save_map
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.files import save_map
 from bidnerf_core.training import Progress as TrainingProgress
 from bidnerf_core.training import TrainingState
 

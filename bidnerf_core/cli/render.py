@@ -24,7 +24,7 @@ from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
 from bidnerf_core.fields.rendering import RenderedImage, render_image
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.io.files import write_file
-from bidnerf_core.maps.storage import Map
+from bidnerf_core.maps.map import Map
 
 DEEPEST = 65.535  # metres that a 16-bit image of millimetres can hold
 

@@ -21,7 +21,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.maps.storage import MapInfo
+from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage, write_poses
 from bidnerf_core.results.trajectory import ErrorSummary, TrajectoryErrors, spans

@@ -39,7 +39,9 @@ from bidnerf_core.io.images import background_colour
 from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.mapping.landmark_building import TrackedViews
-from bidnerf_core.maps.storage import MapInfo, build_field, load_info, load_state
+from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.files import load_state
+from bidnerf_core.maps.map import build_field
 from bidnerf_core.registry import load_backend
 from bidnerf_core.settings import to_flat
 from bidnerf_core.training import TrainingStopped

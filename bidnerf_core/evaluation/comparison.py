@@ -15,7 +15,7 @@ from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.evaluation.summary import Success, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trial_process import Measured, TrialProcess
-from bidnerf_core.maps.storage import DESCRIPTION, load_info
+from bidnerf_core.maps.description import DESCRIPTION, load_info
 from bidnerf_core.scenes.closed_form_data import closed_form_data, is_closed_form
 
 ProgressCallback: TypeAlias = Callable[[int, int, Measured], None]

@@ -36,7 +36,8 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.serialization import from_plain, to_plain
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.maps.storage import Map, MapInfo, cameras_of, load_info, load_map
+from bidnerf_core.maps.description import MapInfo, cameras_of, load_info
+from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat

@@ -1,0 +1,83 @@
+"""The description of a map: the content of its ``map.json``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.captures.cameras import PoseRefinement, StoredCamera
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import read_file
+from bidnerf_core.io.serialization import from_plain
+
+FORMAT = "bidnerf map"
+VERSION = 1
+DESCRIPTION = "map.json"
+
+LandmarkSource = Literal["photos", "rendered images"]
+
+
+@dataclass(frozen=True)
+class MapInfo:
+    """The content of ``map.json``."""
+
+    backend: str
+    config: dict[str, Any]
+    bounds: SceneBounds
+    step: int  # training steps done
+    complete: bool  # whether training has finished
+    data: str = ""  # name of the dataset's folder
+    seconds: float = 0.0  # of training
+    cameras: tuple[StoredCamera, ...] = ()
+    pose_refinement: PoseRefinement | None = None  # of the cameras; None if nothing is known
+    distances: bool = True  # False if all images are from one place, so that they do not determine distances
+    sparse_depth: int = 0  # number of training pixels whose depth came from structure from motion
+    weights: str = ""  # file names
+    training: str | None = None  # state that resuming needs; dropped when training is complete
+    surface: str | None = None  # baked from these weights
+    landmarks: str | None = None
+    landmark_source: LandmarkSource | None = None  # the images they were built from, where that is recorded
+    capture: str | None = None  # record of the photos that gave the landmarks
+    colour_noise: float | None = None  # root mean square error of rendered colours on training images
+    bidnerf: str = field(default_factory=lambda: version("bidnerf"))
+    format: str = FORMAT
+    version: int = VERSION
+
+
+def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
+    """Return the cameras of the training images with their ``T_world_camera`` (float64)."""
+    return [(c.intrinsics, c.pose) for c in info.cameras]
+
+
+def load_info(folder: Path) -> MapInfo:
+    """Return the content of ``map.json``, checked. Raises ``InputError`` where it does not describe a map of this version."""
+    path = folder / DESCRIPTION
+    if not folder.is_dir():
+        what = "is a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: {what}, expected a map: a folder as written by 'bidnerf train'")
+    if not path.exists():
+        raise InputError(f"{folder}: no {DESCRIPTION} in it, expected a map as written by 'bidnerf train'")
+    content = read_file(path, "the description of a map")
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON ({error}), expected the description of a map") from error
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise InputError(f'{path}: not the description of a map, expected "format": "{FORMAT}"')
+    if found.get("version") != VERSION:
+        newer = isinstance(found.get("version"), int) and found["version"] > VERSION
+        advice = "it was written by a newer bidnerf, update yours" if newer else "train the map anew"
+        raise InputError(f"{path}: version {found.get('version')!r}, expected {VERSION}; {advice}")
+    info = from_plain(MapInfo, found, str(path))
+    for name in (info.weights, info.training, info.surface, info.landmarks, info.capture):
+        if name is not None and (not name or Path(name).name != name):
+            raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
+    for name in (camera.name for camera in info.cameras if not camera.is_rigid):
+        raise InputError(f"{path}: pose of camera {name!r} is not a rigid transform, expected 4x4 rows")
+    return info
