@@ -42,7 +42,7 @@ from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trial import views_digest
 from bidnerf_core.evaluation.trials import parse_settings
 from bidnerf_core.frames.frame import View
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import normalized_error_squared, pose_error, success_rate
 
 RESULTS = Path(__file__).resolve().parent / "results"

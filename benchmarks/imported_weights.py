@@ -37,7 +37,7 @@ from bidnerf_core.evaluation.trials import run_trial
 from bidnerf_core.fields.contract import levels
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.errors import CRITERIA
 from bidnerf_core.results.overlays import depth_to_rgb, tile

@@ -32,7 +32,7 @@ from bidnerf_core.evaluation.summary import median, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import normalized_error_squared, success_rate
 
 RESULTS = Path(__file__).parent / "results"

@@ -22,7 +22,7 @@ from bidnerf_core import Localizer, Map
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.io.serialization import from_plain
+from bidnerf_core.io.json import from_plain
 
 LIBRARIES = {
     "pycolmap": "pycolmap", "kiss_matcher": "kiss-matcher", "small_gicp": "small_gicp",

@@ -54,7 +54,7 @@ from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.localization import Localizer
 from bidnerf_core.maps.map import Map
 from bidnerf_core.results.errors import CRITERIA, pose_error, success_rate

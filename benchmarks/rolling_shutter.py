@@ -29,7 +29,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults.camera import rolling_shutter
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.frames.frame import View
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher

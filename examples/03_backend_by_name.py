@@ -14,7 +14,7 @@ from pathlib import Path
 from bidnerf_core import Intrinsics, Localizer, list_backends, load_backend, load_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.files import save_map

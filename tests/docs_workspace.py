@@ -17,7 +17,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.frames.frame import View
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.maps.description import MapInfo

@@ -303,7 +303,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda path: path.write_text("1 PINHOLE 4 3 1 1 2 2\n2 PINHOLE 4 3 2 1 2 2\n"),
         "holds 2 cameras, expected one",
     ),
-    "broken JSON": (lambda path: path.write_text("{,"), "broken JSON at line 1"),
+    "broken JSON": (lambda path: path.write_text("{,"), "not JSON"),
     "JSON list": (lambda path: path.write_text("[]"), "holds [], expected a JSON object"),
     "no focal length": (lambda path: path.write_text("{}"), "no focal length, expected fl_x"),
     "is_fisheye": (

@@ -170,7 +170,10 @@ BAD_DATA: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "broken JSON": (
         lambda folder: (folder / "transforms.json").write_text('{"frames": [') and None,
-        ("transforms.json: broken JSON at line 1",),
+        (
+            "transforms.json: not JSON",
+            "at line 1",
+        ),
     ),
     "a list": (
         lambda folder: (folder / "transforms.json").write_text("[]") and None,

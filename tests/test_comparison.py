@@ -25,7 +25,7 @@ from bidnerf_core.evaluation.summary import seconds_to_success, success_of
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trial_process import Measured, TrialProcess, samples_per_ray
 from bidnerf_core.evaluation.trials import run_trial
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, to_plain
 
 QUICK = json.dumps({"rays": 32, "max_steps": 3})
 

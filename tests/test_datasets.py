@@ -445,11 +445,11 @@ def test_unknown_split_and_frame(blender: Path) -> None:
 
 
 BAD_TEXT = {
-    '{"frames": [}': "transforms.json: broken JSON at line 1, column 13",
-    '{\n"fl_x": 1,,\n}': "broken JSON at line 2, column 11",
-    "": "broken JSON at line 1, column 1",
+    '{"frames": [}': "transforms.json: not JSON (Expecting value at line 1, column 13)",
+    '{\n"fl_x": 1,,\n}': "at line 2, column 11)",
+    "": "(Expecting value at line 1, column 1)",
     "[1, 2]": "transforms.json: holds [1, 2], expected a JSON object",
-    "[" * 100_000: "not readable as JSON",
+    "[" * 100_000: "not JSON (maximum recursion depth",
 }
 
 
@@ -461,7 +461,7 @@ def test_bad_json(tmp_path: Path, text: str, expected: str) -> None:
 
 def test_json_of_another_encoding(tmp_path: Path, nerfstudio: Callable[..., Path]) -> None:
     (tmp_path / "transforms.json").write_bytes(b'{"a": "\xff\xfe"}')
-    assert "not readable as JSON (UnicodeDecodeError" in message(tmp_path)
+    assert "not JSON (" in message(tmp_path)
     folder = nerfstudio()
     text = (folder / "transforms.json").read_text()
     (folder / "transforms.json").write_text(text, encoding="utf-8-sig")  # some editors put a mark in front

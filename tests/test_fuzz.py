@@ -32,15 +32,13 @@ from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.depth.images import read_depth_image
 from bidnerf_core.errors import InputError, printable
 from bidnerf_core.evaluation.results import read_results
-from bidnerf_core.io.arrays import read_archive, read_array
 from bidnerf_core.io.files import read_file
 from bidnerf_core.io.images import read_image
-from bidnerf_core.io.records import read_record
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import read_record, to_plain
+from bidnerf_core.io.tensors import read_archive, read_array, read_tensors
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.files import save_map
 from bidnerf_core.maps.map import load_map as load
-from bidnerf_core.maps.tensors import read_tensors
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from commands import Run
@@ -300,7 +298,7 @@ def test_arrays_come_back_as_they_were(tmp_path: Path) -> None:
 def test_an_archive_that_unpacks_to_more_than_an_image_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.io.arrays.LARGEST_ARRAY", 10**6)
+    monkeypatch.setattr("bidnerf_core.io.tensors.LARGEST_ARRAY", 10**6)
     np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**5, 3)))
     with pytest.raises(InputError, match=r"points\.npy has 2 MiB"):
         read_depth_points(tmp_path / "a.npz")

@@ -14,7 +14,7 @@ import baked
 import tiny
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import write_file
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap

@@ -19,7 +19,7 @@ import tiny
 from bidnerf_core import Localizer, Map, load_backend
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.description import MapInfo

@@ -301,7 +301,7 @@ def test_a_damaged_side_file_is_named(
     file = write(tmp_path / "r.jsonl", *results)
     (tmp_path / "r.meta.json").write_text(json.dumps({"runs": 3}))
     assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
-    assert "no list of runs" in capsys.readouterr().err
+    assert "runs is 3, expected a list" in capsys.readouterr().err
 
 
 def test_a_recorded_command_has_no_local_paths(monkeypatch: pytest.MonkeyPatch) -> None:

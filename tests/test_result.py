@@ -13,7 +13,7 @@ import torch
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.serialization import from_plain
+from bidnerf_core.io.json import from_plain
 from bidnerf_core.localization import Localization, Outcome, pose_from_matrix
 from bidnerf_core.localization.result import Verdict
 

@@ -23,7 +23,7 @@ from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.io.files import write_file
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
 from bidnerf_core.maps import files
 from bidnerf_core.maps import map as map_module
@@ -241,10 +241,10 @@ def test_a_map_that_a_training_replaces_while_it_is_read(
     read = map_module.read_tensors
     pending = [lambda: save_map(tmp_path, info(step=6), state(6))]
 
-    def late(path: Path) -> dict[str, Tensor]:
+    def late(path: Path, expected: str) -> dict[str, Tensor]:
         if pending:
             pending.pop()()
-        return read(path)
+        return read(path, expected)
 
     monkeypatch.setattr(map_module, "read_tensors", late)
     loaded = load_map(tmp_path)
@@ -355,7 +355,7 @@ def test_a_surface_that_cannot_be_written_leaves_the_map(tmp_path: Path) -> None
     [
         (b"\x80\x04.", "expected a safetensors file"),
         (None, "no such file"),
-        ({"rgb": torch.ones(2, 3)}, "bake it anew"),
+        ({"rgb": torch.ones(2, 3)}, "writes anew"),
     ],
     ids=["no tensors", "missing", "other tensors"],
 )

@@ -18,7 +18,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trial import Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trials import forget_peak_memory, peak_memory_bytes, run_trial
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.results.errors import pose_error
 from tiny import backends_listed_once  # noqa: F401
 

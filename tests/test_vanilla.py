@@ -19,7 +19,7 @@ from bidnerf_core.fields.rendering import query_samples, render
 from bidnerf_core.fields.sampling import Importance, OccupiedOnly, Stratified
 from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_core.frames.frame import View
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.files import save_map
 from bidnerf_core.maps.map import load_map

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from bidnerf_core.camera.intrinsics import Intrinsics, focal_length
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.records import Record
+from bidnerf_core.io.json import Record
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")

@@ -14,7 +14,7 @@ from bidnerf_core.camera.records import camera_record
 from bidnerf_core.camera.shapes import cameras_at_size, centre_crop_cameras, median_camera
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import read_file
-from bidnerf_core.io.records import parse_record
+from bidnerf_core.io.json import parse_record
 
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
 """Millimetres; 35 mm-equivalent focal lengths refer to it (CIPA DCG-001)."""

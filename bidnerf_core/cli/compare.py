@@ -34,7 +34,7 @@ from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trial_process import Measured
 from bidnerf_core.io.files import write_file
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import METHODS
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.results.errors import CRITERIA

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time as clocks
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import photos_in
 from bidnerf_core.io.images import Background
-from bidnerf_core.io.serialization import LARGEST_NUMBER
+from bidnerf_core.io.json import parse_record
 
 STDIN = "-"
 POLL = 0.05
@@ -40,22 +38,14 @@ class FrameRequest:
 
         Raises ``InputError`` for anything that is not such an object.
         """
-        expected = 'expected {"image": path, "depth": path, "time": seconds}'
-        try:
-            found = json.loads(line)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"not JSON ({error}), {expected}") from error
-        if not isinstance(found, dict) or not isinstance(found.get("image"), str):
-            raise InputError(f'no "image" in {line.strip()[:80]!r}, {expected}')
-        if unknown := sorted(found.keys() - KEYS):
-            raise InputError(f"unknown key {unknown[0]!r}, {expected}")
-        depth = found.get("depth")
-        if depth is not None and not isinstance(depth, str):
-            raise InputError(f'"depth" is {depth!r}, expected a path or null')
-        return FrameRequest(
-            Path(found["image"]), None if depth is None else Path(depth), _number(found, "time"),
-            _number(found, "depth_unit"),
-        )  # fmt: skip
+        request = parse_record("request", line, '{"image": path, "depth": path, "time": seconds}')
+        image, depth = request.text("image"), request.text("depth")
+        if image is None:
+            raise request.error(f'no "image" in {line.strip()[:80]!r}')
+        if unknown := sorted(request.values.keys() - KEYS):
+            raise request.error(f"unknown key {unknown[0]!r}, expected some of {', '.join(sorted(KEYS))}")
+        time, unit = request.number("time"), request.number("depth_unit")
+        return FrameRequest(Path(image), None if depth is None else Path(depth), time, unit)
 
     def read(self, camera: GivenCamera, background: Background) -> Frame:
         """Read the image and its depth. Raises ``InputError`` if they are not readable or the camera is not known."""
@@ -109,12 +99,3 @@ def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
     looks = looks + 1 if size == before and size > 0 else 0
     sizes[file] = (size, looks)
     return looks >= STEADY
-
-
-def _number(found: dict[str, Any], name: str) -> float | None:
-    value = found.get(name)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST_NUMBER:
-        raise InputError(f'"{name}" is {value!r}, expected a finite number or null')
-    return float(value)

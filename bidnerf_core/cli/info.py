@@ -14,7 +14,7 @@ from bidnerf_core.cli.trial_progress import duration_text
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.evaluation.capture_figure import draw_capture
 from bidnerf_core.fields.contract import SceneBounds, levels
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.mapping.surface_map import SurfaceMap
 from bidnerf_core.maps.files import load_capture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +12,10 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import read_file
+from bidnerf_core.io.json import parse_json
 from bidnerf_core.localization import pose_from_matrix
 
-EXPECTED_POSE = 'expected {"T_world_camera": 4x4 rows}'
+EXPECTED_POSE = '{"T_world_camera": 4x4 rows}'
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ def read_pose(path: Path) -> SE3:
     """
     content = read_file(path, "a pose file")
     try:
-        found = json.loads(content)
-    except (ValueError, RecursionError) as error:
+        found = parse_json(content, str(path), EXPECTED_POSE)
+    except InputError as error:
         lines = [line for line in content.splitlines() if line.strip()]
         if len(lines) > 1 and all(line.startswith(b"{") for line in lines):  # as ``--json`` prints several
             raise _not_one(path, len(lines)) from error
-        raise InputError(f"{path}: not JSON ({error}), {EXPECTED_POSE}") from error
+        raise
     if isinstance(found, list) and all(isinstance(entry, dict) for entry in found):
         if len(found) != 1:  # as ``--out`` writes several
             raise _not_one(path, len(found))
@@ -66,7 +66,7 @@ def read_pose(path: Path) -> SE3:
     try:
         matrix = torch.tensor(rows, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{path}: no matrix of numbers in it, {EXPECTED_POSE}") from error
+        raise InputError(f"{path}: no matrix of numbers in it, expected {EXPECTED_POSE}") from error
     return pose_from_matrix(matrix, f"{path}: T_world_camera")
 
 

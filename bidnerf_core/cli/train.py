@@ -36,7 +36,7 @@ from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import View
 from bidnerf_core.io.images import background_colour
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.maps.description import MapInfo, load_info

@@ -16,7 +16,7 @@ from bidnerf_core.datasets.poses import rigid_of_rows
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import resampled
-from bidnerf_core.io.records import read_record
+from bidnerf_core.io.json import read_record
 
 ENOUGH_REGISTERED = 1000
 """Number of measured pixels above which at least one must fall into the colour image."""

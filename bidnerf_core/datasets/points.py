@@ -10,8 +10,8 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.arrays import read_archive, read_array
 from bidnerf_core.io.files import read_file
+from bidnerf_core.io.tensors import read_archive, read_array
 
 EXPECTED_POINTS = "expected n rows of x, y, z in metres"
 

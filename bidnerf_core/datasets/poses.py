@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.records import Record
+from bidnerf_core.io.json import Record
 
 RIGID_TO = 5e-3
 """Largest entry of R^T R - 1 that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""

@@ -43,7 +43,7 @@ from bidnerf_core.frames.photos import fit_depth
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import read_file
 from bidnerf_core.io.images import Background, decode, over, read_header, read_image, reduced
-from bidnerf_core.io.records import Record, read_record
+from bidnerf_core.io.json import Record, read_record
 
 LARGEST_SIDE = 640
 """Maximum number of pixels on the longer side of a photo once it is read."""

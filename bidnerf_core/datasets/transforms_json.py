@@ -12,7 +12,7 @@ from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import IMAGE_SUFFIXES
-from bidnerf_core.io.records import Record, read_record
+from bidnerf_core.io.json import Record, read_record
 
 SPLITS = ("train", "val", "test")
 METRES_PER_DEPTH_UNIT = 0.001

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError, InputWarning
-from bidnerf_core.io.arrays import read_array
 from bidnerf_core.io.images import decode, to_numpy
+from bidnerf_core.io.tensors import read_array
 
 FARTHEST = 1e9
 """Metres. No sensor measures more."""

@@ -29,7 +29,7 @@ from bidnerf_core.evaluation.trials import (
     trial_views,
 )
 from bidnerf_core.geometry.arcs import arc
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.localization.methods import RENAMED, require_use_of_depth
 from bidnerf_core.scenes.closed_form_data import ClosedFormData

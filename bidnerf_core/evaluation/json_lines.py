@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import FileInUse, open_binary, read_file, read_open_file, take_lock, write_file
+from bidnerf_core.io.json import parse_json
 
 LARGEST_LINES = 512 * 2**20
 """Bytes. A trial takes a few kilobytes, so this is enough for a hundred thousand trials."""
@@ -37,11 +38,11 @@ class LineFormat:
         for number, line in enumerate(lines, start=1):
             where = f"{path}: line {number}"
             try:
-                plain = _parsed(line) if line.strip() else None
-            except (ValueError, RecursionError) as error:
+                plain = parse_json(line, where, self.expected) if line.strip() else None
+            except InputError:
                 if number == len(lines) and (line.startswith(self.opening) or self.opening.startswith(line)):
                     break
-                raise InputError(f"{where}: not JSON, expected {self.expected}") from error
+                raise
             if plain is not None:
                 found.append((where, plain))
             length += len(line) + (number < len(lines))
@@ -175,11 +176,3 @@ class RowStore:
 def as_line(plain: Any) -> bytes:
     """Return ``plain`` as one line of strict JSON."""
     return json.dumps(plain, allow_nan=False).encode() + b"\n"
-
-
-def _parsed(line: bytes) -> Any:
-    """Return the object of a line. Raises ``ValueError`` also for text with half of a surrogate pair."""
-    plain = json.loads(line)
-    if b"\\ud" in line.lower():
-        json.dumps(plain, ensure_ascii=False).encode()
-    return plain

@@ -19,8 +19,8 @@ import torch
 
 import bidnerf_core
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file, write_file
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.json import from_plain, read_record, to_plain
 
 VERSIONS = ("bidnerf", "torch", "numpy", "scipy", "kornia")
 SOURCES = ("bidnerf_core", "backends", "plugins", "benchmarks", ":!benchmarks/results")
@@ -84,16 +84,11 @@ def read_runs(results: Path) -> list[Provenance]:
     path = beside(results)
     if not path.is_file():
         return []
-    what = "what 'bidnerf evaluate' writes beside its results"
-    content, expected = read_file(path, what), f"expected {what}"
-    try:
-        found: Any = json.loads(content)
-        json.dumps(found, ensure_ascii=False).encode()  # fails for half a surrogate pair
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON ({error}), {expected}") from error
-    if not isinstance(found, dict) or not isinstance(found.get("runs"), list):
-        raise InputError(f"{path}: no list of runs, {expected}")
-    return [from_plain(Provenance, run, str(path)) for run in found["runs"]]
+    expected = "what 'bidnerf evaluate' writes beside its results"
+    runs = read_record(path, expected).items("runs")
+    if runs is None:
+        raise InputError(f"{path}: no list of runs, expected {expected}")
+    return [from_plain(Provenance, run, str(path)) for run in runs]
 
 
 def git(*arguments: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 from bidnerf_core.evaluation.json_lines import JsonLinesFile, LineFormat, as_line
 from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, to_plain
 
 Key: TypeAlias = str
 """The identity of a trial, independent of where its folders are."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import PoseError
 from bidnerf_core.scenes.closed_form_data import is_closed_form
 

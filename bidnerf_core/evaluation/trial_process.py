@@ -20,7 +20,7 @@ from bidnerf_core.fields.contract import levels
 from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import draw, uniform
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, parse_json, to_plain
 from bidnerf_core.settings import to_flat
 
 COUNTED_RAYS = 2048
@@ -59,7 +59,7 @@ class TrialProcess:
                 f"{trial.map}: the process that localized frame {trial.frame} ended with status {self._process.wait()},"
                 " expected a result; was memory short?"
             )
-        answer = json.loads(line)
+        answer = parse_json(line, trial.map, "the result of a trial")
         if "refused" in answer:
             raise InputError(answer["refused"])
         return from_plain(Measured, answer, "result")
@@ -90,7 +90,7 @@ def samples_per_ray(trial: Trial) -> float:
 def _serve(questions: Iterable[str], answers: Any) -> None:
     """Answer each line with a line, until there are none left."""
     for line in questions:
-        trial = from_plain(Trial, json.loads(line), "trial")
+        trial = from_plain(Trial, parse_json(line, "trial", "a trial"), "trial")
         try:
             _send(answers, to_plain(Measured(run_trial(trial), samples_per_ray(trial))))
         except InputError as error:

@@ -7,7 +7,6 @@ and on any machine; two runs of the same trial differ only in ``seconds`` and ``
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import sys
 from dataclasses import replace
@@ -34,7 +33,7 @@ from bidnerf_core.evaluation.trial import (
 )
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, parse_record, to_plain
 from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.maps.description import MapInfo, cameras_of, load_info
 from bidnerf_core.maps.map import Map, load_map
@@ -95,15 +94,9 @@ def start_of(trial: Trial, views: list[View], dataset: Dataset) -> SE3 | None:
 
 def parse_settings(method: str, config: str) -> Any:
     """Return the settings of ``method`` from the JSON of those that differ from its defaults."""
-    try:
-        plain = json.loads(config)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"config: not JSON ({error}), expected an object of settings of {method}") from error
-    if not isinstance(plain, dict):
-        raise InputError(
-            f"config: found a {type(plain).__name__}, expected an object of settings of {method}"
-        )
-    return settings_of(method, plain)
+    return settings_of(
+        method, dict(parse_record("config", config, f"an object of settings of {method}").values)
+    )
 
 
 @lru_cache(maxsize=4)

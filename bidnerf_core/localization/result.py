@@ -15,7 +15,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 
 
 class Outcome(StrEnum):

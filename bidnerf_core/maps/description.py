@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -13,12 +12,12 @@ from bidnerf_core.captures.cameras import PoseRefinement, StoredCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.serialization import from_plain
+from bidnerf_core.io.json import from_plain, read_json
 
 FORMAT = "bidnerf map"
 VERSION = 1
 DESCRIPTION = "map.json"
+EXPECTED_PART = "a safetensors file, without which the map is incomplete"
 
 LandmarkSource = Literal["photos", "rendered images"]
 
@@ -63,11 +62,7 @@ def load_info(folder: Path) -> MapInfo:
         raise InputError(f"{folder}: {what}, expected a map: a folder as written by 'bidnerf train'")
     if not path.exists():
         raise InputError(f"{folder}: no {DESCRIPTION} in it, expected a map as written by 'bidnerf train'")
-    content = read_file(path, "the description of a map")
-    try:
-        found = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON ({error}), expected the description of a map") from error
+    found = read_json(path, "the description of a map")
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise InputError(f'{path}: not the description of a map, expected "format": "{FORMAT}"')
     if found.get("version") != VERSION:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import secrets
 from dataclasses import replace
@@ -19,17 +20,19 @@ from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.io.files import write_file
-from bidnerf_core.io.serialization import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, read_json, to_plain
+from bidnerf_core.io.tensors import load_part, packed, read_tensors
 from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.maps.description import DESCRIPTION, LandmarkSource, MapInfo, load_info
-from bidnerf_core.maps.tensors import checked_weights, load_part, packed, read_tensors
+from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, LandmarkSource, MapInfo, load_info
+from bidnerf_core.maps.weights import checked_weights
 from bidnerf_core.training import TrainingState
 
 PARTS = (
     r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
 )
+BAKED = "a safetensors file, which 'bidnerf bake' writes anew"
 OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 """Names of the files that saving may leave behind; other files in the folder are never removed."""
 
@@ -111,43 +114,33 @@ def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingSta
     if info.training is None:
         raise InputError(f"{folder}: training is complete ({amount(info.step, 'step')}), nothing to resume")
     path = folder / info.weights
-    weights = checked_weights(field, read_tensors(path), path)
-    return TrainingState(info.step, weights, read_tensors(folder / info.training))
+    weights = checked_weights(field, read_tensors(path, EXPECTED_PART), path)
+    return TrainingState(info.step, weights, read_tensors(folder / info.training, EXPECTED_PART))
 
 
 def load_surface(path: Path) -> SurfaceMap:
     """Return the baked surface of a map. Raises ``InputError`` where the file does not hold the tensors of one."""
-    return load_part(path, surface_from_tensors, "a baked surface")
+    return load_part(path, surface_from_tensors, "a baked surface", BAKED)
 
 
 def load_landmarks(path: Path) -> LandmarkMap:
     """Return the landmarks of a map. Raises ``InputError`` where the file does not hold the tensors of landmarks."""
-    return load_part(path, landmarks_from_tensors, "landmarks")
+    return load_part(path, landmarks_from_tensors, "landmarks", BAKED)
 
 
 def load_capture(path: Path) -> CaptureReport:
     """Return the record of a capture. Raises ``InputError`` where the file does not hold one."""
-    try:
-        found = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: missing, although the map names it; bake the map again with --data"
-        ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: not JSON ({error}), expected the record of a capture; bake the map again with --data"
-        ) from error
-    return from_plain(CaptureReport, found, str(path))
+    expected = "the record of a capture, which 'bidnerf bake' with --data writes anew"
+    return from_plain(CaptureReport, read_json(path, expected), str(path))
 
 
 def _sweep(folder: Path) -> None:
     """Remove the files of earlier and of interrupted saves that ``map.json`` does not name."""
+    exists = os.path.lexists(folder / DESCRIPTION)
     try:
-        found = json.loads((folder / DESCRIPTION).read_bytes())
+        found = read_json(folder / DESCRIPTION, "the description of a map") if exists else {}
         kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks", "capture")}
-    except FileNotFoundError:
-        kept = set()
-    except (OSError, ValueError, AttributeError):  # damaged: which files are in use is unknown
+    except (InputError, AttributeError):  # damaged: which files are in use is unknown
         return
     for file in list(folder.iterdir()):
         if OURS.fullmatch(file.name) and file.name not in kept:

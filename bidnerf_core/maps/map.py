@@ -12,13 +12,14 @@ from torch import Tensor, nn
 from bidnerf_core.backend import Backend
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField, SceneBounds
-from bidnerf_core.io.serialization import from_plain
+from bidnerf_core.io.json import from_plain
+from bidnerf_core.io.tensors import read_tensors
 from bidnerf_core.localization.problem import on_device
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.maps.description import DESCRIPTION, MapInfo, load_info
+from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, MapInfo, load_info
 from bidnerf_core.maps.files import load_landmarks, load_surface
-from bidnerf_core.maps.tensors import checked_weights, read_tensors
+from bidnerf_core.maps.weights import checked_weights
 from bidnerf_core.registry import load_backend
 
 
@@ -106,7 +107,7 @@ def _read(
     info = load_info(folder)
     while True:
         try:
-            weights = read_tensors(folder / info.weights)
+            weights = read_tensors(folder / info.weights, EXPECTED_PART)
             surface = load_surface(folder / info.surface) if baked and info.surface else None
             landmarks = load_landmarks(folder / info.landmarks) if baked and info.landmarks else None
             return info, weights, surface, landmarks

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
+from bidnerf_core.io.json import parse_json
+from bidnerf_core.io.tensors import read_tensors_and_metadata
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.tracking.alignment import CloudInCamera
@@ -96,16 +97,11 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
 
 
 def _read(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            found = json.loads((file.metadata() or {}).get("bidnerf", "null"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, ValueError, SafetensorError) as error:
-        raise InputError(
-            f"{path}: not readable ({error}), expected a file that Tracker.save wrote"
-        ) from error
+    expected = "a file that Tracker.save wrote"
+    tensors, metadata = read_tensors_and_metadata(path, expected)
+    found = parse_json(metadata.get("bidnerf", "null"), str(path), expected)
     if not isinstance(found, dict) or found.get("format") != STATE_FORMAT:
-        raise InputError(f"{path}: not the state of a tracker, expected a file that Tracker.save wrote")
+        raise InputError(f"{path}: not the state of a tracker, expected {expected}")
     if found.get("version") != STATE_VERSION:
         raise InputError(
             f"{path}: version {found.get('version')!r}, expected {STATE_VERSION}; begin the sequence anew"

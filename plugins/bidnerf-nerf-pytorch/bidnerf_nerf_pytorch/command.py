@@ -12,7 +12,7 @@ import tyro
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.io.serialization import to_plain
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.files import save_map
 from bidnerf_core.training import TrainingState

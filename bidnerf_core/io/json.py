@@ -1,20 +1,126 @@
-"""Conversion of frozen dataclasses to JSON values, and back with an error that names every mistake."""
+"""JSON: one parser, objects with values read by type, and frozen dataclasses to and from plain values.
+
+Everything that reads JSON uses ``parse_json``, so that damaged text of any origin gives the same one-line error.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import sys
 import types
 import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from bidnerf_core.errors import InputError, spelling_hint
+from bidnerf_core.io.files import read_file
 
 _T = TypeVar("_T")
 
 LARGEST_NUMBER = sys.float_info.max  # JSON can hold NaN, 1e999 and integers that no float can
 LARGEST_INTEGER = 2**63 - 1  # that tensors and files can hold
+
+
+def read_json(path: Path, expected: str) -> Any:
+    """Return the JSON value in the file ``path``. Raises ``InputError`` as ``read_file`` and ``parse_json`` do."""
+    return parse_json(read_file(path, expected), str(path), expected)
+
+
+def parse_json(content: bytes | str, where: str, expected: str) -> Any:
+    """Return the value of JSON text (UTF-8). Raises ``InputError`` for text that is not JSON or cannot be written again.
+
+    ``where`` begins the message (the file, or nothing), and ``expected`` describes in a few words what should be there.
+    """
+    try:
+        text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
+        found = json.loads(text)
+        if "\\ud" in text.lower():  # half of a surrogate pair, which no file or terminal can hold
+            json.dumps(found, ensure_ascii=False).encode()
+    except json.JSONDecodeError as error:
+        reason = f"{error.msg} at line {error.lineno}, column {error.colno}"
+        raise _not_json(where, reason, expected) from error
+    except (ValueError, RecursionError) as error:
+        raise _not_json(where, str(error), expected) from error
+    return found
+
+
+def _not_json(where: str, reason: str, expected: str) -> InputError:
+    return InputError(f"{where}{': ' if where else ''}not JSON ({reason}), expected {expected}")
+
+
+@dataclass(frozen=True)
+class Record:
+    """A JSON object. A key that is missing or ``null`` is looked up in ``defaults``."""
+
+    where: str  # the beginning of every message: the file, and the part of it
+    values: Mapping[str, Any]
+    defaults: Record | None = None
+
+    def error(self, finding: str) -> InputError:
+        return InputError(f"{self.where}: {finding}")
+
+    def scopes(self) -> Iterator[Record]:
+        """Yield this object without its defaults, then the defaults without theirs, and so on."""
+        yield Record(self.where, self.values)
+        if self.defaults is not None:
+            yield from self.defaults.scopes()
+
+    def value(self, key: str) -> Any:
+        found = self.values.get(key)
+        return self.defaults.value(key) if found is None and self.defaults is not None else found
+
+    def number(self, key: str) -> float | None:
+        """Return a finite number, or None where the key is missing."""
+        found = self.value(key)
+        return None if found is None else self.checked_number(found, key)
+
+    def size(self, key: str) -> int | None:
+        """Return a positive whole number of pixels, which some programs write as 800.0, or None where the key is missing."""
+        found = self.number(key)
+        if found is not None and (found < 1 or found != int(found)):
+            raise self.error(f"{key} is {found:g}, expected a positive whole number of pixels")
+        return None if found is None else int(found)
+
+    def text(self, key: str) -> str | None:
+        found = self.value(key)
+        if found is not None and not isinstance(found, str):
+            raise self.error(f"{key} is {_short(found)}, expected text")
+        return found
+
+    def items(self, key: str) -> list[Any] | None:
+        found = self.value(key)
+        if found is not None and not isinstance(found, list):
+            raise self.error(f"{key} is {_short(found)}, expected a list")
+        return found
+
+    def checked_number(self, found: Any, what: str) -> float:
+        is_number = isinstance(found, int | float) and not isinstance(found, bool)
+        if not is_number or not abs(found) < LARGEST_NUMBER:
+            raise self.error(f"{what} is {_short(found)}, expected a finite number")
+        return float(found)
+
+
+def read_record(path: Path, expected: str = "a JSON object") -> Record:
+    """Read the JSON object in the file ``path``. Raises ``InputError``, with line and column where the JSON is malformed."""
+    return parse_record(str(path), read_file(path, "a JSON file"), expected)
+
+
+def parse_record(where: str, content: bytes | str, expected: str = "a JSON object") -> Record:
+    """Parse a JSON object; ``where`` begins the message of the ``InputError`` that a malformed one raises."""
+    values = parse_json(content, where, expected)
+    if not isinstance(values, dict):
+        raise InputError(f"{where}: holds {_short(values)}, expected {expected}")
+    return Record(where, values)
+
+
+def _short(value: Any) -> str:
+    """Return a value as JSON on one line, truncated if it is long."""
+    text = json.dumps(value)
+    return text if len(text) <= 40 else text[:37] + "..."
 
 
 def to_plain(value: Any, where: str = "") -> Any:

@@ -1,0 +1,137 @@
+"""Files of arrays and tensors (NumPy, safetensors), whose size is checked before memory is allocated for them."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import struct
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.torch import load as tensors_from_bytes
+from torch import Tensor
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import open_binary
+from bidnerf_core.io.json import parse_json
+
+_Part = TypeVar("_Part")
+
+LARGEST_ARRAY = 800_000_000
+"""Bytes: an image of 100 megapixels in double precision."""
+TENSOR_FILE = "a safetensors file"
+LARGEST_HEADER = 16 * 2**20
+"""Bytes of the header of a safetensors file, which takes about a hundred for each tensor."""
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def read_array(path: Path, expected: str) -> np.ndarray:
+    """Read the array of a ``.npy`` file. Raises ``InputError`` for anything else, including pickled objects.
+
+    ``expected`` describes in a few words what the file should be.
+    """
+    with open_binary(path, expected) as file:
+        try:
+            return _array(file, os.fstat(file.fileno()).st_size)
+        except Exception as error:  # NumPy parses the header as Python, which may raise anything
+            raise _unreadable(path, error, expected) from error
+
+
+def read_archive(path: Path, names: Sequence[str], expected: str) -> dict[str, np.ndarray]:
+    """Read those of the arrays ``names`` that a ``.npz`` file holds. Raises ``InputError`` as ``read_array`` does."""
+    with open_binary(path, expected) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                held = {name: f"{name}.npy" for name in names if f"{name}.npy" in archive.namelist()}
+                return {name: _member(archive, member) for name, member in held.items()}
+        except Exception as error:  # as above; zipfile has errors of its own as well
+            raise _unreadable(path, error, expected) from error
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    size = archive.getinfo(name).file_size
+    if size > LARGEST_ARRAY:
+        raise ValueError(f"{name} has {size / 2**20:,.0f} MiB")
+    return _array(io.BytesIO(archive.read(name)), size)
+
+
+def _array(file: BinaryIO | io.BytesIO, size: int) -> np.ndarray:
+    """Read an array from a file of ``size`` bytes. Raises ``ValueError``, and NumPy's ``OSError``."""
+    version = np.lib.format.read_magic(file)
+    if version not in HEADERS:
+        raise ValueError(f"version {version} of the format")
+    shape, _, kind = HEADERS[version](file)
+    if kind.hasobject:
+        raise ValueError("objects of Python")
+    needed, left = math.prod(shape) * kind.itemsize, size - file.tell()
+    if min(shape, default=0) < 0 or needed > min(left, LARGEST_ARRAY):
+        raise ValueError(f"an array of {needed:,} bytes in {left:,}".replace(",", " "))
+    file.seek(0)
+    return np.asarray(np.load(file, allow_pickle=False))
+
+
+def _unreadable(path: Path, error: Exception, expected: str) -> InputError:
+    reason = str(error).strip().partition("\n")[0][:120] or type(error).__name__
+    return InputError(f"{path}: not readable as an array ({reason}), expected {expected}")
+
+
+def read_tensors(path: Path, expected: str = TENSOR_FILE) -> dict[str, Tensor]:
+    """Return the tensors of a safetensors file. Raises ``InputError`` as ``read_tensors_and_metadata`` does."""
+    return read_tensors_and_metadata(path, expected)[0]
+
+
+def read_tensors_and_metadata(
+    path: Path, expected: str = TENSOR_FILE
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return the tensors of a safetensors file, and the texts that its header holds beside them.
+
+    Raises ``InputError`` if it is not such a file, or if its length contradicts its header.
+    """
+    with open_binary(path, expected) as file:
+        try:
+            metadata = _checked_header(path, file, expected).get("__metadata__", {})
+            return tensors_from_bytes(file.read()), metadata
+        except InputError:
+            raise
+        except (SafetensorError, KeyError, ValueError, RuntimeError, OverflowError, OSError) as error:
+            raise InputError(f"{path}: not readable ({error}), expected {expected}") from error
+
+
+def _checked_header(path: Path, file: BinaryIO, expected: str) -> dict[str, Any]:
+    """Return the header of a safetensors file, whose length agrees with it, before memory is allocated for the tensors."""
+    size = os.fstat(file.fileno()).st_size
+    length = struct.unpack("<Q", file.read(8).ljust(8, b"\xff"))[0]
+    if not length <= min(size - 8, LARGEST_HEADER):
+        raise InputError(f"{path}: not readable (its header is cut off), expected {expected}")
+    try:
+        header: dict[str, Any] = parse_json(file.read(length), str(path), expected)
+        ends = [part["data_offsets"][1] for name, part in header.items() if name != "__metadata__"]
+        described = 8 + length + max(ends, default=0)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        raise InputError(f"{path}: not readable (its header is damaged), expected {expected}") from error
+    if described != size:
+        raise InputError(f"{path}: has {size} bytes, its header describes {described}; expected {expected}")
+    file.seek(0)
+    return header
+
+
+def load_part(
+    path: Path, make: Callable[[dict[str, Tensor]], _Part], what: str, expected: str = TENSOR_FILE
+) -> _Part:
+    """Return what ``make`` returns for the tensors of a file. Raises ``InputError`` where it rejects them."""
+    tensors = read_tensors(path, expected)
+    try:
+        return make(tensors)
+    except (KeyError, ValueError) as error:
+        why = f"no tensor {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{path}: not {what} ({why}), expected {expected}") from error
+
+
+def packed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return contiguous copies on the CPU, as safetensors needs them."""
+    return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}

@@ -1,0 +1,42 @@
+"""Checking the weights of a map against the field that they are for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+from torch import Tensor, nn
+
+from bidnerf_core.backend import UpgradingField
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contract import RadianceField
+
+
+def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """Return a field's tensors from a file, upgraded where an earlier version stored them, after checking them.
+
+    Their names, shapes and values are checked against the field here, since torch's own message would take many lines.
+    """
+    if isinstance(field, UpgradingField):
+        tensors = field.upgraded_state(tensors)
+    module = cast(nn.Module, field)
+    expected = module.state_dict()
+    for name, value in expected.items():
+        if name not in tensors:
+            raise InputError(f"{path}: no tensor {name!r}, expected one of shape {list(value.shape)}")
+        if tensors[name].shape != value.shape:
+            found, wanted = list(tensors[name].shape), list(value.shape)
+            raise InputError(f"{path}: tensor {name!r} has shape {found}, expected {wanted}")
+        if tensors[name].is_floating_point() != value.is_floating_point():
+            kinds = (str(kind).removeprefix("torch.") for kind in (tensors[name].dtype, value.dtype))
+            raise InputError(f"{path}: tensor {name!r} is of {next(kinds)}, expected {next(kinds)}")
+    surplus = sorted(tensors.keys() - expected.keys())
+    if surplus:
+        raise InputError(f"{path}: tensor {surplus[0]!r} is not part of the field that map.json describes")
+    for name, _ in module.named_parameters():
+        if name in tensors and not bool(tensors[name].isfinite().all()):
+            raise InputError(f"{path}: tensor {name!r} holds NaN or infinity, expected finite numbers")
+    for name, _ in module.named_buffers():
+        if name in tensors and bool(tensors[name].isnan().any()):
+            raise InputError(f"{path}: tensor {name!r} holds NaN, expected numbers")
+    return tensors
