@@ -8,9 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.intrinsics import (
+    Intrinsics,
+    cameras_at_size,
+    centre_crop_cameras,
+    median_camera,
+    stretched_cameras,
+)
 from bidnerf_core.camera.orientation import QUARTER_TURNS
-from bidnerf_core.camera.shapes import cameras_at_size, centre_crop_cameras, median_camera, stretched_cameras
 from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.mapping.calibration import Calibration
 

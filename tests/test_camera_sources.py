@@ -13,9 +13,10 @@ import pytest
 import torch
 
 from bidnerf_core.camera.exif import Exif, read_exif
+from bidnerf_core.camera.files import read_camera
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
-from bidnerf_core.camera.source import Raster, find_camera, read_camera
+from bidnerf_core.camera.source import CameraSource, FoundCamera, Raster
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from photo_files import noise, write_photo
@@ -27,7 +28,11 @@ WAYS = r"--camera FILE, --focal PX or --hfov DEG \(camera=, focal=, hfov= in Pyt
 
 
 def found(exif: Exif = Exif(), raster: Raster = PHOTO, **given: Any) -> Intrinsics:  # noqa: B008
-    return find_camera("a.jpg", raster, exif, **given).intrinsics
+    return find_camera(raster, exif, **given).intrinsics
+
+
+def find_camera(raster: Raster, exif: Exif, **given: Any) -> FoundCamera:
+    return CameraSource(**given).find("a.jpg", raster, exif)
 
 
 # EXIF.
@@ -35,7 +40,7 @@ def found(exif: Exif = Exif(), raster: Raster = PHOTO, **given: Any) -> Intrinsi
 
 def test_an_equivalent_focal_length_refers_to_the_diagonal() -> None:
     """The diagonal of the image subtends the angle that 43.27 mm subtend at that focal length."""
-    source = find_camera("a.jpg", PHOTO, Exif(equivalent_mm=26))
+    source = find_camera(PHOTO, Exif(equivalent_mm=26))
     camera = source.intrinsics
     half = math.atan(math.hypot(camera.width, camera.height) / 2 / camera.fx)
     assert half == pytest.approx(math.atan(math.hypot(36, 24) / 2 / 26))
@@ -51,7 +56,7 @@ def test_a_focal_length_and_the_pixels_of_the_sensor() -> None:
     assert found(taken, Raster(2016, 1512, UPRIGHT)).fx == pytest.approx(1400)  # was reduced since
     zoomed = Exif(size=SIZE, focal_mm=4.0, pixels_per_mm=(700.0, 700.0), digital_zoom=2.0)
     assert found(zoomed).fx == pytest.approx(5600)
-    assert "digital zoom 2" in find_camera("a.jpg", PHOTO, zoomed).description
+    assert "digital zoom 2" in find_camera(PHOTO, zoomed).description
 
 
 def test_a_portrait_photo_is_as_wide_as_it_was_high() -> None:
@@ -80,17 +85,17 @@ def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assume
     small, wide = (Intrinsics.from_focal(f, 400, 300) for f in (300, 500))
     film = Intrinsics.from_focal(90, 320, 180)
     for raster in (PHOTO, PORTRAIT):
-        source = find_camera("a.jpg", raster, Exif(), assumed=[wide, film, small, small])
+        source = find_camera(raster, Exif(), assumed=[wide, film, small, small])
         assert source.approximate
         assert source.intrinsics == Intrinsics.from_focal(300 * 4032 / 400, *raster.upright_size)
         assert "assumed to be that of the map's images" in source.description
-    square = find_camera("a.jpg", Raster(250, 250, UPRIGHT), Exif(), assumed=[small])
+    square = find_camera(Raster(250, 250, UPRIGHT), Exif(), assumed=[small])
     assert square.intrinsics == Intrinsics.from_focal(300 * 250 / 300, 250, 250)
     assert "assumed to be that of centre crops of the map's images" in square.description
-    assert find_camera("a.jpg", PHOTO, Exif(equivalent_mm=26), assumed=[small]).intrinsics == found(
+    assert find_camera(PHOTO, Exif(equivalent_mm=26), assumed=[small]).intrinsics == found(
         Exif(equivalent_mm=26)
     )
-    assert not find_camera("a.jpg", PHOTO, Exif(), focal=3000, assumed=[small]).approximate
+    assert not find_camera(PHOTO, Exif(), focal=3000, assumed=[small]).approximate
 
 
 @pytest.mark.parametrize(
@@ -99,16 +104,16 @@ def test_without_a_focal_length_the_median_of_images_of_the_same_shape_is_assume
 def test_a_cropped_photo_has_the_focal_length_of_the_whole_one_where_it_is_estimated(exif: Exif) -> None:
     whole, part = replace(exif, size=SIZE), Raster(1200, 3000, UPRIGHT)
     assumed = [Intrinsics.from_focal(300, 400, 300)]
-    source = find_camera("a.jpg", part, whole, assumed=assumed)
+    source = find_camera(part, whole, assumed=assumed)
     assert source.approximate
     assert source.intrinsics == Intrinsics.from_focal(found(exif).fx, 1200, 3000)
     assert source.description.endswith("a crop of a photo of 4032x3024")
-    square = find_camera("a.jpg", Raster(1080, 1080, UPRIGHT), whole, assumed=assumed)  # resized as well
+    square = find_camera(Raster(1080, 1080, UPRIGHT), whole, assumed=assumed)  # resized as well
     assert square.intrinsics.fx == pytest.approx(found(exif).fx * 1080 / 3024)
-    large = find_camera("a.jpg", Raster(8064, 4536, UPRIGHT), whole, assumed=assumed)
+    large = find_camera(Raster(8064, 4536, UPRIGHT), whole, assumed=assumed)
     assert large.intrinsics.fx == pytest.approx(found(exif).fx * 2)
     with pytest.raises(InputError, match="is 1200x3000, but was 4032x3024"):
-        find_camera("a.jpg", part, whole)
+        find_camera(part, whole)
 
 
 def test_tags_are_read_from_the_file(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core.datasets import READERS, Dataset, open_dataset
+from bidnerf_core.datasets import READERS, Dataset, Reader, ReadOptions, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 
@@ -402,13 +402,13 @@ def test_names_with_dots_and_twins(nerfstudio: Callable[..., Path]) -> None:
 
 
 def test_another_reader_can_join(tmp_path: Path, blender: Path) -> None:
-    class Other:
+    class Other(Reader):
         expected = "magic.bin"
 
         def recognises(self, path: Path) -> bool:
             return (path / "magic.bin").exists()
 
-        def open(self, path: Path, background: Any) -> Dataset:
+        def open(self, path: Path, options: ReadOptions) -> Dataset:
             return open_dataset(blender)
 
     (tmp_path / "magic.bin").touch()
@@ -590,7 +590,7 @@ def test_images_of_different_size(nerfstudio: Callable[..., Path]) -> None:
 def test_depth_of_another_size(nerfstudio: Callable[..., Path]) -> None:
     folder = nerfstudio()
     write_depth(folder, ["depth/r_0.png"], (H, W // 2))
-    assert "frame 0 (images/r_0.png): depth/r_0.png is 6x8, expected 12x8 as its image" in message(folder)
+    assert "depth/r_0.png: depth is 6x8, expected 12x8 as its image r_0.png" in message(folder)
 
 
 def test_an_image_of_another_size_is_not_decoded(nerfstudio: Callable[..., Path]) -> None:

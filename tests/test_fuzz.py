@@ -25,7 +25,7 @@ from safetensors.torch import save
 
 import tiny
 from bidnerf_core import Frame, load_map
-from bidnerf_core.camera.source import read_camera
+from bidnerf_core.camera.files import read_camera
 from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.points import read_depth_points

@@ -19,6 +19,8 @@ from bidnerf_core.datasets import (
     Dataset,
     FileSequence,
     FrameSequence,
+    Reader,
+    ReadOptions,
     open_dataset,
     open_sequence,
     write_transforms,
@@ -26,7 +28,6 @@ from bidnerf_core.datasets import (
 from bidnerf_core.datasets.dataset import ReadingProgress
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
-from bidnerf_core.io.images import Background
 
 NAMES = ("b_10", "b_2", "a_3", "b_1")
 
@@ -131,20 +132,20 @@ def test_datasets_of_other_readers_have_sequences(tmp_path: Path) -> None:
         ) -> list[View]:
             return [self.seen[name] for name in names or self.frame_names(split)]
 
-    class Reader:
+    class Anything(Reader):
         expected = "anything"
 
         def recognises(self, path: Path) -> bool:
             return True
 
-        def open(self, path: Path, background: Background | None) -> Dataset:
+        def open(self, path: Path, options: ReadOptions) -> Dataset:
             return Others()
 
-    sequence = open_sequence(tmp_path, readers=[Reader()])
+    sequence = open_sequence(tmp_path, readers=[Anything()])
     assert names(sequence) == list(Others.seen)
     assert [timed.split for timed in sequence] == ["train", "train", "test"]
     with pytest.raises(InputError, match="with cameras of its own"):
-        open_sequence(tmp_path, readers=[Reader()], focal=100.0)
+        open_sequence(tmp_path, readers=[Anything()], focal=100.0)
 
 
 def test_a_folder_of_images(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import Dataset, open_dataset, open_sequence
-from bidnerf_core.datasets.depth_registration import DepthCamera, register_depth
-from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH, SevenScenesReader
+from bidnerf_core.datasets.seven_scenes import COLOUR_CAMERA, DEPTH_CAMERA, T_COLOUR_DEPTH
+from bidnerf_core.depth.registration import DepthCamera, register_depth
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 
@@ -155,8 +155,9 @@ def test_a_rendered_room_is_that_of_transforms_json(data_dir: Path, tmp_path: Pa
         iio.imwrite(f"{stem}.color.png", (view.frame.rgb.numpy() * 255).round().astype(np.uint8))
         iio.imwrite(f"{stem}.depth.png", (view.frame.depth.numpy() * 1000).round().astype(np.uint16))
         np.savetxt(f"{stem}.pose.txt", view.T_ref_camera.matrix().numpy(), fmt="%.17g")
-    reader = SevenScenesReader(sensor=None, camera=expected[0].frame.intrinsics)
-    for timed, view in zip(open_sequence(folder, readers=[reader]), expected, strict=True):
+    camera = expected[0].frame.intrinsics
+    frames = open_sequence(folder, camera=camera, register_depth=False)
+    for timed, view in zip(frames, expected, strict=True):
         assert timed.frame.intrinsics == view.frame.intrinsics
         assert torch.equal(timed.frame.rgb, view.frame.rgb)
         torch.testing.assert_close(timed.frame.depth, view.frame.depth)

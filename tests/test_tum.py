@@ -256,7 +256,7 @@ def test_a_binary_list_is_refused(folder: Path) -> None:
 def test_images_and_depth_that_are_no_pair_are_refused(folder: Path) -> None:
     depth = next(iter(sorted((folder / "depth").iterdir())))
     iio.imwrite(depth, np.ones((6, 8), np.uint16))
-    with pytest.raises(InputError, match=r"depth is 8x6, expected 16x12 as its colour image"):
+    with pytest.raises(InputError, match=r"depth is 8x6, expected 16x12 as its image"):
         next(iter(open_sequence(folder)))
     depth.unlink()
     with pytest.raises(InputError, match=rf"depth\.txt: line 4: no image .*{re.escape(depth.name)}"):

@@ -3,48 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bidnerf_core.camera.exif import Exif
-from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
-from bidnerf_core.camera.orientation import Orientation
-from bidnerf_core.camera.records import camera_record
-from bidnerf_core.camera.shapes import cameras_at_size, centre_crop_cameras, median_camera
+from bidnerf_core.camera.files import read_camera
+from bidnerf_core.camera.intrinsics import (
+    Intrinsics,
+    cameras_at_size,
+    centre_crop_cameras,
+    median_camera,
+    same_aspect,
+)
+from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import parse_record
 
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
 """Millimetres; 35 mm-equivalent focal lengths refer to it (CIPA DCG-001)."""
 LEAST_CROP = 0.5
 """Smallest share of the width or of the height at which a cropped photo is assumed to have kept its resolution."""
+CAMERA_FILES = ("camera.json", "cameras.txt")
+"""Files in a recording's folder that may hold its camera, in the formats of ``read_camera``."""
+NO_EXIF = Exif()
 MIDDLE = "the principal point is assumed in the middle"
 WAYS = "--camera FILE, --focal PX or --hfov DEG (camera=, focal=, hfov= in Python)"
-COLMAP_MODELS: dict[str, tuple[int, ...]] = {
-    # Indices of fx, fy, cx, cy and the distortion (in OpenCV's order) among the parameters; -1 is a coefficient of 0.
-    "SIMPLE_PINHOLE": (0, 0, 1, 2),
-    "PINHOLE": (0, 1, 2, 3),
-    "SIMPLE_RADIAL": (0, 0, 1, 2, 3, -1, -1, -1),
-    "RADIAL": (0, 0, 1, 2, 3, 4, -1, -1),
-    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
-    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
-}
-"""Parameters of COLMAP's perspective models (https://colmap.github.io/cameras.html). Its pixel centres are at +0.5 as well."""
-COLMAP_MODEL_IDS = {
-    0: "SIMPLE_PINHOLE",
-    1: "PINHOLE",
-    2: "SIMPLE_RADIAL",
-    3: "RADIAL",
-    4: "OPENCV",
-    6: "FULL_OPENCV",
-}
-"""The ids of these models in ``cameras.bin``."""
 
 
 @dataclass(frozen=True)
-class CameraSource:
+class FoundCamera:
     """The camera of an upright image, and a one-line description of its source."""
 
     intrinsics: Intrinsics
@@ -58,7 +45,7 @@ class Raster:
 
     width: int
     height: int
-    orientation: Orientation
+    orientation: Orientation = UPRIGHT
 
     @property
     def size(self) -> tuple[int, int]:
@@ -81,42 +68,85 @@ class Raster:
         return camera.resized(*self.upright_size) if same_aspect(given, self.upright_size) else None
 
 
-def find_camera(
-    where: str,
-    raster: Raster,
-    exif: Exif,
-    camera: Intrinsics | str | Path | None = None,
-    focal: float | None = None,
-    hfov: float | None = None,
-    assumed: Sequence[Intrinsics] = (),
-) -> CameraSource:
-    """Return the camera of an upright photo: ``camera``, ``focal`` or ``hfov`` where one is given, else that of EXIF.
+@dataclass(frozen=True)
+class CameraSource:
+    """All that is known of the camera of some images, beside their EXIF.
 
-    ``focal`` is in pixels of the stored image and ``hfov`` in degrees across the upright one. Where EXIF has no focal length,
-    that of the ``assumed`` cameras, if there are any, is used. Raises ``InputError``, whose message begins with ``where``, if
-    several are given, if none is known, and if the camera belongs to an image of another aspect ratio.
+    At most one of intrinsics or a file that holds them, a focal length and a field of view is given. ``assumed`` are cameras
+    of which one probably took the images whose focal length is unknown.
     """
-    if sum(given is not None for given in (camera, focal, hfov)) > 1:
-        raise InputError(f"{where}: several cameras are given, expected one of {WAYS}")
-    size = raster.upright_size
-    try:
-        if focal is not None:
-            return _described(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px as given")
-        if hfov is not None:
-            return _described(Intrinsics.from_hfov(hfov, *size), f"horizontal field of view {hfov:g} deg")
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-    if camera is None:
-        return replace(_found_camera(where, raster, exif, assumed), approximate=True)
-    given, origin = (
-        (camera, "camera as given")
-        if isinstance(camera, Intrinsics)
-        else (read_camera(Path(camera), size), f"camera of {camera}")
-    )
-    return _fitted(where, raster, given, origin)
+
+    camera: Intrinsics | str | Path | None = None
+    focal: float | None = None  # pixels of the stored image
+    hfov: float | None = None  # degrees across the upright image
+    assumed: tuple[Intrinsics, ...] = ()
+
+    @property
+    def is_given(self) -> bool:
+        """Whether the camera is given, rather than to be found in EXIF or assumed."""
+        return any(given is not None for given in (self.camera, self.focal, self.hfov))
+
+    def require(self, path: Path, why: str) -> None:
+        """Raise ``InputError`` where no camera is given or assumed; ``why`` is the reason why one is needed."""
+        if not self.is_given and not self.assumed:
+            raise InputError(f"{path}: {why}, expected a camera: {WAYS}")
+
+    def find(self, where: Path | str, raster: Raster, exif: Exif = NO_EXIF) -> FoundCamera:
+        """Return the camera of an upright image: the given one, else that of EXIF, else one of the ``assumed`` ones.
+
+        Raises ``InputError``, whose message begins with ``where``, if several are given, if none is known, and if the camera
+        belongs to an image of another aspect ratio.
+        """
+        camera, focal, hfov, size = self.camera, self.focal, self.hfov, raster.upright_size
+        if sum(given is not None for given in (camera, focal, hfov)) > 1:
+            raise InputError(f"{where}: several cameras are given, expected one of {WAYS}")
+        try:
+            if focal is not None:
+                return _described(Intrinsics.from_focal(focal, *size), f"focal length {focal:g} px as given")
+            if hfov is not None:
+                return _described(Intrinsics.from_hfov(hfov, *size), f"horizontal field of view {hfov:g} deg")
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
+        if camera is None:
+            return replace(_found_camera(str(where), raster, exif, self.assumed), approximate=True)
+        given, origin = (
+            (camera, "camera as given")
+            if isinstance(camera, Intrinsics)
+            else (read_camera(Path(camera), size), f"camera of {camera}")
+        )
+        return _fitted(str(where), raster, given, origin)
+
+    def at(self, image: Path) -> Callable[[int, int], Intrinsics]:
+        """Return the function that finds the camera of the file ``image``, without EXIF, from its width and height."""
+        return lambda width, height: self.find(image, Raster(width, height)).intrinsics
 
 
-def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intrinsics]) -> CameraSource:
+def folder_camera(
+    folder: Path,
+    given: Intrinsics | Path | None,
+    published: Intrinsics | None,
+    unknown: str = "",
+    ways: str = "a file",
+) -> CameraSource:
+    """Return the single camera of a recording whose format has none in its files.
+
+    It is the ``given`` one (intrinsics or a file), that of one of ``CAMERA_FILES`` in ``folder``, or the ``published`` one of
+    the format. Raises ``InputError`` where none of them exists, with the reason ``unknown`` and the ``ways`` to give one, and
+    for a given file that does not exist.
+    """
+    if isinstance(given, Path) and not given.exists():
+        raise InputError(f"{given}: no such file, expected as the camera of {folder}: {ways}")
+    beside = next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+    found = given or beside or published
+    if found is None:
+        raise InputError(
+            f"{folder}: {unknown}; expected its camera: {' or '.join(CAMERA_FILES)} in the folder, or --camera with "
+            f"{ways} (camera= in Python)"
+        )
+    return CameraSource(found)
+
+
+def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intrinsics]) -> FoundCamera:
     """Return the camera from EXIF, or one of the ``assumed`` ones."""
     if exif.has_focal_length and assumed and exif.size and _is_cropped(raster, exif.size):
         return _camera_of_crop(where, raster, exif, exif.size)
@@ -124,25 +154,25 @@ def _found_camera(where: str, raster: Raster, exif: Exif, assumed: Sequence[Intr
     return assumable or camera_from_exif(where, raster, exif)
 
 
-def _described(camera: Intrinsics, origin: str) -> CameraSource:
-    return CameraSource(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
+def _described(camera: Intrinsics, origin: str) -> FoundCamera:
+    return FoundCamera(camera, f"{origin}: {_focal(camera)} ({MIDDLE})")
 
 
-def _fitted(where: str, raster: Raster, given: Intrinsics, origin: str) -> CameraSource:
+def _fitted(where: str, raster: Raster, given: Intrinsics, origin: str) -> FoundCamera:
     fitted = raster.upright(given)
     if fitted is None:
         size = "x".join(map(str, raster.upright_size))
         raise InputError(
             f"{where}: image is {size}, its camera is for {given.width}x{given.height}; expected one of the same aspect ratio"
         )
-    return CameraSource(fitted, f"{origin}: {_focal(fitted)}")
+    return FoundCamera(fitted, f"{origin}: {_focal(fitted)}")
 
 
 def _focal(camera: Intrinsics) -> str:
     return f"fx {camera.fx:.0f} px at {camera.width}x{camera.height}"
 
 
-def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
+def camera_from_exif(where: str, raster: Raster, exif: Exif) -> FoundCamera:
     """Return the camera that EXIF describes, accurate to a few percent; the lens is assumed to be free of distortion.
 
     Raises ``InputError`` where there is no focal length, and where the image was cropped after it was taken.
@@ -156,7 +186,7 @@ def camera_from_exif(where: str, raster: Raster, exif: Exif) -> CameraSource:
     return _by_exif(where, raster, exif, raster.size)
 
 
-def _camera_of_crop(where: str, raster: Raster, exif: Exif, taken: tuple[int, int]) -> CameraSource:
+def _camera_of_crop(where: str, raster: Raster, exif: Exif, taken: tuple[int, int]) -> FoundCamera:
     """Return the camera of a photo that was cropped after EXIF was written, when its size was ``taken``.
 
     It is assumed to have kept its resolution, unless it is far smaller or larger: then it is taken for a resized centre crop.
@@ -173,7 +203,7 @@ def _is_cropped(raster: Raster, taken: tuple[int, int]) -> bool:
     return not (same_aspect(taken, raster.size) or same_aspect(taken[::-1], raster.size))
 
 
-def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> CameraSource:
+def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> FoundCamera:
     """Return the camera of an image that is, or was cropped from, one of the size ``whole``."""
     if exif.equivalent_mm is not None:
         focal = exif.equivalent_mm / FILM_DIAGONAL * math.hypot(*whole)
@@ -189,7 +219,7 @@ def _by_exif(where: str, raster: Raster, exif: Exif, whole: tuple[int, int]) -> 
     )
 
 
-def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource | None:
+def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> FoundCamera | None:
     """Return the camera with the median focal length among those of the same aspect ratio, or else among centre crops.
 
     Where it is not known to which side the camera was turned, only its focal length is used.
@@ -202,83 +232,12 @@ def _assumed(raster: Raster, cameras: Sequence[Intrinsics]) -> CameraSource | No
     likely, *others = (median_camera(group) for group in groups)
     origin = f"camera unknown, assumed to be that of {'' if whole else 'centre crops of '}the map's images"
     if not others:
-        return CameraSource(likely, f"{origin}: {_focal(likely)}")
+        return FoundCamera(likely, f"{origin}: {_focal(likely)}")
     return _described(Intrinsics.from_focal(math.sqrt(likely.fx * likely.fy), *size), origin)
 
 
-def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> CameraSource:
+def _from_focal(where: str, raster: Raster, focal: float, origin: str) -> FoundCamera:
     try:
         return _described(Intrinsics.from_focal(focal, *raster.upright_size), origin)
     except InputError as error:
         raise InputError(f"{where}: EXIF: {error}; give its camera: {WAYS}") from error
-
-
-def read_camera(path: Path, size: tuple[int, int]) -> Intrinsics:
-    """Read the camera in the header of a ``transforms.json`` or ``cameras.json``, or in COLMAP's ``cameras.txt``.
-
-    JSON without ``w`` and ``h`` describes an image of ``size`` (width, height). Raises ``InputError`` for other files, for
-    lenses that are not perspective, and where ``cameras.txt`` holds several different cameras.
-    """
-    content = read_file(path, "a JSON file or COLMAP's cameras.txt")
-    if content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"["):
-        record = camera_record(parse_record(str(path), content))
-        return record.intrinsics(record.width or size[0], record.height or size[1])
-    cameras = _colmap_cameras(path, content)
-    if len(set(cameras.values())) != 1:
-        raise InputError(f"{path}: holds {len(cameras)} cameras, expected one; keep the line of this photo's")
-    return next(iter(cameras.values()))
-
-
-def read_text_cameras(path: Path) -> dict[int, Intrinsics]:
-    """Read COLMAP's ``cameras.txt`` and return its cameras by their ids. Raises ``InputError``."""
-    return _colmap_cameras(path, read_file(path, "COLMAP's cameras.txt"))
-
-
-def _colmap_cameras(path: Path, content: bytes) -> dict[int, Intrinsics]:
-    try:
-        lines = [line.partition("#")[0].split() for line in content.decode("utf-8-sig").splitlines()]
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: neither JSON nor text, expected transforms.json or cameras.txt "
-            "(COLMAP's model_converter makes it of cameras.bin)"
-        ) from error
-    found: dict[int, Intrinsics] = {}
-    for number, words in enumerate(lines, start=1):
-        if words:
-            key, camera = _text_camera(f"{path}: line {number}", words)
-            if found.setdefault(key, camera) != camera:
-                raise InputError(f"{path}: line {number}: camera {key} again, expected each id once")
-    return found
-
-
-def _text_camera(where: str, words: Sequence[str]) -> tuple[int, Intrinsics]:
-    """Read ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``."""
-    expected = "expected CAMERA_ID MODEL WIDTH HEIGHT and parameters"
-    if len(words) < 5:
-        raise InputError(f"{where} has {len(words)} entries, {expected}")
-    if words[1] not in COLMAP_MODELS:
-        raise InputError(f"{where}: camera model {words[1]}, expected one of {', '.join(COLMAP_MODELS)}")
-    try:
-        number, width, height = int(words[0]), int(words[2]), int(words[3])
-        parameters = [float(word) for word in words[4:]]
-    except ValueError as error:
-        raise InputError(f"{where}: {error}, {expected}") from error
-    return number, colmap_camera(where, words[1], width, height, parameters)
-
-
-def colmap_parameters(model: str) -> int:
-    """Return the number of parameters of one of ``COLMAP_MODELS``."""
-    return max(COLMAP_MODELS[model]) + 1
-
-
-def colmap_camera(where: str, model: str, width: int, height: int, parameters: Sequence[float]) -> Intrinsics:
-    """Return a camera of one of ``COLMAP_MODELS``. Raises ``InputError``, whose message begins with ``where``."""
-    if len(parameters) != colmap_parameters(model):
-        raise InputError(
-            f"{where}: {model} has {len(parameters)} parameters, expected {colmap_parameters(model)}"
-        )
-    fx, fy, cx, cy, *lens = (0.0 if place < 0 else parameters[place] for place in COLMAP_MODELS[model])
-    try:
-        return Intrinsics(fx, fy, cx, cy, width, height, tuple(lens) if any(lens) else ())
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error

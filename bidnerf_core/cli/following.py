@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.datasets.given_camera import GivenCamera
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import photos_in
@@ -47,9 +48,12 @@ class FrameRequest:
         time, unit = request.number("time"), request.number("depth_unit")
         return FrameRequest(Path(image), None if depth is None else Path(depth), time, unit)
 
-    def read(self, camera: GivenCamera, background: Background) -> Frame:
+    def read(self, camera: CameraSource, sensor: DepthCamera | None, background: Background) -> Frame:
         """Read the image and its depth. Raises ``InputError`` if they are not readable or the camera is not known."""
-        return camera.read(self.image, self.depth, self.depth_unit, background)
+        return Frame.read(
+            self.image, camera, depth=self.depth, depth_unit=self.depth_unit, sensor=sensor,
+            background=background,
+        )  # fmt: skip
 
 
 def requests(source: str) -> Iterator[FrameRequest | InputError]:

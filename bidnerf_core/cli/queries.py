@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.cli.options import UsageError, require, require_different
 from bidnerf_core.cli.output import read_views, say
-from bidnerf_core.datasets import READERS, Dataset, DepthRegistration, given_sensor, open_dataset
+from bidnerf_core.datasets import READERS, Dataset, DepthRegistration, ReadOptions, open_dataset
 from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.dataset import unique_names
-from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.errors import InputError, InputWarning, amount
@@ -133,8 +133,8 @@ class Photos:
             raise UsageError(
                 "--register-depth was given without --depth, expected measured depth to register"
             )
-        sensor = given_sensor("--register-depth", options.registration)
-        self._camera = GivenCamera(options.camera, options.focal, options.hfov, sensor, options.assumed)
+        self._sensor = ReadOptions(register_depth=options.registration).sensor("--register-depth")
+        self._camera = CameraSource(options.camera, options.focal, options.hfov, options.assumed)
         self._remarks: set[str] = set()
 
     @property
@@ -145,7 +145,10 @@ class Photos:
         file, options = self._files[place], self._options
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", InputWarning)
-            frame = self._camera.read(file, self._depth.get(file), options.depth_unit, self._background)
+            frame = Frame.read(
+                file, self._camera, depth=self._depth.get(file), depth_unit=options.depth_unit,
+                sensor=self._sensor, background=self._background,
+            )  # fmt: skip
         name = self._names[place]
         for warning in caught:
             self._remark(name, str(warning.message).partition(": ")[2] or str(warning.message))

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import tyro
 
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.cli.another_scene import question_about_scene
 from bidnerf_core.cli.camera_options import (
     CameraFile,
@@ -30,8 +31,8 @@ from bidnerf_core.cli.progress import counted
 from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.cli.tracked_path import TrackedPath, check_out
 from bidnerf_core.cli.tracking_video import TrackingVideo, check_video
-from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, given_sensor, open_sequence
-from bidnerf_core.datasets.given_camera import GivenCamera
+from bidnerf_core.datasets import FileSequence, FrameSequence, ReadOptions, TimedFrame, open_sequence
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
@@ -110,7 +111,7 @@ def run(arguments: list[str]) -> None:
         if video is not None:
             check_video(video)
         registration = depth_registration(register_depth)
-        sensor = given_sensor(sequence, registration) if follow else None
+        sensor = ReadOptions(register_depth=registration).sensor(sequence) if follow else None
         begin, settings = None if start is None else read_pose(start), AutoConfig(depth_sensor=depth_sensor)
         stored = opened_map(map)
         assumed = () if stored.landmarks is None else stored.landmarks.cameras
@@ -122,8 +123,8 @@ def run(arguments: list[str]) -> None:
             with drawn as drawing:
                 step = _Step(tracker, path, depth, drawing)
                 if follow:
-                    given = GivenCamera(camera, focal, hfov, sensor, assumed)
-                    _follow(str(sequence), step, given, stored.bounds.background)
+                    given = CameraSource(camera, focal, hfov, assumed)
+                    _follow(str(sequence), step, given, sensor, stored.bounds.background)
                 else:
                     frames = open_sequence(
                         sequence, camera=camera, focal=focal, hfov=hfov, assumed=assumed,
@@ -221,14 +222,17 @@ def _chosen(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputErr
             yield error
 
 
-def _follow(source: str, step: _Step, camera: GivenCamera, background: tuple[float, float, float]) -> None:
+def _follow(
+    source: str, step: _Step, camera: CameraSource, sensor: DepthCamera | None,
+    background: tuple[float, float, float],
+) -> None:  # fmt: skip
     """Answer each frame that arrives, at once, with one JSON object on a line of its own."""
     say(f"waiting for {'JSON lines on stdin' if source == STDIN else f'images in {source}'}; Ctrl-C ends")
     for request in requests(source):
         try:
             if isinstance(request, InputError):
                 raise request
-            frame = request.read(camera, background)
+            frame = request.read(camera, sensor, background)
             step(frame, request.time)
             print_json(step.path.plain(step.path.frames[-1]))
         except InputError as error:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, TypeAlias, runtime_checkable
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.colmap_project import ColmapReader
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
-from bidnerf_core.datasets.depth_registration import DepthCamera
-from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.image_folders import open_images
+from bidnerf_core.datasets.reader import DepthRegistration, Reader, ReadOptions
+from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.scanner_app import ScannerAppReader
 from bidnerf_core.datasets.sequence import (
     FileSequence,
@@ -22,10 +21,12 @@ from bidnerf_core.datasets.sequence import (
     sequence_of,
 )
 from bidnerf_core.datasets.seven_scenes import SevenScenesReader
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.datasets.transforms import TransformsReader
 from bidnerf_core.datasets.tum import TumReader
 from bidnerf_core.datasets.video import VIDEO_SUFFIXES, open_video
 from bidnerf_core.datasets.writing import write_transforms
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.frames.photos import photos_in
 from bidnerf_core.io.images import Background
@@ -33,72 +34,27 @@ from bidnerf_core.io.images import Background
 __all__ = [
     "READERS",
     "Background",
-    "CameraReader",
     "Dataset",
     "DepthCamera",
+    "DepthFile",
     "DepthRegistration",
-    "DepthSensorReader",
     "FileSequence",
     "FrameSequence",
+    "ReadOptions",
     "Reader",
     "ReadingProgress",
     "SequenceEntry",
-    "SequenceReader",
+    "SplitDataset",
+    "Splits",
     "TimedFrame",
-    "given_sensor",
+    "hold_out",
     "open_dataset",
     "open_sequence",
+    "read_rgbd",
+    "sequence_of",
     "write_transforms",
 ]
 
-
-@runtime_checkable
-class Reader(Protocol):
-    """A reader of one dataset format.
-
-    ``expected`` names the files that its folders hold, for error messages. ``recognises`` returns whether a folder has its
-    format. ``open`` returns the dataset and raises ``InputError`` if the folder cannot be used.
-    """
-
-    @property
-    def expected(self) -> str: ...
-
-    def recognises(self, path: Path) -> bool: ...
-
-    def open(self, path: Path, background: Background | None) -> Dataset: ...
-
-
-@runtime_checkable
-class SequenceReader(Protocol):
-    """A reader whose format records times, or frames that no split of the dataset has.
-
-    The sequences of other readers have the frames of all splits in the natural order of their names.
-    """
-
-    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence: ...
-
-
-@runtime_checkable
-class CameraReader(Protocol):
-    """A reader whose format has no camera in its files, so that the user may give one."""
-
-    def with_camera(self, camera: Intrinsics | Path) -> Reader: ...
-
-
-@runtime_checkable
-class DepthSensorReader(Protocol):
-    """A reader of a format whose depth may not be registered to its colour images."""
-
-    @property
-    def sensor(self) -> DepthCamera | None:
-        """The sensor from which depth is registered, unless another is given."""
-        ...
-
-    def with_depth_sensor(self, sensor: DepthCamera | None) -> Reader: ...
-
-
-DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
-"""The registration of depth to colour images: from a sensor or a file of one, from the format's own (True), or none (False)."""
 
 READERS: list[Reader] = [
     TransformsReader(),
@@ -134,8 +90,7 @@ def open_dataset(
     reader = _reader_of(folder, readers)
     if reader is None:
         raise InputError(f"{folder}: {_without_dataset(folder, readers)}")
-    reader = _with_sensor(_with_camera(reader, folder, GivenCamera(camera)), folder, register_depth)
-    return reader.open(folder, background)
+    return reader.open(folder, _options(reader, folder, CameraSource(camera), background, register_depth))
 
 
 def open_sequence(
@@ -157,7 +112,7 @@ def open_sequence(
     ``register_depth`` is as in ``open_dataset``; depth in a folder of images is registered if a sensor is given. Raises
     ``InputError`` where nothing is found, where a description is not usable, and for a missing or superfluous camera.
     """
-    place, given = Path(path), GivenCamera(camera, focal, hfov, assumed=tuple(assumed))
+    place, given = Path(path), CameraSource(camera, focal, hfov, tuple(assumed))
     if not place.exists():
         raise InputError(f"{place}: no such file or folder")
     if not place.is_dir():
@@ -170,37 +125,29 @@ def open_sequence(
         return open_video(place, given)
     reader = _reader_of(place, READERS if readers is None else readers)
     if reader is None:
-        return open_images(place, replace(given, sensor=given_sensor(place, register_depth)), background)
-    reader = _with_sensor(_with_camera(reader, place, given), place, register_depth)
-    if isinstance(reader, SequenceReader):
-        return reader.open_sequence(place, background)
-    return sequence_of(reader.open(place, background))
+        sensor = ReadOptions(register_depth=register_depth).sensor(place)
+        return open_images(place, given, sensor, background)
+    return reader.open_sequence(place, _options(reader, place, given, background, register_depth))
 
 
-def given_sensor(place: Path | str, register: DepthRegistration | None) -> DepthCamera | None:
-    """Return the sensor from which depth is registered, or None where depth is used as it is.
-
-    Raises ``InputError``, which begins with ``place``, for the format's own sensor (True), and as ``DepthCamera.read`` does.
-    """
-    if register is True:
-        raise InputError(
-            f"{place}: has no depth sensor that is known, expected a file of one (register_depth=)"
-        )
-    if register is None or register is False:
-        return None
-    return register if isinstance(register, DepthCamera) else DepthCamera.read(Path(register))
-
-
-def _with_sensor(reader: Reader, folder: Path, register: DepthRegistration | None) -> Reader:
-    if register is None or (register is False and not isinstance(reader, DepthSensorReader)):
-        return reader
-    if not isinstance(reader, DepthSensorReader):
+def _options(
+    reader: Reader,
+    folder: Path,
+    camera: CameraSource,
+    background: Background | None,
+    register: DepthRegistration | None,
+) -> ReadOptions:
+    """Return the options for a reader. Raises ``InputError`` for those that its format does not leave open."""
+    if camera.is_given and "camera" not in reader.accepts:
+        raise InputError(f"{folder}: is a dataset with cameras of its own, expected no other camera")
+    if camera.is_given and camera.camera is None:
+        raise InputError(f"{folder}: is a dataset, expected a camera with all its intrinsics (camera=)")
+    if register not in (None, False) and "register_depth" not in reader.accepts:
         raise InputError(
             f"{folder}: is a dataset whose depth belongs to its images, expected no registration; leave out register_depth"
         )
-    if register is True and reader.sensor is not None:
-        return reader
-    return reader.with_depth_sensor(given_sensor(folder, register))
+    given = camera.camera
+    return ReadOptions(background, Path(given) if isinstance(given, str) else given, register)
 
 
 def _without_dataset(folder: Path, readers: Sequence[Reader]) -> str:
@@ -222,13 +169,3 @@ def _without_dataset(folder: Path, readers: Sequence[Reader]) -> str:
 
 def _reader_of(folder: Path, readers: Sequence[Reader]) -> Reader | None:
     return next((reader for reader in readers if reader.recognises(folder)), None)
-
-
-def _with_camera(reader: Reader, folder: Path, given: GivenCamera) -> Reader:
-    if not given.is_given:
-        return reader
-    if not isinstance(reader, CameraReader):
-        raise InputError(f"{folder}: is a dataset with cameras of its own, expected no other camera")
-    if given.camera is None:
-        raise InputError(f"{folder}: is a dataset, expected a camera with all its intrinsics (camera=)")
-    return reader.with_camera(given.camera if isinstance(given.camera, Intrinsics) else Path(given.camera))

@@ -19,13 +19,13 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.source import (
+from bidnerf_core.camera.files import (
     COLMAP_MODEL_IDS,
     colmap_camera,
     colmap_parameters,
     read_text_cameras,
 )
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import read_file

@@ -17,18 +17,18 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import UPRIGHT
-from bidnerf_core.camera.source import Raster
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.colmap_files import ModelImage, has_posed_images, read_posed_images
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.reader import Reader, ReadOptions
+from bidnerf_core.datasets.rgbd import read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import natural_order
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import Background, over, read_header, read_image
 
 MODELS = ("sparse/0", "sparse", ".")
 """Possible places of a model, in order of preference; COLMAP writes the first of several models to ``sparse/0``."""
@@ -55,7 +55,7 @@ class ColmapFrame:
         return (*self.name.parts[:-1], self.stem)
 
 
-class ColmapReader:
+class ColmapReader(Reader):
     """The reader of folders of COLMAP projects."""
 
     expected = "images with a sparse model in sparse/0 (COLMAP)"
@@ -63,34 +63,27 @@ class ColmapReader:
     def recognises(self, path: Path) -> bool:
         return _model_of(path) is not None
 
-    def open(self, path: Path, background: Background | None) -> Dataset:
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Read the model. Raises ``InputError`` where it is damaged or has no registered image."""
-        return self._open(path, background)
+        return self._open(path, options)
 
-    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
-        return self._open(path, background).sequence()
+    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
+        return self._open(path, options).sequence()
 
-    def _open(self, path: Path, background: Background | None) -> ColmapDataset:
+    def _open(self, path: Path, options: ReadOptions) -> ColmapDataset:
         model = _model_of(path)
         assert model is not None  # recognises ensures it
-        return ColmapDataset(Splits(path, hold_out(_frames(path, model))), background)
+        return ColmapDataset(Splits(path, hold_out(_frames(path, model))), options.background)
 
 
-class ColmapDataset(OpaqueDataset[ColmapFrame]):
+class ColmapDataset(SplitDataset[ColmapFrame]):
     """Views of a COLMAP project; see ``Dataset``."""
 
-    def _view(self, frame: ColmapFrame, name: str) -> View:
-        header = read_header(frame.image)
-        camera = Raster(header.width, header.height, UPRIGHT).upright(frame.camera)
-        if camera is None:
-            raise InputError(
-                f"{frame.image}: image is {header.width}x{header.height}, its camera in the model "
-                f"{frame.camera.width}x{frame.camera.height}; expected the same aspect ratio"
-            )
-        colour, alpha = read_image(frame.image)
-        return View(
-            Frame(name, over(colour, alpha, self._background), camera, None, alpha), frame.T_world_camera
-        )
+    def _frame(self, frame: ColmapFrame, name: str) -> Frame:
+        return read_rgbd(name, frame.image, CameraSource(frame.camera).at(frame.image), self._background)
+
+    def _pose(self, frame: ColmapFrame) -> SE3:
+        return frame.T_world_camera
 
 
 def _model_of(path: Path) -> Path | None:

@@ -5,21 +5,24 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.datasets.dataset import unique_names
-from bidnerf_core.datasets.given_camera import GivenCamera
 from bidnerf_core.datasets.sequence import FileSequence, SequenceEntry, timestamp
 from bidnerf_core.depth.images import MILLIMETRE
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import DEPTH_STEM, photos_in
 from bidnerf_core.io.images import Background
 
 
-def open_images(folder: Path, camera: GivenCamera, background: Background | None = None) -> FileSequence:
+def open_images(
+    folder: Path, camera: CameraSource, sensor: DepthCamera | None, background: Background | None = None
+) -> FileSequence:
     """Return the images of a folder, by time if all names are times (``12.345.png``), else in the natural order of names.
 
     ``NAME.depth.png`` (millimetres) next to ``NAME.png`` is its depth, as ``bidnerf render`` writes it. Images have the given
-    camera, or that of their EXIF, as in ``Frame.open``. Raises ``InputError`` where there is no image.
+    camera, or that of their EXIF, as in ``Frame.open``; depth is registered from ``sensor``, if there is one. Raises ``InputError`` where there is no image.
     """
     photos, _ = photos_in(folder)
     if not photos:
@@ -30,7 +33,8 @@ def open_images(folder: Path, camera: GivenCamera, background: Background | None
         beside = photo.with_name(f"{photo.stem}{DEPTH_STEM}.png")
         depth, unit = (beside, MILLIMETRE) if beside.is_file() else (None, None)
         behind: Background = "black" if background is None else background
-        return camera.read(photo, depth, unit, behind), None
+        frame = Frame.read(photo, camera, depth=depth, depth_unit=unit, sensor=sensor, background=behind)
+        return frame, None
 
     return FileSequence.ordered(
         folder,

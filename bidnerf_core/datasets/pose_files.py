@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core.datasets.poses import rigid_pose
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.pose_rows import rigid_pose
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import open_binary
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,19 +31,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
-from bidnerf_core.camera.orientation import UPRIGHT
 from bidnerf_core.camera.source import Raster
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.poses import pose_of_rows
+from bidnerf_core.datasets.reader import Reader, ReadOptions
+from bidnerf_core.datasets.rgbd import read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.depth.images import MILLIMETRE, DepthImage, read_depth_image
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import fit_depth
+from bidnerf_core.geometry.pose_rows import pose_of_rows
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import read_file
-from bidnerf_core.io.images import Background, decode, over, read_header, read_image, reduced
+from bidnerf_core.io.images import Background, decode, reduced
 from bidnerf_core.io.json import Record, read_record
 
 LARGEST_SIDE = 640
@@ -85,7 +87,7 @@ class ScannerFrame:
 
 
 @dataclass(frozen=True)
-class ScannerAppReader:
+class ScannerAppReader(Reader):
     """The reader of folders of "3D Scanner App"; ``largest`` limits the longer side of its photos (pixels)."""
 
     largest: int = LARGEST_SIDE
@@ -99,58 +101,57 @@ class ScannerAppReader:
         except InputError:
             return False
 
-    def open(self, path: Path, background: Background | None) -> Dataset:
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Read all descriptions. Raises ``InputError`` where one is missing or not usable."""
-        return ScannerAppDataset(Splits(path, hold_out(scanner_frames(path))), background, self.largest)
+        return self._dataset(path, options)
 
-    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         """Read all descriptions, including those of frames that have only depth."""
+        return self._dataset(path, options).sequence(depth_frames(path))
+
+    def _dataset(self, path: Path, options: ReadOptions) -> ScannerAppDataset:
         splits = Splits(path, hold_out(scanner_frames(path)))
-        return ScannerAppDataset(splits, background, self.largest).sequence(depth_frames(path))
+        return ScannerAppDataset(splits, options.background, self.largest)
 
 
-class ScannerAppDataset(OpaqueDataset[ScannerFrame]):
+class ScannerAppDataset(SplitDataset[ScannerFrame]):
     """Views of a folder of "3D Scanner App"; see ``Dataset``."""
 
     def __init__(self, frames: Splits[ScannerFrame], background: Background | None, largest: int) -> None:
         super().__init__(frames, background)
         self._largest = largest
 
-    def _view(self, frame: ScannerFrame, name: str) -> View:
-        return (
-            self._between(frame, name) if frame.photo is None else self._with_photo(frame, frame.photo, name)
-        )
+    def _pose(self, frame: ScannerFrame) -> SE3:
+        return frame.T_world_camera
 
-    def _with_photo(self, frame: ScannerFrame, photo: Path, name: str) -> View:
-        header = read_header(photo)
-        camera = scanner_camera(frame.record, header.width, header.height)
+    def _frame(self, frame: ScannerFrame, name: str) -> Frame:
+        return _between(frame, name) if frame.photo is None else self._with_photo(frame, frame.photo, name)
+
+    def _with_photo(self, frame: ScannerFrame, photo: Path, name: str) -> Frame:
+        whole = read_rgbd(name, photo, partial(scanner_camera, frame.record), self._background)
+        camera = whole.intrinsics
         small = camera.scaled(min(1.0, self._largest / max(camera.width, camera.height)))
-        colour, alpha = read_image(photo)
-        rgb = over(colour, alpha, self._background)
-        if small != camera:
-            rgb = reduced(rgb, small.width, small.height)
+        rgb = whole.rgb if small == camera else reduced(whole.rgb, small.width, small.height)
         depth = None
         if frame.has_depth:
-            raster = Raster(camera.width, camera.height, UPRIGHT)
             measured = read_measured(frame.beside("depth"), frame.beside("conf"))
-            depth = fit_depth(
-                measured, raster, (small.width, small.height), f"{frame.beside('depth')}: depth"
-            )
-        return View(Frame(name, rgb, small, depth), frame.T_world_camera)
+            raster, where = Raster(camera.width, camera.height), f"{frame.beside('depth')}: depth"
+            depth = fit_depth(measured, raster, (small.width, small.height), where)
+        return Frame(name, rgb, small, depth)
 
-    def _between(self, frame: ScannerFrame, name: str) -> View:
-        """Read a frame that has only depth. Its description holds the camera of a photo that was not saved."""
-        depth = read_measured(frame.beside("depth"), frame.beside("conf")).metres
-        height, width = depth.shape
-        photo_width, photo_height = projected_size(frame.record)
-        if not same_aspect((width, height), (photo_width, photo_height)):
-            raise InputError(
-                f"{frame.beside('depth')}: depth is {width}x{height}, its camera's photos are "
-                f"{photo_width}x{photo_height}; expected the same aspect ratio"
-            )
-        camera = scanner_camera(frame.record, photo_width, photo_height).resized(width, height)
-        black = torch.zeros(height, width, 3)
-        return View(Frame(name, black, camera, depth, has_colour=False), frame.T_world_camera)
+
+def _between(frame: ScannerFrame, name: str) -> Frame:
+    """Read a frame that has only depth. Its description holds the camera of a photo that was not saved."""
+    depth = read_measured(frame.beside("depth"), frame.beside("conf")).metres
+    height, width = depth.shape
+    photo_width, photo_height = projected_size(frame.record)
+    if not same_aspect((width, height), (photo_width, photo_height)):
+        raise InputError(
+            f"{frame.beside('depth')}: depth is {width}x{height}, its camera's photos are "
+            f"{photo_width}x{photo_height}; expected the same aspect ratio"
+        )
+    camera = scanner_camera(frame.record, photo_width, photo_height).resized(width, height)
+    return Frame(name, torch.zeros(height, width, 3), camera, depth, has_colour=False)
 
 
 def scanner_frames(folder: Path) -> list[ScannerFrame]:

@@ -20,25 +20,27 @@ is that of the colour images; without registration, it is that of the depth imag
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.depth_registration import DepthCamera
-from bidnerf_core.datasets.folder_camera import FolderCamera
 from bidnerf_core.datasets.pose_files import read_pose_matrix
+from bidnerf_core.datasets.reader import Reader, ReadOptions
+from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.depth.images import MILLIMETRE, DepthReader
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import natural_order
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import read_file
-from bidnerf_core.io.images import Background, over, read_header, read_image
+from bidnerf_core.io.images import Background
 
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
 COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)
@@ -88,24 +90,19 @@ class SceneFrame:
         return self.image.with_name(f"{self.stem}.pose.txt")
 
 
-@dataclass(frozen=True)
-class SevenScenesReader:
-    """The reader of folders of 7-Scenes; poses and depth are moved from ``sensor`` to the colour camera, if there is one."""
+class SevenScenesReader(Reader):
+    """The reader of folders of 7-Scenes.
 
-    sensor: DepthCamera | None = SEVEN_SCENES_KINECT
-    camera: Intrinsics | Path | None = None
+    Poses and depth are moved from a depth sensor to the colour camera: that of a Kinect, unless another or none is given.
+    """
+
+    accepts = ("camera", "register_depth")
     expected = "frame-000000.color.png ... in the folder or in seq-01 ... (7-Scenes)"
 
     def recognises(self, path: Path) -> bool:
         return any(_has_frames(folder) for folder in (path, *_sequence_folders(path).values()))
 
-    def with_camera(self, camera: Intrinsics | Path) -> SevenScenesReader:
-        return replace(self, camera=camera)
-
-    def with_depth_sensor(self, sensor: DepthCamera | None) -> SevenScenesReader:
-        return replace(self, sensor=sensor)
-
-    def open(self, path: Path, background: Background | None) -> Dataset:
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
         """List the frames. Raises ``InputError`` where one lacks a pose, and for split files that are not usable."""
         splits = _splits(path)
         for frames in splits.values():
@@ -114,30 +111,30 @@ class SevenScenesReader:
                     raise InputError(
                         f"{frame.pose}: no such file, expected it as {frame.image.name} is there"
                     )
-        return self._dataset(path, splits, background)
+        return self._dataset(path, splits, options)
 
-    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         """List the frames, including those without a pose."""
         splits = _splits(path)
         posed = {split: [frame for frame in group if frame.pose.is_file()] for split, group in splits.items()}
         unposed = {frame: None for group in splits.values() for frame in group if not frame.pose.is_file()}
-        return self._dataset(path, {s: g for s, g in posed.items() if g}, background).sequence(list(unposed))
+        return self._dataset(path, {s: g for s, g in posed.items() if g}, options).sequence(list(unposed))
 
     def _dataset(
-        self, path: Path, splits: dict[str, list[SceneFrame]], background: Background | None
+        self, path: Path, splits: dict[str, list[SceneFrame]], options: ReadOptions
     ) -> SevenScenesDataset:
-        published = DEPTH_CAMERA if self.sensor is None else COLOUR_CAMERA
-        camera = FolderCamera(path, self.camera, published)
-        return SevenScenesDataset(Splits(path, splits), camera, self.sensor, background)
+        sensor = options.sensor(path, SEVEN_SCENES_KINECT)
+        camera = folder_camera(path, options.camera, DEPTH_CAMERA if sensor is None else COLOUR_CAMERA)
+        return SevenScenesDataset(Splits(path, splits), camera, sensor, options.background)
 
 
-class SevenScenesDataset(OpaqueDataset[SceneFrame]):
+class SevenScenesDataset(SplitDataset[SceneFrame]):
     """Views of a folder of 7-Scenes; see ``Dataset``."""
 
     def __init__(
         self,
         frames: Splits[SceneFrame],
-        camera: FolderCamera,
+        camera: CameraSource,
         sensor: DepthCamera | None,
         background: Background | None,
     ) -> None:
@@ -145,33 +142,19 @@ class SevenScenesDataset(OpaqueDataset[SceneFrame]):
         self._camera, self._sensor = camera, sensor
         self._read_depth = DepthReader(documented=("65535",))
 
-    def _view(self, frame: SceneFrame, name: str) -> View:
-        return View(self._frame(frame, name), self._pose(frame))
-
-    def _posed(self, frame: SceneFrame, name: str) -> tuple[Frame, SE3 | None]:
-        return self._frame(frame, name), self._pose(frame) if frame.pose.is_file() else None
-
-    def _pose(self, frame: SceneFrame) -> SE3:
+    def _pose(self, frame: SceneFrame) -> SE3 | None:
+        if not frame.pose.is_file():
+            return None
         T_world_depth = read_pose_matrix(frame.pose)
         return (
             T_world_depth if self._sensor is None else T_world_depth @ self._sensor.T_colour_depth.inverse()
         )
 
     def _frame(self, frame: SceneFrame, name: str) -> Frame:
-        header = read_header(frame.image)
-        camera = self._camera.at(frame.image, header.width, header.height)
-        colour, alpha = read_image(frame.image)
         depth = None
         if frame.depth.is_file():
-            depth = self._read_depth(frame.depth, MILLIMETRE).metres
-            if self._sensor is not None:
-                depth = self._sensor.registered(depth, camera, frame.depth)
-            elif depth.shape != colour.shape[:2]:
-                raise InputError(
-                    f"{frame.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
-                    "as the colour image"
-                )
-        return Frame(name, over(colour, alpha, self._background), camera, depth, alpha)
+            depth = DepthFile(frame.depth, MILLIMETRE, self._read_depth, self._sensor)
+        return read_rgbd(name, frame.image, self._camera.at(frame.image), self._background, depth)
 
 
 def _splits(path: Path) -> dict[str, list[SceneFrame]]:

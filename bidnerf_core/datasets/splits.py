@@ -88,10 +88,11 @@ class Splits(Generic[F]):
 
 
 class SplitDataset(ABC, Generic[F]):
-    """A ``Dataset`` whose frames are described by ``Splits``; subclasses read a frame and define the background."""
+    """A ``Dataset`` whose frames are described by ``Splits``; subclasses read the image and the pose of a frame."""
 
-    def __init__(self, frames: Splits[F]) -> None:
+    def __init__(self, frames: Splits[F], background: Background | None = None) -> None:
         self._frames = frames
+        self._background = background_colour("black" if background is None else background)
 
     @property
     def path(self) -> Path:
@@ -102,8 +103,9 @@ class SplitDataset(ABC, Generic[F]):
         return self._frames.splits
 
     @property
-    @abstractmethod
-    def background(self) -> tuple[float, float, float]: ...
+    def background(self) -> tuple[float, float, float]:
+        """The requested colour, or black, as images of most formats have no alpha channel."""
+        return self._background
 
     def frame_names(self, split: str) -> list[str]:
         return self._frames.names(split)
@@ -114,7 +116,9 @@ class SplitDataset(ABC, Generic[F]):
         frames = self._frames.select(split, names)
         views = []
         for done, (name, frame) in enumerate(frames, start=1):
-            views.append(self._view(frame, name))
+            found, truth = self._posed(frame, name)
+            assert truth is not None  # only frames with a pose are in splits
+            views.append(View(found, truth))
             if progress is not None:
                 progress(done, len(frames))
         return views
@@ -136,26 +140,15 @@ class SplitDataset(ABC, Generic[F]):
         )
 
     def _posed(self, frame: F, name: str) -> tuple[Frame, SE3 | None]:
-        """Read a frame of a sequence, and its pose where there is one."""
-        view = self._view(frame, name)
-        return view.frame, view.T_ref_camera
+        return self._frame(frame, name), self._pose(frame)
 
     @abstractmethod
-    def _view(self, frame: F, name: str) -> View:
+    def _frame(self, frame: F, name: str) -> Frame:
         """Read the frame's image and depth. Raises ``InputError`` where a file is missing or not usable."""
 
-
-class OpaqueDataset(SplitDataset[F]):
-    """A ``SplitDataset`` of images that usually have no alpha channel: the background is black unless it is given."""
-
-    def __init__(self, frames: Splits[F], background: Background | None) -> None:
-        super().__init__(frames)
-        self._background = background_colour("black" if background is None else background)
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """The requested colour, or black."""
-        return self._background
+    @abstractmethod
+    def _pose(self, frame: F) -> SE3 | None:
+        """Return ``T_world_camera``, or None where the recording does not have it."""
 
 
 def hold_out(frames: list[F]) -> dict[str, list[F]]:

@@ -21,20 +21,24 @@ from __future__ import annotations
 from functools import cached_property
 from pathlib import Path
 
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
+from bidnerf_core.datasets.reader import Reader, ReadOptions
+from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits
 from bidnerf_core.datasets.transforms_json import SPLITS, FrameRecord, file_of, read_splits
 from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import Background, background_colour, over, read_header, read_image
+from bidnerf_core.io.images import Background, background_colour, read_header
 
 TRIED_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 
 
-class TransformsReader:
+class TransformsReader(Reader):
     """The reader of folders with ``transforms*.json``."""
 
     expected = "transforms.json or transforms_train.json, transforms_val.json, transforms_test.json"
@@ -42,11 +46,11 @@ class TransformsReader:
     def recognises(self, path: Path) -> bool:
         return any((path / name).is_file() for name in ("transforms.json", *map(file_of, SPLITS)))
 
-    def open(self, path: Path, background: Background | None) -> Dataset:
-        return TransformsDataset(path, read_splits(path), background)
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
+        return TransformsDataset(path, read_splits(path), options.background)
 
-    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
-        return TransformsDataset(path, read_splits(path), background).sequence()
+    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
+        return TransformsDataset(path, read_splits(path), options.background).sequence()
 
 
 class TransformsDataset(SplitDataset[FrameRecord]):
@@ -55,9 +59,9 @@ class TransformsDataset(SplitDataset[FrameRecord]):
     def __init__(
         self, path: Path, frames: dict[str, list[FrameRecord]], background: Background | None = None
     ) -> None:
-        super().__init__(Splits(path, frames))
+        super().__init__(Splits(path, frames), background)
         self._read_depth = DepthReader()
-        self._background = None if background is None else background_colour(background)
+        self._by_images = background is None
         self._first: tuple[str, int, int] | None = (
             None  # file, width and height of the first image whose camera has no size
         )
@@ -65,33 +69,28 @@ class TransformsDataset(SplitDataset[FrameRecord]):
     @cached_property
     def background(self) -> tuple[float, float, float]:
         """The requested colour; by default white if the first image of a split has an alpha channel, else black."""
-        if self._background is not None:
-            return self._background
-        return background_colour("white" if any(map(self._has_alpha, self._frames.first())) else "black")
+        if self._by_images and any(map(self._has_alpha, self._frames.first())):
+            return background_colour("white")
+        return self._background
 
     def image_file(self, split: str, name: str) -> Path:
         """Return the image file of a frame. Raises ``InputError`` where there is none."""
         ((_, frame),) = self._frames.select(split, [name])
         return self._image_file(frame)
 
-    def _view(self, frame: FrameRecord, name: str) -> View:
-        path = self._image_file(frame)
-        header = read_header(path)
-        width, height = header.width, header.height
-        self._check_size(frame, path, width, height)  # before memory is allocated for the pixels
-        colour, alpha = read_image(path)
-        depth = None
+    def _frame(self, frame: FrameRecord, name: str) -> Frame:
+        path, depth = self._image_file(frame), None
         if frame.depth_path is not None:
-            depth = self._read_depth(self._depth_file(frame), frame.depth_unit).metres
-            if depth.shape != colour.shape[:2]:
-                found = f"{depth.shape[1]}x{depth.shape[0]}"
-                raise frame.record.error(
-                    f"{frame.depth_path} is {found}, expected {width}x{height} as its image"
-                )
-        rgb = over(colour, alpha, self.background)
-        return View(
-            Frame(name, rgb, frame.camera.intrinsics(width, height), depth, alpha), frame.T_world_camera
-        )
+            depth = DepthFile(self._depth_file(frame), frame.depth_unit, self._read_depth)
+
+        def camera_of(width: int, height: int) -> Intrinsics:
+            self._check_size(frame, path, width, height)
+            return frame.camera.intrinsics(width, height)
+
+        return read_rgbd(name, path, camera_of, self.background, depth)
+
+    def _pose(self, frame: FrameRecord) -> SE3:
+        return frame.T_world_camera
 
     def _image_file(self, frame: FrameRecord) -> Path:
         tried = [Path(f"{self.path / frame.file_path}{suffix}") for suffix in TRIED_SUFFIXES]

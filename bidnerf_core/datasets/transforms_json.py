@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from bidnerf_core.camera.records import CameraRecord, camera_record
-from bidnerf_core.datasets.poses import pose
+from bidnerf_core.camera.files import CameraRecord, camera_record
 from bidnerf_core.datasets.sequence import timestamp
 from bidnerf_core.datasets.splits import hold_out
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.pose_rows import pose
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import IMAGE_SUFFIXES
 from bidnerf_core.io.json import Record, read_record

@@ -22,25 +22,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.depth_registration import DepthCamera
-from bidnerf_core.datasets.folder_camera import FolderCamera
+from bidnerf_core.datasets.reader import Reader, ReadOptions
+from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
-from bidnerf_core.datasets.splits import OpaqueDataset, Splits, hold_out
+from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
 from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows, require_distinct_times
 from bidnerf_core.datasets.trajectories import LARGEST_GAP, read_trajectory
 from bidnerf_core.depth.images import DepthReader
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import is_file
-from bidnerf_core.io.images import Background, over, read_header, read_image
+from bidnerf_core.io.images import Background
 
 COLOUR_LIST, DEPTHS, TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 METRES_PER_STEP = 1 / 5000
@@ -57,7 +59,7 @@ SENSOR = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class DepthFile:
+class ListedDepth:
     """A depth image of the list."""
 
     where: str
@@ -71,7 +73,7 @@ class TumFrame:
     where: str  # the file and line that lists it
     image: Path
     time: float
-    depth: DepthFile | None
+    depth: ListedDepth | None
     truth: SE3 | None  # T_world_camera
 
     @property
@@ -83,28 +85,20 @@ class TumFrame:
         return (*self.image.parts[:-1], self.stem)
 
 
-@dataclass(frozen=True)
-class TumReader:
+class TumReader(Reader):
     """The reader of folders of the TUM RGB-D benchmark.
 
-    ``camera`` (intrinsics or a file) takes precedence over all others; depth is registered from ``sensor``, if there is one.
+    A camera that is given (intrinsics, a file, or the name of one of the benchmark's sensors) takes precedence over all others;
+    depth is registered from the sensor that is given, if there is one.
     """
 
-    camera: Intrinsics | Path | None = None
-    sensor: DepthCamera | None = None
+    accepts = ("camera", "register_depth")
     expected = "rgb.txt with depth.txt and groundtruth.txt (TUM RGB-D)"
 
     def recognises(self, path: Path) -> bool:
         return (path / COLOUR_LIST).is_file()
 
-    def with_camera(self, camera: Intrinsics | Path) -> TumReader:
-        """Return a reader with this camera; a path may also be the name of one of the benchmark's sensors."""
-        return replace(self, camera=_named_camera(camera) or camera)
-
-    def with_depth_sensor(self, sensor: DepthCamera | None) -> TumReader:
-        return replace(self, sensor=sensor)
-
-    def open(self, path: Path, background: Background | None) -> Dataset:
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
         """Read the lists. Raises ``InputError`` where one is missing or broken, and where no frame has a pose."""
         if not (path / TRUTH).is_file():
             raise InputError(f"{path / TRUTH}: no such file, expected the poses of the frames of a dataset")
@@ -114,33 +108,30 @@ class TumReader:
                 f"{path / TRUTH}: covers no image of {COLOUR_LIST}, expected samples before and after their times, "
                 f"at most {LARGEST_GAP:g} s apart"
             )
-        return self._dataset(path, hold_out(posed), background)
+        return self._dataset(path, hold_out(posed), options)
 
-    def open_sequence(self, path: Path, background: Background | None) -> FrameSequence:
+    def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         """Read the lists; the sequence includes frames without a pose, and has only these if there is no ground truth."""
         frames = tum_frames(path)
         posed = [frame for frame in frames if frame.truth is not None]
         unposed = [frame for frame in frames if frame.truth is None]
         splits = hold_out(posed) if posed else {}
-        return self._dataset(path, splits, background).sequence(unposed)
+        return self._dataset(path, splits, options).sequence(unposed)
 
-    def _dataset(
-        self, path: Path, splits: dict[str, list[TumFrame]], background: Background | None
-    ) -> TumDataset:
-        unknown = f"its name says none of {SENSORS}"
-        camera = FolderCamera(
-            path, self.camera, published_camera(path), unknown, f"one of {SENSORS}, or a file"
-        )
-        return TumDataset(Splits(path, splits), camera, self.sensor, background)
+    def _dataset(self, path: Path, splits: dict[str, list[TumFrame]], options: ReadOptions) -> TumDataset:
+        given = None if options.camera is None else _named_camera(options.camera) or options.camera
+        unknown, ways = f"its name says none of {SENSORS}", f"one of {SENSORS}, or a file"
+        camera = folder_camera(path, given, published_camera(path), unknown, ways)
+        return TumDataset(Splits(path, splits), camera, options.sensor(path), options.background)
 
 
-class TumDataset(OpaqueDataset[TumFrame]):
+class TumDataset(SplitDataset[TumFrame]):
     """Views of a folder of the TUM RGB-D benchmark; see ``Dataset``."""
 
     def __init__(
         self,
         frames: Splits[TumFrame],
-        camera: FolderCamera,
+        camera: CameraSource,
         sensor: DepthCamera | None,
         background: Background | None,
     ) -> None:
@@ -148,29 +139,17 @@ class TumDataset(OpaqueDataset[TumFrame]):
         self._camera, self._sensor = camera, sensor
         self._read_depth = DepthReader(documented=("65535",))
 
-    def _view(self, frame: TumFrame, name: str) -> View:
-        found, truth = self._posed(frame, name)
-        assert truth is not None  # only frames with a pose are in splits
-        return View(found, truth)
-
-    def _posed(self, frame: TumFrame, name: str) -> tuple[Frame, SE3 | None]:
+    def _frame(self, frame: TumFrame, name: str) -> Frame:
         for listed in (frame, frame.depth):
             if listed is not None and not is_file(listed.image):
                 raise InputError(f"{listed.where}: no image {listed.image}, expected that file")
-        header = read_header(frame.image)
-        camera = self._camera.at(frame.image, header.width, header.height)
-        colour, alpha = read_image(frame.image)
         depth = None
         if frame.depth is not None:
-            depth = self._read_depth(frame.depth.image, METRES_PER_STEP).metres
-            if self._sensor is not None:
-                depth = self._sensor.registered(depth, camera, frame.depth.image)
-            elif depth.shape != colour.shape[:2]:
-                raise InputError(
-                    f"{frame.depth.image}: depth is {depth.shape[1]}x{depth.shape[0]}, expected {header.width}x{header.height} "
-                    "as its colour image, to which it is registered"
-                )
-        return Frame(name, over(colour, alpha, self._background), camera, depth, alpha), frame.truth
+            depth = DepthFile(frame.depth.image, METRES_PER_STEP, self._read_depth, self._sensor)
+        return read_rgbd(name, frame.image, self._camera.at(frame.image), self._background, depth)
+
+    def _pose(self, frame: TumFrame) -> SE3 | None:
+        return frame.truth
 
 
 def published_camera(folder: Path) -> Intrinsics | None:
@@ -191,7 +170,7 @@ def tum_frames(folder: Path) -> list[TumFrame]:
     depths = _listed(folder / DEPTHS) if (folder / DEPTHS).is_file() else []
     path = read_trajectory(folder / TRUTH) if (folder / TRUTH).is_file() else None
     partners = associate([row.time for row in colours], [row.time for row in depths], LARGEST_DIFFERENCE)
-    files = [DepthFile(row.where, folder / row.words[0]) for row in depths]
+    files = [ListedDepth(row.where, folder / row.words[0]) for row in depths]
     return [
         TumFrame(
             row.where,

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from bidnerf_core.datasets.given_camera import GivenCamera
+from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.datasets.sequence import TimedFrame
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
@@ -58,7 +58,7 @@ class Video:
     """
 
     path: Path
-    camera: GivenCamera
+    camera: CameraSource
     ffmpeg: str
     count: int
 
@@ -72,14 +72,14 @@ class Video:
 
     def _frame(self, pixels: UInt8[np.ndarray, "h w 3"], number: int) -> Frame:
         rgb = torch.from_numpy(pixels.astype(np.float32) / 255)
-        found = self.camera.of(self.path, pixels.shape[1], pixels.shape[0])
+        found = self.camera.find(self.path, Raster(pixels.shape[1], pixels.shape[0]))
         return Frame(
             f"{number:06d}", rgb, found.intrinsics, camera_source=found.description,
             focal_is_approximate=found.approximate,
         )  # fmt: skip
 
 
-def open_video(path: Path, camera: GivenCamera) -> Video:
+def open_video(path: Path, camera: CameraSource) -> Video:
     """Open a video file. Raises ``InputError`` if it is not one, if there is no camera, and if the extra is missing."""
     try:
         from imageio_ffmpeg import get_ffmpeg_exe

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import UPRIGHT
-from bidnerf_core.camera.source import Raster
+from bidnerf_core.camera.source import CameraSource, Raster
 from bidnerf_core.depth.images import depth_image
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.frames.photos import fit_depth, read_photo
 from bidnerf_core.geometry.se3 import SE3
@@ -116,30 +116,40 @@ class Frame:
         Raises ``InputError`` where a file is not readable or has more than 100 megapixels, where the camera is not known or
         given twice, and where camera or depth belong to an image of another aspect ratio.
         """
+        given = CameraSource(camera, focal, hfov, tuple(assumed))
+        return Frame.read(
+            path, given, depth=depth, depth_unit=depth_unit, background=background, largest=largest
+        )
+
+    @staticmethod
+    def read(
+        path: str | Path,
+        camera: CameraSource,
+        *,
+        depth: str | Path | None = None,
+        depth_unit: float | None = None,
+        sensor: DepthCamera | None = None,
+        background: Background = BLACK,
+        largest: int | None = None,
+    ) -> Frame:
+        """Read a photo as ``open`` does; depth is registered to it from ``sensor``, if there is one."""
         path = Path(path)
         photo = read_photo(
             path,
+            camera,
             depth=None if depth is None else Path(depth),
-            camera=camera,
-            focal=focal,
-            hfov=hfov,
-            assumed=assumed,
             depth_unit=depth_unit,
+            sensor=sensor,
             background=background,
             largest=largest,
         )
         if photo.remark is not None:
-            warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=2)
-        source = photo.camera
+            warnings.warn(f"{depth}: {photo.remark}", InputWarning, stacklevel=3)
+        found = photo.camera
         return Frame(
-            path.stem,
-            photo.rgb,
-            source.intrinsics,
-            photo.depth,
-            photo.alpha,
-            source.description,
-            source.approximate,
-        )
+            path.stem, photo.rgb, found.intrinsics, photo.depth, photo.alpha, found.description,
+            found.approximate,
+        )  # fmt: skip
 
     @staticmethod
     def from_numpy(
@@ -169,7 +179,7 @@ class Frame:
                     f"{where}: rgb has an alpha channel, and alpha is given; expected one of them"
                 )
             cover = _mask(alpha, (colour.shape[1], colour.shape[0]), where)
-        raster = Raster(colour.shape[1], colour.shape[0], UPRIGHT)
+        raster = Raster(colour.shape[1], colour.shape[0])
         intrinsics = raster.upright(camera)
         if intrinsics is None:
             found, expected = f"{raster.width}x{raster.height}", f"{camera.width}x{camera.height}"

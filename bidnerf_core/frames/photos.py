@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,9 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.exif import read_exif
-from bidnerf_core.camera.intrinsics import Intrinsics, same_aspect
-from bidnerf_core.camera.source import CameraSource, Raster, find_camera
+from bidnerf_core.camera.intrinsics import same_aspect
+from bidnerf_core.camera.source import CameraSource, FoundCamera, Raster
 from bidnerf_core.depth.images import DepthImage, read_depth_image
+from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.images import (
     HEIF_SUFFIXES,
@@ -37,38 +37,43 @@ class Photo:
 
     rgb: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"] | None  # 1 where the scene covers the pixel
-    camera: CameraSource
+    camera: FoundCamera
     depth: Float[Tensor, "h w"] | None  # planar z in metres, 0 where nothing was measured
     remark: str | None  # one line on the assumptions that were made about depth
 
 
 def read_photo(
     path: Path,
+    camera: CameraSource,
     *,
     depth: Path | None = None,
-    camera: Intrinsics | str | Path | None = None,
-    focal: float | None = None,
-    hfov: float | None = None,
-    assumed: Sequence[Intrinsics] = (),
     depth_unit: float | None = None,
+    sensor: DepthCamera | None = None,
     background: Background = (0.0, 0.0, 0.0),
     largest: int | None = None,
 ) -> Photo:
-    """Read an image file and find its camera, as ``Frame.open`` describes it; raises ``InputError`` as that does."""
+    """Read an image file and find its camera, as ``Frame.open`` describes it; raises ``InputError`` as that does.
+
+    Depth is registered to the image from ``sensor``, if there is one.
+    """
     colour_behind = background_colour(background)
     header, exif = read_header(path), read_exif(path)
     raster = Raster(header.width, header.height, exif.orientation)
-    source = find_camera(str(path), raster, exif, camera, focal, hfov, assumed)
+    found = camera.find(path, raster, exif)
     measured = None if depth is None else read_depth_image(depth, depth_unit)
-    source, size = _limited(source, largest)
+    found, size = _limited(found, largest)
     colour, alpha = read_image(path)
     rgb = _sized(exif.orientation.upright(over(colour, alpha, colour_behind)), size)
     if alpha is not None:
         alpha = _sized(exif.orientation.upright(alpha), size)
-    if measured is None:
-        return Photo(rgb, alpha, source, None, None)
-    fitted = fit_depth(measured, raster, size, f"{depth}: depth")
-    return Photo(rgb, alpha, source, fitted, measured.remark(depth_unit is None))
+    if measured is None or depth is None:
+        return Photo(rgb, alpha, found, None, None)
+    fitted = (
+        fit_depth(measured, raster, size, f"{depth}: depth")
+        if sensor is None
+        else sensor.registered(measured.metres, found.intrinsics, depth)
+    )
+    return Photo(rgb, alpha, found, fitted, measured.remark(depth_unit is None))
 
 
 def fit_depth(measured: DepthImage, raster: Raster, size: tuple[int, int], what: str) -> Float[Tensor, "h w"]:
@@ -121,7 +126,7 @@ def natural_order(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)]
 
 
-def _limited(source: CameraSource, largest: int | None) -> tuple[CameraSource, tuple[int, int]]:
+def _limited(source: FoundCamera, largest: int | None) -> tuple[FoundCamera, tuple[int, int]]:
     """Return the camera and the size (width, height) of an image whose longer side has at most ``largest`` pixels."""
     camera = source.intrinsics
     if largest is not None and not (isinstance(largest, int) and largest >= 1):

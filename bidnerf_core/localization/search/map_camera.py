@@ -14,8 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.shapes import cameras_at_size, centre_crop_cameras, stretched_cameras
+from bidnerf_core.camera.intrinsics import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
 from bidnerf_core.mapping.calibration import (
     CALIBRATED,
     GIVEN,

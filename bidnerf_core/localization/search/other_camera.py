@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.shapes import median_camera, stretched_cameras
+from bidnerf_core.camera.intrinsics import Intrinsics, median_camera, stretched_cameras
 from bidnerf_core.localization.search.camera_fit import (
     LEAST_EXTRA_INLIERS,
     SUPPORT_RATIO,

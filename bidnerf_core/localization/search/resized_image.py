@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from bidnerf_core.camera.intrinsics import stretched_cameras
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
-from bidnerf_core.camera.shapes import stretched_cameras
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.evident_motion import SHARE_MOVING
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bidnerf_core.camera.files import read_camera
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.orientation import UPRIGHT
-from bidnerf_core.camera.source import Raster, read_camera
-from bidnerf_core.datasets.poses import rigid_of_rows
+from bidnerf_core.camera.source import Raster
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.pose_rows import rigid_of_rows
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import resampled
 from bidnerf_core.io.json import read_record
@@ -57,7 +57,7 @@ class DepthCamera:
         not the sensor's, and where none of it falls into the colour image.
         """
         height, width = depth.shape
-        camera = Raster(width, height, UPRIGHT).upright(self.camera)
+        camera = Raster(width, height).upright(self.camera)
         if camera is None:
             given = f"{self.camera.width}x{self.camera.height}"
             raise InputError(

@@ -1,0 +1,55 @@
+"""Reading an image of a recording with the depth image that belongs to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.depth.images import DepthReader
+from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.io.images import over, read_header, read_image
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """A depth image of a recording, and how it is read."""
+
+    path: Path
+    unit: float  # metres per step
+    read: DepthReader
+    sensor: DepthCamera | None = (
+        None  # the sensor from which it is registered to its image; None: it already is
+    )
+
+
+def read_rgbd(
+    name: str,
+    image: Path,
+    camera_of: Callable[[int, int], Intrinsics],
+    background: Sequence[float],
+    depth: DepthFile | None = None,
+) -> Frame:
+    """Read the image file ``image``, laid over ``background`` (rgb) where it has an alpha channel, and its depth.
+
+    ``camera_of`` returns the camera of an image of a width and height, or raises ``InputError`` where that is not the size
+    expected; it is called before any pixel is decoded. Raises ``InputError`` for a file that is not readable, and for
+    registered depth of another size.
+    """
+    header = read_header(image)
+    camera = camera_of(header.width, header.height)
+    colour, alpha = read_image(image)
+    metres = None
+    if depth is not None:
+        metres = depth.read(depth.path, depth.unit).metres
+        if depth.sensor is not None:
+            metres = depth.sensor.registered(metres, camera, depth.path)
+        elif metres.shape != colour.shape[:2]:
+            raise InputError(
+                f"{depth.path}: depth is {metres.shape[1]}x{metres.shape[0]}, expected {header.width}x{header.height} as its"
+                f" image {image.name}, to which it is registered"
+            )
+    return Frame(name, over(colour, alpha, background), camera, metres, alpha)
