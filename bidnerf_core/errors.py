@@ -10,6 +10,10 @@ class InputError(ValueError):
     """An input is not usable; the message is one line that can be shown to the user as it is."""
 
 
+class UsageError(InputError):
+    """Arguments contradict each other or are out of range, whatever the files contain."""
+
+
 class InputWarning(UserWarning):
     """An input was ambiguous and a convention was assumed; the message is one line that states which."""
 

@@ -17,11 +17,12 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core.cli import localize, main
+from bidnerf_core.cli import main
 from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.help_page import without_expert_settings
 from bidnerf_core.cli.options import parse
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.datasets.queries import Photos, Query
 from bidnerf_core.errors import printable
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.settings import EXPERT, Settings
@@ -330,13 +331,13 @@ def test_an_interrupted_run_keeps_its_answers(
 ) -> None:  # fmt: skip
     """Two of the three photos are answered; two steps from a start do not converge, so a trajectory would be empty."""
 
-    def stopping(number: int, *arguments: Any) -> Any:
-        if number == 2:
+    def stopping(photos: Photos, place: int) -> Query:
+        if place == 2:
             raise KeyboardInterrupt
-        return answered(number, *arguments)
+        return read(photos, place)
 
-    answered = localize._answered
-    monkeypatch.setattr(localize, "_answered", stopping)
+    read = Photos.read
+    monkeypatch.setattr(Photos, "read", stopping)
     out = [] if name is None else ["--out", tmp_path / name]
     status, _, err = bidnerf(*place, shared / "photos", *FOCAL, *out)
     assert status == 130

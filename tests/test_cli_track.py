@@ -16,11 +16,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-import bidnerf_core.cli.following as following
 import bidnerf_core.cli.track as track_module
+import bidnerf_core.cli.watch_folder as following
 from bidnerf_core import InputError, Tracker, View
 from bidnerf_core.captures.cameras import StoredCamera, stored_cameras
-from bidnerf_core.cli.following import FrameRequest, requests
+from bidnerf_core.cli.watch_folder import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.datasets.trajectories import read_trajectory
 from bidnerf_core.maps.description import MapInfo

@@ -11,8 +11,8 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core import Frame, Intrinsics, Localizer
-from bidnerf_core.cli.depth_remark import depth_remark
+from bidnerf_core import Intrinsics, Localizer
+from bidnerf_core.depth.noise import noise_remark
 from bidnerf_core.depth.sensors import (
     DEPTH_SENSORS,
     KINECT,
@@ -93,13 +93,10 @@ def test_localize_compares_a_named_sensor_with_the_image(generator: Generator) -
     depth = torch.linspace(1.0, 1.3, 120).expand(90, 120) * (
         1 + 0.02 * torch.randn((90, 120), generator=generator)
     )
-    frame = Frame("wall", torch.zeros((90, 120, 3)), camera, depth)
-    remark = depth_remark(frame, AutoConfig(depth_sensor="kinect"))
+    remark = noise_remark(depth, camera, "kinect")
     assert remark is not None
     assert re.search(r"is about (1\.[6-9]|2\.[0-4])\d%; that of 'kinect' is usually 0\.\d+%", remark)
-    assert depth_remark(frame, AutoConfig()) is None
-    assert depth_remark(frame, settings_of("bid", {})) is None
-    assert depth_remark(replace(frame, depth=None), AutoConfig(depth_sensor="kinect")) is None
+    assert noise_remark(torch.zeros_like(depth), camera, "kinect") is None
 
 
 def test_the_localizer_has_the_sensor_of_its_settings() -> None:

@@ -26,7 +26,6 @@ from safetensors.torch import save
 import tiny
 from bidnerf_core import Frame, load_map
 from bidnerf_core.camera.files import read_camera
-from bidnerf_core.cli.starts import read_pose
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.points import read_depth_points
 from bidnerf_core.depth.images import read_depth_image
@@ -39,6 +38,7 @@ from bidnerf_core.io.tensors import read_archive, read_array, read_tensors
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.files import save_map
 from bidnerf_core.maps.map import load_map as load
+from bidnerf_core.results.pose_files import read_pose
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from commands import Run

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
-from bidnerf_core.errors import InputError, InputWarning, printable, spelling_hint
+from bidnerf_core.cli.interruptions import Interrupted, interruptions
+from bidnerf_core.errors import InputError, InputWarning, UsageError, printable, spelling_hint
 
 COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
@@ -27,7 +29,8 @@ COMMANDS = {
 }
 
 DONE, BAD_INPUT, WRONG_USAGE, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
-"""Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells."""
+"""Exit statuses; the last two are 128 plus the number of the signal, as is customary for shells. For SIGTERM and SIGHUP the
+status is 143 and 129."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,10 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _guarded(name: str, given: list[str]) -> int:
     """Run a command and return its exit status; a user's mistake is reported in one line instead of a traceback."""
     try:
-        with _warnings_as_lines(name):
+        with interruptions(), _warnings_as_lines(name), _remarks_as_lines():
             return _dispatch(given)
     except SystemExit as stopped:  # the parser has printed why
         return stopped.code if isinstance(stopped.code, int) else DONE if stopped.code is None else BAD_INPUT
+    except Interrupted as stopped:
+        return _failed(name, "interrupted", 128 + stopped.number)
     except KeyboardInterrupt:
         return _failed(name, "interrupted", INTERRUPTED)
     except BrokenPipeError:
@@ -62,7 +67,7 @@ def _guarded(name: str, given: list[str]) -> int:
         where = f"{error.filename}: " if error.filename else ""
         return _failed(name, f"{where}{error.strerror or error}", BAD_INPUT)
     except InputError as error:
-        return _failed(name, str(error), getattr(error, "status", BAD_INPUT))
+        return _failed(name, str(error), WRONG_USAGE if isinstance(error, UsageError) else BAD_INPUT)
     except RuntimeError as error:
         if (
             type(error).__name__ != "OutOfMemoryError"
@@ -104,6 +109,30 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
         warnings.simplefilter("always", InputWarning)
         warnings.showwarning = show  # type: ignore[assignment]
         yield
+
+
+@contextlib.contextmanager
+def _remarks_as_lines() -> Iterator[None]:
+    """Print each remark that the library logs as one line on stderr."""
+    logger, handler = logging.getLogger("bidnerf"), _Lines()
+    before = logger.level, logger.propagate
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.level, logger.propagate = before
+
+
+class _Lines(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        from bidnerf_core.cli.output import (
+            say,
+        )  # here, because importing rich takes longer than --help should
+
+        say(record.getMessage())
 
 
 def _failed(name: str, message: str, status: int, more: str = "") -> int:

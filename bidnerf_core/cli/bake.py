@@ -16,12 +16,12 @@ from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
 from bidnerf_core.cli.opened_map import unfinished
-from bidnerf_core.cli.options import Device, Flag, MapFolder, UsageError, option, parse
+from bidnerf_core.cli.options import Device, Flag, MapFolder, option, parse
 from bidnerf_core.cli.output import read_views, say
 from bidnerf_core.cli.progress import counted
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.devices import working_device
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.io.files import locked
 from bidnerf_core.mapping import BakeConfig, bake

@@ -14,18 +14,9 @@ from rich.table import Table
 
 from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.method_options import Preset, chosen_settings
-from bidnerf_core.cli.options import (
-    LARGEST_SEED,
-    Flag,
-    Names,
-    UsageError,
-    option,
-    parse,
-    require,
-    wrong_usage,
-)
+from bidnerf_core.cli.options import LARGEST_SEED, Flag, Names, option, parse, require, wrong_usage
 from bidnerf_core.cli.output import print_json, print_table, say, show
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.evaluation.bench import changed_settings
 from bidnerf_core.evaluation.comparison import Comparison, MapRow, compare_maps, plan_comparison
 from bidnerf_core.evaluation.comparison_figure import comparison_figure

@@ -16,11 +16,11 @@ from rich.table import Table
 from bidnerf_core.backend import Backend, quick_config
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.cli.folders import output_folder
-from bidnerf_core.cli.options import DEFAULT_BACKEND, LARGEST_SEED, Flag, UsageError, option, parse, require
+from bidnerf_core.cli.options import DEFAULT_BACKEND, LARGEST_SEED, Flag, option, parse, require
 from bidnerf_core.cli.output import console, print_table, say, show
 from bidnerf_core.cli.progress import timed
 from bidnerf_core.cli.train import train_map
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.evaluation.figures import convergence_plot, save_gif
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames.frame import View

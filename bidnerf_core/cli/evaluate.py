@@ -18,7 +18,6 @@ from bidnerf_core.cli.options import (
     LARGEST_SEED,
     Device,
     Names,
-    UsageError,
     option,
     parse,
     require,
@@ -27,7 +26,7 @@ from bidnerf_core.cli.options import (
 )
 from bidnerf_core.cli.output import say, show
 from bidnerf_core.cli.trial_progress import TrialProgress
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.evaluation.bench import (
     Plan,
     changed_settings,

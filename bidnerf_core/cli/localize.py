@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import imageio.v3 as iio
 import tyro
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.cli.answers import Answer, Answers, OutputSpec
 from bidnerf_core.cli.camera_options import (
     CameraFile,
     FieldOfView,
@@ -17,28 +18,29 @@ from bidnerf_core.cli.camera_options import (
     RegisterDepth,
     depth_registration,
 )
-from bidnerf_core.cli.depth_remark import depth_remark
+from bidnerf_core.cli.folders import check_pose_file, make_folder
+from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.opened_map import opened_map
-from bidnerf_core.cli.options import LARGEST_SEED, Flag, MapFolder, Names, UsageError, option, parse, require
-from bidnerf_core.cli.output import say
+from bidnerf_core.cli.options import LARGEST_SEED, Flag, MapFolder, Names, option, parse, require
+from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.progress import counted
-from bidnerf_core.cli.queries import (
-    DepthPoints,
-    FrameOptions,
-    PhotoOptions,
-    Photos,
-    QuerySource,
-    open_queries,
-)
-from bidnerf_core.cli.starts import StartSpec, read_pose
+from bidnerf_core.cli.queries import FrameOptions, PhotoOptions, open_queries
+from bidnerf_core.cli.starts import StartSpec
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
-from bidnerf_core.errors import InputError
+from bidnerf_core.datasets.queries import DepthPoints, Photos, Query, QuerySource
+from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.evaluation.trials import places_of
-from bidnerf_core.localization import METHODS, AutoConfig, Localizer
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
+from bidnerf_core.localization import METHODS, AutoConfig, Localization, Localizer
 from bidnerf_core.localization.methods import require_use_of_depth
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.map import Map
+from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each, pose_format
+from bidnerf_core.results.errors import PoseError, pose_error, standard_deviations
+from bidnerf_core.results.overlays import overlay
+from bidnerf_core.results.pose_files import read_pose
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
 
@@ -126,7 +128,6 @@ def run(arguments: list[str]) -> None:
             raise UsageError("--frame names no frame, expected the stem of an image file")
         photos = PhotoOptions(depth, camera, focal, hfov, depth_unit, depth_registration(register_depth))
         frames = FrameOptions(split, tuple(name for group in frame for name in group), window)
-        output = OutputSpec(out, draw, json)
         begin = StartSpec(None if start is None else read_pose(start), perturb)
         for part in (frames, begin):
             part.check()
@@ -136,7 +137,10 @@ def run(arguments: list[str]) -> None:
             raise InputError(f"method {method!r} needs a start; give one by --start, or take method 'auto'")
         if depth_points is not None:
             require_use_of_depth(method)
-        output.prepare()
+        if out is not None:
+            check_pose_file(out)
+        if draw is not None:
+            make_folder(draw)
         stored = opened_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
         photos = replace(photos, assumed=_assumed_cameras(stored.landmarks, config))
@@ -144,7 +148,7 @@ def run(arguments: list[str]) -> None:
         if perturb is not None and isinstance(source, Photos):
             raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")
         localizer = Localizer(stored, method, config, warm_up=len(source.names) > 1)
-        _localize(source, localizer, begin, seed, Answers(stored, output, len(source.names)))
+        _localize(source, localizer, begin, seed, _Output(stored, out, draw, json, len(source.names)))
 
     parse("localize", localize, arguments, settings)
 
@@ -165,45 +169,114 @@ def _assumed_cameras(landmarks: LandmarkMap | None, config: Any) -> tuple[Intrin
 
 
 def _localize(
-    source: QuerySource, localizer: Localizer, begin: StartSpec, seed: int, answers: Answers
-) -> None:  # fmt: skip
-    """Localize each query. A failure does not stop the others; the error of a single query is raised."""
+    source: QuerySource, localizer: Localizer, begin: StartSpec, seed: int, output: _Output
+) -> None:
     total = len(source.names)
-    without_depth = list[str]()
-    try:
-        with counted("localizing", "images", total) as report:
-            for number, name in enumerate(source.names):
-                try:
-                    answer = _answered(number, source, localizer, begin, seed, without_depth)
-                except UsageError:
-                    raise
-                except InputError as error:
-                    if total == 1:
-                        raise
-                    answers.fail(name, localizer.method, error)
-                else:
-                    answers.add(answer)
-                report(number + 1, total)
-    except KeyboardInterrupt:
-        answers.keep()
-        raise
-    answers.finish()
+    with counted("localizing", "images", total) as report:
+        try:
+            localize_each(
+                localizer, source, start=lambda query: begin.pose(query.truth, seed), seed=seed, answers=output.answers,
+                each=lambda query, answer: output.show(query, answer, begin.pose(query.truth, seed)),
+                progress=lambda p: report(p.done, p.total),
+            )  # fmt: skip
+        except BaseException:  # whatever ended it: Ctrl-C, SIGTERM, a reader that went away, a full disk
+            with uninterrupted():
+                output.keep()
+            raise
+    with uninterrupted():
+        output.finish()
 
 
-def _answered(
-    number: int, source: QuerySource, localizer: Localizer, begin: StartSpec, seed: int, said: list[str]
-) -> Answer:
-    query = source.read(number)
-    bare = [view.frame.name for view in query.views if not view.frame.has_depth]
-    if bare and query.truth is not None and query.depth_rays is None and not said:
-        said += bare
-        say(f"{', '.join(bare)}: no measured depth; colour only")
-    if number == 0 and (remark := depth_remark(query.frame, localizer.config)) is not None:
-        say(f"{query.name}: {remark}")
-    start = begin.pose(query.truth, seed)
-    found = localizer(query.views, start, query.depth_rays, seed)
-    if not bool(found.T_world_camera.matrix().isfinite().all()):
-        raise InputError(
-            f"{query.name}: {found.method} came to a pose that is not finite, expected a sound map"
-        )
-    return Answer(number, query, start, found)
+class _Output:
+    """What is done with the answers: they are printed, drawn, and written to the file of poses at the end."""
+
+    def __init__(self, stored: Map, out: Path | None, draw: Path | None, json: bool, total: int) -> None:
+        self._stored, self._out, self._draw, self._json, self._total = stored, out, draw, json, total
+        self._not_drawn = 0
+        self.answers = Answers(stored.info.backend)
+
+    def show(self, query: Query, answer: Answer | Failure, start: SE3 | None) -> None:
+        """Print an answer and draw it."""
+        if isinstance(answer, Failure):
+            say(f"{answer.name}: {answer.reason}")
+        if self._json:
+            print_json(self.answers.plain(answer))
+        if isinstance(answer, Failure):
+            return
+        if not self._json and self._total == 1:
+            _show_in_full(answer, start)
+        elif not self._json:
+            _show_in_short(answer)
+        if self._draw is not None:
+            self._write_picture(self._draw / f"overlay-{query.name}.png", query, answer, start)
+
+    def _write_picture(self, file: Path, query: Query, answer: Answer, start: SE3 | None) -> None:
+        """Draw an answer. A picture that cannot be written does not end the run."""
+        picture = overlay(self._stored, query.frame, answer.found, start)
+        try:
+            write_file(file, bytes(iio.imwrite("<bytes>", picture, extension=".png")))
+        except OSError as error:
+            self._not_drawn += 1
+            say(f"{file}: not drawn: {error.strerror or error}")
+
+    def finish(self) -> None:
+        """Write the file of poses, and print how many of several queries converged.
+
+        Raises ``InputError`` if a file of accepted poses would be empty, if a query failed, and if a picture is missing.
+        """
+        answers, out, accepted = self.answers, self._out, len(self.answers.accepted)
+        if self._total > 1:
+            say(f"{accepted} of {self._total} converged{answers.question}")
+        if out is not None:
+            if not accepted and pose_format(out) != ".json":
+                raise InputError(
+                    f"{out}: not written, since no pose converged; a name ending with .json takes all"
+                )
+            answers.save(out)
+        if failed := len(answers) - len(answers.answers):
+            raise InputError(f"{failed} of {self._total} queries could not be read or localized, see above")
+        if self._not_drawn:
+            raise InputError(f"{amount(self._not_drawn, 'picture')} could not be written, see above")
+
+    def keep(self) -> None:
+        """Write the file of poses with the answers so far, after a run that did not come to its end."""
+        out, answers = self._out, self.answers
+        if out is None or not (answers.accepted or (answers.given and pose_format(out) == ".json")):
+            return
+        answers.save(out)
+        say(f"{out}: written after {len(answers)} of {self._total} images")
+
+
+def _show_in_full(answer: Answer, start: SE3 | None) -> None:
+    """Print an answer in several lines: its errors where the truth is known, its uncertainty, the matrix."""
+    found = answer.found
+    show(f"{answer.name}: {_verdict(found)} ({found.reason})")
+    if answer.error is not None and answer.truth is not None:
+        show(f"  start error  {'no start' if start is None else _shown(pose_error(start, answer.truth))}")
+        show(f"  final error  {_shown(answer.error)}")
+    if found.covariance is not None:
+        position, rotation = standard_deviations(found.covariance)
+        show(f"  uncertainty  {position:.4f} m, {math.degrees(rotation):.3f} deg (one standard deviation)")
+    show(
+        f"  {amount(found.steps, 'step')}, {found.seconds:.2f} s, loss {found.loss:.5f}, method {found.method}"
+    )
+    show("  T_world_camera")
+    for row in found.T_world_camera.matrix().tolist():
+        show("    " + " ".join(f"{value: .6f}" for value in row))
+
+
+def _show_in_short(answer: Answer) -> None:
+    """Print an answer in one line."""
+    found, error = answer.found, answer.error
+    known = "" if error is None else f"error {_shown(error)}; "
+    took = f"{amount(found.steps, 'step')}, {found.seconds:.2f} s"
+    show(f"{answer.name}: {known}{_verdict(found)} ({found.reason}); {took}")
+
+
+def _verdict(found: Localization) -> str:
+    """Return the verdict in words; the troubleshooting page of the documentation explains each outcome."""
+    return "converged" if found.converged else f"NOT converged: {found.outcome.value}"
+
+
+def _shown(error: PoseError) -> str:
+    return f"{float(error.translation):.4f} m, {float(error.rotation_deg):.3f} deg"

@@ -17,18 +17,12 @@ import tyro
 
 from bidnerf_core.cli.help_page import Page, retyped, without_expert_settings
 from bidnerf_core.cli.output import PrintableStream
-from bidnerf_core.errors import InputError, printable
+from bidnerf_core.errors import InputError, UsageError, printable
 
 _T = TypeVar("_T")
 
 DEFAULT_BACKEND = "hashgrid"
 LARGEST_SEED = 2**31 - 1
-
-
-class UsageError(InputError):
-    """The arguments contradict each other. The exit status is that of wrong usage, 2, and not that of bad input, 1."""
-
-    status = 2
 
 
 def option(metavar: str | None, help: str, default: str | None = None) -> Any:

@@ -3,19 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-import torch
-
-from bidnerf_core.cli.options import UsageError
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import UsageError
 from bidnerf_core.evaluation import protocols
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import read_file
-from bidnerf_core.io.json import parse_json
-from bidnerf_core.localization import pose_from_matrix
-
-EXPECTED_POSE = '{"T_world_camera": 4x4 rows}'
 
 
 @dataclass(frozen=True)
@@ -42,33 +33,3 @@ class StartSpec:
         if self.perturb is None or truth is None:
             return self.fixed
         return protocols.perturb(truth, *self.perturb, seed)
-
-
-def read_pose(path: Path) -> SE3:
-    """Read a 4x4 camera-to-world matrix, alone or under "T_world_camera", as ``localize --json`` prints it.
-
-    A list of one such object is accepted as well. Raises ``InputError`` where the file does not hold the rows of a rigid
-    transform.
-    """
-    content = read_file(path, "a pose file")
-    try:
-        found = parse_json(content, str(path), EXPECTED_POSE)
-    except InputError as error:
-        lines = [line for line in content.splitlines() if line.strip()]
-        if len(lines) > 1 and all(line.startswith(b"{") for line in lines):  # as ``--json`` prints several
-            raise _not_one(path, len(lines)) from error
-        raise
-    if isinstance(found, list) and all(isinstance(entry, dict) for entry in found):
-        if len(found) != 1:  # as ``--out`` writes several
-            raise _not_one(path, len(found))
-        (found,) = found
-    rows = found.get("T_world_camera") if isinstance(found, dict) else found
-    try:
-        matrix = torch.tensor(rows, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{path}: no matrix of numbers in it, expected {EXPECTED_POSE}") from error
-    return pose_from_matrix(matrix, f"{path}: T_world_camera")
-
-
-def _not_one(path: Path, count: int) -> InputError:
-    return InputError(f"{path}: holds {count} poses, expected one")

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import sys
 import time as clocks
-from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.table import Table
 
 from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.cli.another_scene import question_about_scene
 from bidnerf_core.cli.camera_options import (
     CameraFile,
     DepthSensorName,
@@ -23,24 +21,23 @@ from bidnerf_core.cli.camera_options import (
     RegisterDepth,
     depth_registration,
 )
-from bidnerf_core.cli.following import STDIN, requests
+from bidnerf_core.cli.folders import check_pose_file
+from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.opened_map import opened_map
-from bidnerf_core.cli.options import Flag, MapFolder, UsageError, option, parse, require
+from bidnerf_core.cli.options import Flag, MapFolder, option, parse, require
 from bidnerf_core.cli.output import print_json, print_table, say
 from bidnerf_core.cli.progress import counted
-from bidnerf_core.cli.starts import read_pose
-from bidnerf_core.cli.tracked_path import TrackedPath, check_out
 from bidnerf_core.cli.tracking_video import TrackingVideo, check_video
-from bidnerf_core.datasets import FileSequence, FrameSequence, ReadOptions, TimedFrame, open_sequence
+from bidnerf_core.cli.watch_folder import STDIN, requests
+from bidnerf_core.datasets import FileSequence, FrameSequence, ReadOptions
 from bidnerf_core.depth.registration import DepthCamera
-from bidnerf_core.errors import InputError, amount
-from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig, Localization, Localizer, Tracker, TrackerConfig
+from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.localization import AutoConfig, Localizer, Tracker, TrackerConfig
+from bidnerf_core.maps.map import Map
+from bidnerf_core.results import tracked_path as library
 from bidnerf_core.results.plot_style import require_matplotlib
-
-TRIED = 3
-"""Number of unreadable frames at the beginning of a sequence after which it is given up: probably none can be read."""
+from bidnerf_core.results.pose_files import read_pose
+from bidnerf_core.results.tracked_path import TrackedPath, opened_for
 
 
 def run(arguments: list[str]) -> None:
@@ -105,7 +102,7 @@ def run(arguments: list[str]) -> None:
         if out is None and not follow:
             raise UsageError("no --out, expected the name of a file of poses")
         if out is not None:
-            check_out(out)
+            check_pose_file(out)
         if plot is not None:
             require_matplotlib()
         if video is not None:
@@ -115,70 +112,59 @@ def run(arguments: list[str]) -> None:
         begin, settings = None if start is None else read_pose(start), AutoConfig(depth_sensor=depth_sensor)
         stored = opened_map(map)
         assumed = () if stored.landmarks is None else stored.landmarks.cameras
-        path = TrackedPath(stored.info)
-        tracker = Tracker(Localizer(stored, config=settings), config, begin)
-        drawn = nullcontext() if video is None else TrackingVideo(video, stored)
-        began = clocks.perf_counter()
+        path, began = TrackedPath.of(stored), clocks.perf_counter()
+        localizer = Localizer(stored, config=settings)
         try:
-            with drawn as drawing:
-                step = _Step(tracker, path, depth, drawing)
+            with nullcontext() if video is None else TrackingVideo(video, stored) as drawn:
                 if follow:
                     given = CameraSource(camera, focal, hfov, assumed)
-                    _follow(str(sequence), step, given, sensor, stored.bounds.background)
-                else:
-                    frames = open_sequence(
-                        sequence, camera=camera, focal=focal, hfov=hfov, assumed=assumed,
-                        background=stored.bounds.background, register_depth=registration,
-                    )  # fmt: skip
-                    _track(frames if split is None else _of_split(frames, split), step, every)
-        finally:  # also on Ctrl-C: the frames so far are written
-            seconds = clocks.perf_counter() - began
-            if out is not None and path.frames:
-                path.write(out)
-            if plot is not None and path.frames:
-                path.plot(plot, stored.surface)
-            if not follow and path.frames:
-                print_table(path.table(seconds))
-                if path.lost and path.without_times:
-                    say(
-                        f"the frames have no time stamps, so the first ones count as {config.frame_seconds:.3g} s apart; "
-                        "if they were taken farther apart, set --frame-seconds"
+                    _follow(
+                        str(sequence), Tracker(localizer, config, begin), path, drawn, depth, given, sensor
                     )
-                if not path.accepted:
-                    question = question_about_scene([frame.found for frame in path.frames])
-                    say(f"no pose of {amount(len(path.frames), 'frame')} was accepted{question}")
+                else:
+                    frames = opened_for(
+                        stored, sequence, camera=camera, focal=focal, hfov=hfov, register_depth=registration
+                    )
+                    frames = frames if split is None else _of_split(frames, split)
+                    with counted("tracking", "frames", -(-len(frames) // every)) as report:
+                        library.track(
+                            localizer, frames, config=config, start=begin, depth=depth, every=every, path=path,
+                            each=None if drawn is None else drawn.add, progress=lambda p: report(p.done, p.total),
+                        )  # fmt: skip
+        finally:  # whatever ended it: the frames so far are written
+            with uninterrupted():
+                _finish(path, stored, out, plot, None if follow else clocks.perf_counter() - began, config)
+        if path.unread:
+            read = amount(path.unread + len(path), "frame")
+            raise InputError(f"{path.unread} of {read} could not be read, see above")
 
     parse("track", track, arguments)
 
 
-class _Step:
-    """Tracks a frame, keeps the answer, and prints when the tracker gets lost and when it has recovered."""
-
-    def __init__(self, tracker: Tracker, path: TrackedPath, depth: bool, video: TrackingVideo | None) -> None:
-        self.tracker, self.path, self._depth, self._video = tracker, path, depth, video
-        self._lost_at: int | None = None
-        self._cameras: set[str] = set()  # the sources of frames' cameras that were printed already
-
-    def __call__(
-        self, frame: Frame, time: float | None, truth: SE3 | None = None, place: int | None = None
-    ) -> Localization:
-        if frame.camera_source and frame.camera_source not in self._cameras:
-            self._cameras.add(frame.camera_source)
-            say(f"{frame.name}: {frame.camera_source}")
-        found = self.tracker(frame if self._depth else replace(frame, depth=None), time)
-        self.path.add(frame, time, found, truth, place)
-        if self._video is not None:
-            self._video.add(frame, time, found)
-        number, count = self.path.frames[-1].posed.number + 1, len(self.path.frames)
-        if not found.converged and self._lost_at is None:
-            self._lost_at = count
-            say(f"frame {number} ({frame.name}): {found.outcome}: {found.reason}")
-        elif found.converged and self._lost_at is not None:
-            say(
-                f"frame {number} ({frame.name}): tracking again after {amount(count - self._lost_at, 'frame')}"
-            )
-            self._lost_at = None
-        return found
+def _finish(path: TrackedPath, stored: Map, out: Path | None, plot: Path | None, seconds: float | None, config: TrackerConfig
+) -> None:  # fmt: skip
+    """Write and draw the frames so far, if any; where ``seconds`` are given, print a summary of the run."""
+    if not path.given:
+        return
+    try:
+        if out is not None:
+            path.save(out)
+    finally:
+        if plot is not None:
+            path.plot(plot, stored.surface)
+    if seconds is None:
+        return
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for row in path.summary(seconds):
+        table.add_row(*row)
+    print_table(table)
+    if path.lost and path.without_times:
+        say(
+            f"the frames have no time stamps, so the first ones count as {config.frame_seconds:.3g} s apart; "
+            "if they were taken farther apart, set --frame-seconds"
+        )
+    if not path.accepted:
+        say(f"no pose of {amount(len(path), 'frame')} was accepted{path.question}")
 
 
 def _of_split(frames: FrameSequence, split: str) -> FileSequence:
@@ -187,44 +173,9 @@ def _of_split(frames: FrameSequence, split: str) -> FileSequence:
     return frames.of_split(split)
 
 
-def _track(frames: FrameSequence, step: _Step, every: int) -> None:
-    """Track every n-th frame. One whose files cannot be read is reported and skipped, unless the first ones all are.
-
-    Raises ``InputError`` at the end if any could not be read.
-    """
-    total = -(-len(frames) // every)
-    with counted("tracking", "frames", total) as report:
-        for number, timed in enumerate(_chosen(frames, every)):
-            if isinstance(timed, TimedFrame):
-                step(timed.frame, timed.time, timed.truth, every * number)
-            elif not step.path.frames and number + 1 >= min(TRIED, total):
-                first = (
-                    "the first frame cannot" if number == 0 else f"none of the first {number + 1} frames can"
-                )
-                raise InputError(f"{first} be read: {timed}")
-            else:
-                say(f"{timed}; left out")
-                step.path.unread += 1
-            report(number + 1, total)
-    if step.path.unread:
-        raise InputError(f"{step.path.unread} of {amount(total, 'frame')} could not be read, see above")
-
-
-def _chosen(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:
-    """Yield every n-th frame; where each has files of its own, an unreadable one is yielded as an error."""
-    if not isinstance(frames, FileSequence):
-        yield from islice(frames, 0, None, every)
-        return
-    for place in range(0, len(frames), every):
-        try:
-            yield frames[place]
-        except InputError as error:
-            yield error
-
-
 def _follow(
-    source: str, step: _Step, camera: CameraSource, sensor: DepthCamera | None,
-    background: tuple[float, float, float],
+    source: str, tracker: Tracker, path: TrackedPath, video: TrackingVideo | None, depth: bool, camera: CameraSource,
+    sensor: DepthCamera | None,
 ) -> None:  # fmt: skip
     """Answer each frame that arrives, at once, with one JSON object on a line of its own."""
     say(f"waiting for {'JSON lines on stdin' if source == STDIN else f'images in {source}'}; Ctrl-C ends")
@@ -232,9 +183,12 @@ def _follow(
         try:
             if isinstance(request, InputError):
                 raise request
-            frame = request.read(camera, sensor, background)
-            step(frame, request.time)
-            print_json(step.path.plain(step.path.frames[-1]))
+            frame = request.read(camera, sensor, tracker.localizer.map.bounds.background)
+            found = tracker(frame if depth else replace(frame, depth=None), request.time)
+            answer = path.add(frame, found, request.time)
+            if video is not None:
+                video.add(frame, answer)
+            print_json(path.plain(answer))
         except InputError as error:
             print_json(
                 {"frame": _name_of(request), "converged": False, "outcome": "bad input", "reason": str(error)}

@@ -16,6 +16,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization import Localization
 from bidnerf_core.localization.problem import SceneMap
+from bidnerf_core.results.answers import Answer
 from bidnerf_core.results.overlays import Painter, tile
 
 WRITTEN_SUFFIXES = (".mp4", ".mkv", ".webm")
@@ -62,9 +63,9 @@ class TrackingVideo:
             self._writer.close()
             self._partial.replace(self._file)
 
-    def add(self, frame: Frame, time: float | None, found: Localization) -> None:
+    def add(self, frame: Frame, answer: Answer) -> None:
         """Draw a frame."""
-        picture = self._drawn(frame, found)
+        picture, time = self._drawn(frame, answer.found), answer.time
         if self._first is None:
             self._first = picture, time
             return

@@ -20,7 +20,6 @@ from bidnerf_core.cli.options import (
     DataFolder,
     Device,
     Flag,
-    UsageError,
     option,
     parse,
     require,
@@ -33,7 +32,7 @@ from bidnerf_core.cli.training_views import RefinementChoice, located, prepared
 from bidnerf_core.datasets import Background, Dataset, DepthRegistration, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.devices import moved, working_device
-from bidnerf_core.errors import InputError, amount
+from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.frames.frame import View
 from bidnerf_core.io.images import background_colour
 from bidnerf_core.io.json import from_plain, to_plain

@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.depth.sensors import DepthNoise
+from bidnerf_core.depth.sensors import DepthNoise, find_depth_sensor
 from bidnerf_core.depth.steps import DepthSteps, depth_steps, lines_of_sensor
 from bidnerf_core.geometry.robust import MAD_TO_SIGMA
 
@@ -93,3 +93,20 @@ def _fitted(ranges: Float[Tensor, "b 2"]) -> DepthNoise:
         return DepthNoise(linear=float(np.median(noise)))
     (linear, quadratic), _ = nnls(np.stack([np.ones_like(depth), depth], axis=-1), noise)
     return DepthNoise(linear=float(linear), quadratic=float(quadratic))
+
+
+def noise_remark(depth: Float[Tensor, "h w"], intrinsics: Intrinsics, sensor: str) -> str | None:
+    """Return one line that compares the noise estimated from a depth image (metres) with that of the sensor of a name.
+
+    Returns None where the noise cannot be estimated from the image.
+    """
+    found = estimated_depth_noise(depth, intrinsics)
+    if found is None:
+        return None
+    z = float(depth[depth > 0].median())
+    estimated, expected = found.deviation(z) / z, find_depth_sensor(sensor).noise.deviation(z) / z
+    steps = depth_steps(depth)
+    of_disparity = (
+        "; its steps grow with the square of the distance" if steps is not None and steps.of_disparity else ""
+    )
+    return f"depth noise at {z:.3g} m is about {estimated:.2%}; that of {sensor!r} is usually {expected:.2%}{of_disparity}"

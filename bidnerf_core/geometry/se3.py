@@ -8,6 +8,7 @@ written in the local frame of the camera (Sola et al. 2018, "A micro Lie theory"
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_
 from torch import Tensor
 
 from bidnerf_core.devices import constant
+from bidnerf_core.errors import InputError
 
 SERIES_BELOW = 1e-2
 """Angles (rad) under which coefficients come from their series: sin and cos cancel there, in value and derivative."""
@@ -209,3 +211,28 @@ def _polynomial(phi: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 def _matvec(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector[..., None])[..., 0]
+
+
+def pose_from_matrix(matrix: Float[Tensor, "..."], what: str) -> SE3:
+    """Return T_world_camera of a homogeneous 4x4 matrix, by rows.
+
+    Raises ``InputError``, which begins with ``what``, for another shape, another last row than 0 0 0 1, and a rotation that
+    is not orthonormal.
+    """
+    if matrix.shape != (4, 4):
+        raise InputError(f"{what} has shape {tuple(matrix.shape)}, expected a 4x4 matrix T_world_camera")
+    last = matrix[3].tolist()
+    if not _is_last_row(last):
+        transposed = _is_last_row(matrix[:, 3].tolist())
+        hint = "; its last column is, so it is written by columns: transpose it" if transposed else ""
+        raise InputError(f"{what} has the last row {last}, expected [0, 0, 0, 1]{hint}")
+    pose = SE3.from_matrix(matrix.to(torch.float64))
+    if not bool(pose.is_rigid()):
+        raise InputError(
+            f"{what} is not a rigid transform, expected an orthonormal rotation of determinant 1"
+        )
+    return pose.normalized()
+
+
+def _is_last_row(numbers: Sequence[float]) -> bool:
+    return max(abs(a - b) for a, b in zip(numbers, (0.0, 0.0, 0.0, 1.0), strict=True)) <= 1e-6

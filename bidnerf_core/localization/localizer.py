@@ -17,7 +17,7 @@ from bidnerf_core.fields.contract import device_of
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only, has_distances
 from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
@@ -165,28 +165,3 @@ def start_pose(start: Start) -> SE3:
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"start is a {type(start).__name__}, expected an SE3 or a 4x4 matrix") from error
     return pose_from_matrix(matrix, "start")
-
-
-def pose_from_matrix(matrix: Float[Tensor, "..."], what: str) -> SE3:
-    """Return T_world_camera of a homogeneous 4x4 matrix, by rows.
-
-    Raises ``InputError``, which begins with ``what``, for another shape, another last row than 0 0 0 1, and a rotation that
-    is not orthonormal.
-    """
-    if matrix.shape != (4, 4):
-        raise InputError(f"{what} has shape {tuple(matrix.shape)}, expected a 4x4 matrix T_world_camera")
-    last = matrix[3].tolist()
-    if not _is_last_row(last):
-        transposed = _is_last_row(matrix[:, 3].tolist())
-        hint = "; its last column is, so it is written by columns: transpose it" if transposed else ""
-        raise InputError(f"{what} has the last row {last}, expected [0, 0, 0, 1]{hint}")
-    pose = SE3.from_matrix(matrix.to(torch.float64))
-    if not bool(pose.is_rigid()):
-        raise InputError(
-            f"{what} is not a rigid transform, expected an orthonormal rotation of determinant 1"
-        )
-    return pose.normalized()
-
-
-def _is_last_row(numbers: Sequence[float]) -> bool:
-    return max(abs(a - b) for a, b in zip(numbers, (0.0, 0.0, 0.0, 1.0), strict=True)) <= 1e-6

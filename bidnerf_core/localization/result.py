@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.errors import InputError, unknown_name
 from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import to_plain
+from bidnerf_core.io.json import from_plain, read_record, to_plain
 
 
 class Outcome(StrEnum):
@@ -90,24 +93,81 @@ class Localization:
     def plain(self) -> dict[str, Any]:
         """Return the result as JSON values, with the keys of ``bidnerf localize --json``.
 
-        Numbers that are not finite are None.
+        Numbers and matrices that are not finite are None.
         """
-        finite = bool(self.T_world_camera.matrix().isfinite().all())
         return {
-            "T_world_camera": self.T_world_camera.matrix().tolist() if finite else None,
+            "T_world_camera": _finite(self.T_world_camera.matrix().tolist()),
             "converged": self.converged,
             "outcome": str(self.outcome),
             "reason": self.reason,
             "steps": self.steps,
             "seconds": self.seconds,
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
-            "loss": self.loss if self.loss == self.loss and abs(self.loss) != float("inf") else None,
+            "covariance": None if self.covariance is None else _finite(self.covariance.tolist()),
+            "loss": _finite(self.loss),
             "method": self.method,
-            "focal_factor": self.focal_factor,
+            "focal_factor": _finite(self.focal_factor),
             "intrinsics": None if self.intrinsics is None else to_plain(self.intrinsics),
-            "confidence": self.confidence,
+            "confidence": _finite(self.confidence),
         }
 
     def save(self, path: str | Path) -> None:
         """Write ``plain()`` to a JSON file atomically. ``localize --start`` reads it back as a start."""
         write_file(Path(path), (json.dumps(self.plain(), indent=1, allow_nan=False) + "\n").encode())
+
+    @staticmethod
+    def load(path: str | Path) -> Localization:
+        """Read what ``save`` wrote. The diagnostics are not in the file, nor are intermediate poses and losses.
+
+        Raises ``InputError`` for another file, and for a localization whose pose is not finite.
+        """
+        where = str(path)
+        saved = from_plain(_Saved, dict(read_record(Path(path)).values), where)
+        if saved.T_world_camera is None:
+            raise InputError(f"{where}: T_world_camera is null, expected a pose that is finite")
+        T = pose_from_matrix(
+            _matrix(saved.T_world_camera, 4, f"{where}: T_world_camera"), f"{where}: T_world_camera"
+        )
+        covariance = (
+            None if saved.covariance is None else _matrix(saved.covariance, 6, f"{where}: covariance")
+        )
+        try:
+            outcome = Outcome(saved.outcome)
+        except ValueError as error:
+            raise unknown_name("outcome", saved.outcome, [str(outcome) for outcome in Outcome]) from error
+        loss = math.nan if saved.loss is None else saved.loss
+        return Localization(
+            T, outcome, saved.reason, saved.steps, saved.seconds, loss, saved.method, SE3.stack([T]),
+            torch.tensor([loss], dtype=torch.float64), covariance,
+            math.nan if saved.focal_factor is None else saved.focal_factor, saved.confidence, None,
+            saved.intrinsics,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Saved:
+    """The values in the file of a localization."""
+
+    T_world_camera: list[list[float]] | None
+    converged: bool
+    outcome: str
+    reason: str
+    steps: int
+    seconds: float
+    covariance: list[list[float]] | None
+    loss: float | None
+    method: str
+    focal_factor: float | None
+    intrinsics: Intrinsics | None
+    confidence: float | None
+
+
+def _matrix(rows: list[list[float]], size: int, what: str) -> Float[Tensor, "n n"]:
+    if {len(row) for row in rows} != {size} or len(rows) != size:
+        raise InputError(f"{what} has {len(rows)} rows, expected {size} rows of {size} numbers")
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _finite(value: Any) -> Any:
+    """Return a number, or rows of numbers, or None where any of them is not finite, for which JSON has no notation."""
+    rows = value if isinstance(value, list) else [[value]]
+    return value if all(x is not None and math.isfinite(x) for row in rows for x in row) else None

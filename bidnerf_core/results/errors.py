@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -23,6 +24,11 @@ class PoseError:
     def __getitem__(self, index: Any) -> PoseError:
         return PoseError(self.translation[index], self.rotation_deg[index])
 
+    def plain(self) -> dict[str, float] | None:
+        """Return the error of one pose as JSON values, or None where it is not finite."""
+        values = {"translation": float(self.translation), "rotation_deg": float(self.rotation_deg)}
+        return values if all(map(math.isfinite, values.values())) else None
+
 
 def pose_error(found: SE3, true: SE3) -> PoseError:
     """Return the error of ``found`` in float64; batches broadcast. It is not finite where a pose is not."""
@@ -43,6 +49,25 @@ def normalized_error_squared(
     xi = (found.to(dtype=torch.float64).inverse() @ true.to(dtype=torch.float64)).log()
     solved, _ = torch.linalg.solve_ex(covariance.double(), xi[..., None])
     return (xi * solved[..., 0]).sum(-1)
+
+
+def standard_deviations(covariance: Float[Tensor, "6 6"]) -> tuple[float, float]:
+    """Return the standard deviations of the position (metres) and of the rotation (radians) that a covariance gives."""
+    position, rotation = (float(part.sum().clamp(min=0).sqrt()) for part in covariance.diagonal().split(3))
+    return position, rotation
+
+
+def within(
+    found: SE3, true: SE3, covariance: Float[Tensor, "*c 6 6"], probability: float = 0.95
+) -> Bool[Tensor, "*b"]:
+    """Return whether the error of ``found`` lies within the bound that its covariance gives for a probability.
+
+    The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. A consistent covariance
+    has that share of its errors within. False where the covariance has no inverse.
+    """
+    from scipy.special import chdtri  # here, because importing scipy takes longer than any help page should
+
+    return normalized_error_squared(found, true, covariance) <= float(chdtri(6, 1 - probability))
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:

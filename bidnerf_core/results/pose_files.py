@@ -20,10 +20,12 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.datasets.writing import OPENCV_TO_OPENGL, camera_entry
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import write_file
+from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
+from bidnerf_core.io.files import read_file, write_file
+from bidnerf_core.io.json import parse_json
 
 TUM_HEAD = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes)\n"
+EXPECTED_POSE = '{"T_world_camera": 4x4 rows}'
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
@@ -48,9 +50,18 @@ def tum_trajectory(images: Sequence[PosedImage]) -> str:
     The timestamp is the image's time if all have one, else its name if all names are numbers, as in the TUM RGB-D datasets,
     else the image's number (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
     """
+    _require_finite(images)
     stamps = _timestamps(images)
     rows = (_tum_row(stamp, image.T_world_camera) for stamp, image in zip(stamps, images, strict=True))
     return TUM_HEAD + "".join(rows)
+
+
+def _require_finite(images: Sequence[PosedImage]) -> None:
+    for image in images:
+        if not bool(image.T_world_camera.matrix().isfinite().all()):
+            raise InputError(
+                f"the pose of {image.name} is not finite, expected to leave it out, or a .json file"
+            )
 
 
 def _timestamps(images: Sequence[PosedImage]) -> list[str]:
@@ -80,6 +91,7 @@ def transforms_json(images: Sequence[PosedImage], folder: Path) -> str:
     It describes the image files as they are stored, so the poses and cameras of photos with an EXIF orientation are rotated.
     Raises ``InputError`` for a photo that is stored mirrored, for which no rigid pose exists.
     """
+    _require_finite(images)
     frames = [_transforms_entry(image, folder) for image in images]
     return json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1, allow_nan=False) + "\n"
 
@@ -101,18 +113,22 @@ def poses_json(images: Sequence[PosedImage]) -> str:
     """Return a JSON list of ``{"frame", "time", "T_world_camera", "covariance"}``, one per line; poses have OpenCV axes.
 
     ``time`` (seconds) and ``covariance`` (6x6, tangent of translation in metres, then rotation in rad, at the camera) are
-    null where they are not known.
+    null where they are not known, and every matrix is null where it is not finite.
     """
     objects = [
         {
             "frame": image.name,
             "time": image.time,
-            "T_world_camera": image.T_world_camera.to("cpu", torch.float64).matrix().tolist(),
-            "covariance": None if image.covariance is None else image.covariance.double().cpu().tolist(),
+            "T_world_camera": _rows(image.T_world_camera.matrix()),
+            "covariance": None if image.covariance is None else _rows(image.covariance),
         }
         for image in images
     ]
     return "[\n" + ",\n".join(json.dumps(entry, allow_nan=False) for entry in objects) + "\n]\n"
+
+
+def _rows(matrix: Float[Tensor, "r c"]) -> list[list[float]] | None:
+    return matrix.double().cpu().tolist() if bool(matrix.isfinite().all()) else None
 
 
 def _as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics, SE3]:
@@ -156,10 +172,42 @@ POSE_WRITERS: dict[str, Callable[[Path, Sequence[PosedImage]], None]] = {
 """Writers by the ending of the file's name; the first that matches is used."""
 
 
-def write_poses(path: Path, images: Sequence[PosedImage]) -> None:
+def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
     """Write poses in the format that the ending of the file's name selects. Raises ``InputError`` for an unknown ending."""
+    path = Path(path)
     for ending, write in POSE_WRITERS.items():
         if path.name.lower().endswith(ending):
             write(path, images)
             return
     raise InputError(f"{path}: expected a name that ends with {', '.join(POSE_WRITERS)}")
+
+
+def read_pose(path: str | Path) -> SE3:
+    """Read a 4x4 camera-to-world matrix, alone or under "T_world_camera", as ``localize --json`` prints it.
+
+    A list of one such object is accepted as well. Raises ``InputError`` where the file does not hold the rows of a rigid
+    transform.
+    """
+    path = Path(path)
+    content = read_file(path, "a pose file")
+    try:
+        found = parse_json(content, str(path), EXPECTED_POSE)
+    except InputError as error:
+        lines = [line for line in content.splitlines() if line.strip()]
+        if len(lines) > 1 and all(line.startswith(b"{") for line in lines):  # as ``--json`` prints several
+            raise _not_one(path, len(lines)) from error
+        raise
+    if isinstance(found, list) and all(isinstance(entry, dict) for entry in found):
+        if len(found) != 1:  # as ``--out`` writes several
+            raise _not_one(path, len(found))
+        (found,) = found
+    rows = found.get("T_world_camera") if isinstance(found, dict) else found
+    try:
+        matrix = torch.tensor(rows, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(f"{path}: no matrix of numbers in it, expected {EXPECTED_POSE}") from error
+    return pose_from_matrix(matrix, f"{path}: T_world_camera")
+
+
+def _not_one(path: Path, count: int) -> InputError:
+    return InputError(f"{path}: holds {count} poses, expected one")

@@ -1,0 +1,78 @@
+"""Signals that ask a command to stop: each raises an exception in the main thread, so that results can be kept."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+ASKED_TO_STOP = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+]  # Windows has no SIGHUP
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal asked the command to stop."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class _Handler:
+    """Raises ``Interrupted`` in the process that installed it, at once or once results are written."""
+
+    def __init__(self) -> None:
+        self.process = os.getpid()
+        self.deferring = False
+        self.deferred: int | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self.process:  # a forked worker ends as it would without this handler
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        elif self.deferring:
+            self.deferred = number
+        else:
+            raise Interrupted(number)
+
+
+@contextlib.contextmanager
+def interruptions() -> Iterator[None]:
+    """Let SIGINT, SIGTERM and SIGHUP raise ``Interrupted``. Signals that are ignored, as under nohup, stay ignored.
+
+    Outside the main thread, which alone may handle signals, nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    handler = _Handler()
+    before = {number: signal.getsignal(number) for number in ASKED_TO_STOP}
+    ours = [number for number, found in before.items() if found in usual]
+    for number in ours:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, before[number])
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Defer interruptions to the end of the context, in which results are written."""
+    handlers = [found for number in ASKED_TO_STOP if isinstance(found := signal.getsignal(number), _Handler)]
+    for handler in handlers:
+        handler.deferring = True
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.deferring = False
+    deferred = [handler.deferred for handler in handlers if handler.deferred is not None]
+    if deferred:
+        raise Interrupted(deferred[0])

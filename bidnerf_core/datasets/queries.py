@@ -1,0 +1,210 @@
+"""Queries for a localization: photos, or frames of a dataset, each read when it is its turn."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from bidnerf_core.camera.source import CameraSource
+from bidnerf_core.datasets import READERS, Dataset
+from bidnerf_core.datasets.colmap import SparsePoints
+from bidnerf_core.datasets.dataset import unique_names
+from bidnerf_core.datasets.points import read_depth_points
+from bidnerf_core.datasets.transforms import TransformsDataset
+from bidnerf_core.depth.registration import DepthCamera
+from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
+from bidnerf_core.fields.observations import Observations
+from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.photos import DEPTH_STEM, photos_in
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import Background
+from bidnerf_core.localization import window as windowed
+
+log = logging.getLogger("bidnerf")
+
+NAMED = 5
+"""Maximum number of files that a message names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """An image, or several with known relative poses; the pose of the last one is sought."""
+
+    name: str
+    views: tuple[View, ...]
+    truth: SE3 | None = None  # T_world_camera, where a dataset has it; used for errors and --perturb alone
+    depth_rays: Observations | None = None
+    file: Path | None = None  # of the last image
+
+    @property
+    def frame(self) -> Frame:
+        """The image whose pose is sought."""
+        return self.views[-1].frame
+
+
+@runtime_checkable
+class QuerySource(Protocol):
+    """Queries by name, read one at a time."""
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+    def read(self, place: int) -> Query:
+        """Read the query at index ``place``. Raises ``InputError`` if one of its files is missing or unusable."""
+        ...
+
+
+@dataclass(frozen=True)
+class DepthPoints:
+    """Measured points: a file of points, or a COLMAP model with the points that frames observe."""
+
+    path: Path
+    sparse: SparsePoints | None
+
+    def rays(self, views: Sequence[View], split: str) -> Observations:
+        """Return the measured points as rays in the last camera's frame."""
+        if self.sparse is None:
+            return read_depth_points(self.path)
+        rays = self.sparse.rays(views, split)
+        names = [view.frame.name for view in views]
+        blind = ", ".join(name for name in names if len(self.sparse.seen(name, split)) == 0)
+        log.info("%s: %s seen%s", names[-1], amount(len(rays), "point"), blind and f", none by {blind}")
+        return rays
+
+
+class Photos:
+    """Image files, each a query.
+
+    ``depth`` holds the depth file of each photo that has one, ``depth_unit`` is the length of one of its steps (metres), and
+    ``sensor`` the camera from which depth is registered to the photos.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        camera: CameraSource | None = None,
+        depth: Mapping[Path, Path] | None = None,
+        depth_unit: float | None = None,
+        sensor: DepthCamera | None = None,
+        background: Background = "black",
+        points: DepthPoints | None = None,
+    ) -> None:
+        self._files, self._background, self._points = files, background, points
+        self._camera = CameraSource() if camera is None else camera
+        self._depth, self._depth_unit, self._sensor = depth or {}, depth_unit, sensor
+        self._names = unique_names([(*file.parts[:-1], file.stem) for file in files])
+        self._remarks: set[str] = set()
+
+    @property
+    def names(self) -> Sequence[str]:
+        return self._names
+
+    def read(self, place: int) -> Query:
+        file = self._files[place]
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", InputWarning)
+            frame = Frame.read(
+                file, self._camera, depth=self._depth.get(file), depth_unit=self._depth_unit,
+                sensor=self._sensor, background=self._background,
+            )  # fmt: skip
+        name = self._names[place]
+        for warning in caught:
+            self._remark(name, str(warning.message).partition(": ")[2] or str(warning.message))
+        self._remark(name, f"{frame.camera_source}")
+        if self._depth and file not in self._depth:
+            log.info("%s: no measured depth was given; colour only", name)
+        views = (View(replace(frame, name=name), SE3.identity()),)
+        rays = None if self._points is None else self._points.rays(views, "")
+        return Query(name, views, depth_rays=rays, file=file)
+
+    def _remark(self, name: str, text: str) -> None:
+        """Log the source of a camera, or what was assumed, unless the same was logged for an earlier photo."""
+        if text not in self._remarks:
+            self._remarks.add(text)
+            log.info("%s: %s", name, text)
+
+
+class DatasetFrames:
+    """Frames of a dataset as queries: one rig of ``names``, or each frame of a split with the ``window - 1`` before it."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        split: str = "test",
+        names: tuple[str, ...] = (),
+        window: int = 1,
+        points: DepthPoints | None = None,
+    ) -> None:
+        self._dataset, self._split, self._points = dataset, split, points
+        listed = dataset.frame_names(split)
+        if not listed:
+            raise InputError(f"{dataset.path}: split {split!r} has no frames")
+        if window > len(listed):
+            raise UsageError(f"--window is {window}, expected 1 to {len(listed)}")
+        asked = [names] if names else [(name,) for name in listed]
+        self._rigs = [self._with_window(rig, listed, window) for rig in asked]
+
+    @property
+    def names(self) -> Sequence[str]:
+        return [rig[-1] for rig in self._rigs]
+
+    def read(self, place: int) -> Query:
+        views = tuple(self._dataset.views(self._split, self._rigs[place]))
+        file = None
+        if isinstance(self._dataset, TransformsDataset):
+            file = self._dataset.image_file(self._split, views[-1].frame.name)
+        rays = None if self._points is None else self._points.rays(views, self._split)
+        return Query(views[-1].frame.name, views, views[-1].T_ref_camera, rays, file)
+
+    def _with_window(self, rig: tuple[str, ...], listed: list[str], size: int) -> tuple[str, ...]:
+        if size == 1 or rig[0] not in listed:  # an unknown name is rejected when it is read
+            return rig
+        names = windowed(listed, listed.index(rig[0]), size)
+        if len(names) < size:
+            before = f"{names[-1]} has {len(names) - 1} before it in split {self._split!r}"
+            log.info("--window %d: %s; a rig of %d", size, before, len(names))
+        return names
+
+
+def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]:
+    """Return the image files among ``paths`` and in folders among them; the log names other files there.
+
+    Files of ``depth`` may lie among the photos. Raises ``InputError`` for a folder without photos.
+    """
+    files = list[Path]()
+    for path in paths:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        found, others = photos_in(path)
+        others = [file for file in others if file not in depth]
+        if not found:
+            formats = " or ".join(reader.expected for reader in READERS)
+            raise InputError(f"{path}: no photos in it, and no dataset ({formats})")
+        if others:
+            named = ", ".join(file.name for file in others[:NAMED])
+            more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+            log.info("%s: skipped %s%s: not photos by their names", path, named, more)
+        files += found
+    return files
+
+
+def depth_files(photos: Sequence[Path], depth: Sequence[Path]) -> dict[Path, Path]:
+    """Return the depth file of each photo: by name where names agree (``NAME.png``, ``NAME.depth.png``), else in order.
+
+    Raises ``UsageError`` where depth files can be assigned in neither way.
+    """
+    by_stem = {photo.stem: photo for photo in photos}
+    stems = [file.stem.removesuffix(DEPTH_STEM) for file in depth]
+    if len(by_stem) == len(photos) and len(set(stems)) == len(stems) and set(stems) <= set(by_stem):
+        return {by_stem[stem]: file for stem, file in zip(stems, depth, strict=True)}
+    if len(depth) != len(photos):
+        raise UsageError(
+            f"--depth names {amount(len(depth), 'file')} for {amount(len(photos), 'photo')}, expected one for each, in the"
+            " same order or matched by name"
+        )
+    return dict(zip(photos, depth, strict=True))

@@ -1,0 +1,247 @@
+"""The answers to a run of images: as JSON, and as a file of poses."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.datasets.queries import Query, QuerySource
+from bidnerf_core.depth.noise import noise_remark
+from bidnerf_core.errors import InputError, UsageError, amount
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
+from bidnerf_core.localization import Localization, Localizer, Outcome
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, LandmarkThresholds
+from bidnerf_core.progress import Cancel, ProgressCallback, counter
+from bidnerf_core.results.errors import PoseError, pose_error
+from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage, write_poses
+
+log = logging.getLogger("bidnerf")
+
+RECOGNISED = {
+    Outcome.CONVERGED, Outcome.IMPRECISE, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.UNCERTAIN
+}  # fmt: skip
+"""Outcomes of images that show the scene."""
+SEVERAL = 3
+"""Minimum number of images, all of them rejected, at which the user is asked whether the map is the right one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The pose found for an image, and what is known of the image. The image itself is not kept."""
+
+    name: str
+    number: int  # index in the run or sequence, from 0
+    intrinsics: Intrinsics  # of the upright image, corrected ones where the localization took such
+    found: Localization
+    truth: SE3 | None = None  # T_world_camera
+    time: float | None = None  # seconds
+    file: Path | None = None
+
+    @staticmethod
+    def of(
+        frame: Frame, number: int, found: Localization, *, truth: SE3 | None = None, time: float | None = None,
+        file: Path | None = None,
+    ) -> Answer:  # fmt: skip
+        """Return the answer for a frame, without the intermediate poses, which take much memory in long sequences."""
+        intrinsics = found.frame_as_taken(frame).intrinsics
+        found = replace(found, poses=found.poses[-1:])
+        return Answer(frame.name, number, intrinsics, found, truth, time, file)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the localization converged, to a pose that is finite."""
+        return self.found.converged and bool(self.found.T_world_camera.matrix().isfinite().all())
+
+    @property
+    def error(self) -> PoseError | None:
+        """The error of the pose found, or None where the true pose is not known."""
+        return None if self.truth is None else pose_error(self.found.T_world_camera, self.truth)
+
+    @property
+    def posed(self) -> PosedImage:
+        """The image as files of poses list it."""
+        found = self.found
+        return PosedImage(
+            self.name,
+            self.number,
+            self.intrinsics,
+            found.T_world_camera,
+            self.file,
+            self.time,
+            found.covariance,
+        )
+
+    def plain(self, backend: str) -> dict[str, Any]:
+        """Return the object of JSON values that ``bidnerf localize --json`` prints."""
+        return {"frame": self.name} | plain_localization(self.found, backend, self.error)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An image that could not be read or localized."""
+
+    name: str
+    method: str
+    reason: str
+
+    def plain(self, backend: str) -> dict[str, Any]:
+        """Return an object with the keys of ``Answer.plain``, whose outcome is "bad input"."""
+        return {
+            "frame": self.name, "T_world_camera": None, "converged": False, "outcome": "bad input",
+            "reason": self.reason, "steps": 0, "seconds": 0.0, "covariance": None, "loss": None, "method": self.method,
+            "focal_factor": 1.0, "intrinsics": None, "confidence": None, "backend": backend, "error": None,
+        }  # fmt: skip
+
+
+class Answers:
+    """The answers to the images of a run, in their order, for a map of a ``backend``."""
+
+    def __init__(self, backend: str) -> None:
+        self.backend = backend
+        self.given: list[Answer | Failure] = []
+
+    def __len__(self) -> int:
+        return len(self.given)
+
+    def append(self, answer: Answer | Failure) -> None:
+        """Keep an answer."""
+        self.given.append(answer)
+
+    def plain(self, answer: Answer | Failure) -> dict[str, Any]:
+        """Return an answer as JSON values; numbers and matrices that are not finite are None."""
+        return answer.plain(self.backend)
+
+    @property
+    def accepted(self) -> list[Answer]:
+        """The answers that were accepted."""
+        return [answer for answer in self.answers if answer.accepted]
+
+    @property
+    def answers(self) -> list[Answer]:
+        """The answers, without the failures."""
+        return [answer for answer in self.given if isinstance(answer, Answer)]
+
+    @property
+    def question(self) -> str:
+        """A question to append to a summary: empty unless there are several images and none shows the scene of the map."""
+        return question_about_scene([answer.found for answer in self.answers])
+
+    def save(self, path: str | Path) -> None:
+        """Write the poses atomically, in the format that the ending of the file's name selects.
+
+        A ``.json`` file lists all answers with all details; files of other formats hold the accepted poses alone. Raises
+        ``UsageError`` for an unknown ending, and ``InputError`` for images that the format cannot describe.
+        """
+        path = Path(path)
+        if pose_format(path) == ".json":
+            rows = ",\n".join(json.dumps(self.plain(answer), allow_nan=False) for answer in self.given)
+            write_file(path, f"[\n{rows}\n]\n".encode())
+            return
+        accepted = self.accepted
+        write_poses(path, [answer.posed for answer in accepted])
+        if left_out := len(self) - len(accepted):
+            log.info(
+                "%s: %s; %d without an accepted pose are left out",
+                path,
+                amount(len(accepted), "pose"),
+                left_out,
+            )
+
+
+def plain_localization(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
+    """Return the JSON values of a localization, the backend of its map, and its error if that is known."""
+    return found.plain() | {"backend": backend, "error": None if error is None else error.plain()}
+
+
+def pose_format(path: Path) -> str:
+    """Return the ending that selects the format of a file of poses. Raises ``UsageError`` for a name without any of them."""
+    for ending in POSE_WRITERS:
+        if path.name.lower().endswith(ending):
+            return ending
+    raise UsageError(f"{path}: expected a name that ends with {', '.join(POSE_WRITERS)}")
+
+
+def question_about_scene(found: Collection[Localization]) -> str:
+    """Return a question to append to a summary: empty unless there are several images and none was recognised."""
+    if len(found) < SEVERAL or any(map(_shows_scene, found)):
+        return ""
+    return "; do they show the scene of this map?"
+
+
+def _shows_scene(found: Localization) -> bool:
+    """Return whether an image was recognised. An ambiguous one counts if far more landmarks fit its pose than by chance."""
+    evidence = found.diagnostics
+    if found.outcome is Outcome.AMBIGUOUS and isinstance(evidence, LandmarkDiagnostics):
+        return evidence.inliers >= LandmarkThresholds().above_chance * evidence.chance
+    return found.outcome in RECOGNISED
+
+
+def localize_each(
+    localizer: Localizer,
+    queries: QuerySource,
+    *,
+    start: Callable[[Query], SE3 | None] | None = None,
+    seed: int = 0,
+    answers: Answers | None = None,
+    each: Callable[[Query, Answer | Failure], None] | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> Answers:
+    """Localize each query. One that cannot be read or localized does not stop the others; a single one raises its error.
+
+    ``start`` returns the start of a query, T_world_camera, which method ``auto`` does without. ``answers``: where the answers are
+    kept, by default new ones; they hold those so far if an error ends the run. ``each`` is called with each query's answer and
+    the query; for a failure the query has a name only. Raises ``InputError``, and ``Cancelled`` once ``cancel`` returns True.
+    """
+    answers = (
+        Answers(getattr(getattr(localizer.map, "info", None), "backend", "")) if answers is None else answers
+    )
+    total = len(queries.names)
+    count = counter("localizing", "images", progress, cancel)
+    bare_before = False
+    for number, name in enumerate(queries.names):
+        answer: Answer | Failure
+        query = Query(name, ())
+        try:
+            query = queries.read(number)
+            bare = [view.frame.name for view in query.views if not view.frame.has_depth]
+            if bare and query.truth is not None and query.depth_rays is None and not bare_before:
+                bare_before = True
+                log.info("%s: no measured depth; colour only", ", ".join(bare))
+            if number == 0:
+                _log_depth_noise(query, localizer)
+            found = localizer(query.views, None if start is None else start(query), query.depth_rays, seed)
+            if not bool(found.T_world_camera.matrix().isfinite().all()):
+                raise InputError(
+                    f"{name}: {found.method} came to a pose that is not finite, expected a sound map"
+                )
+            answer = Answer.of(
+                replace(query.frame, name=query.name), number, found, truth=query.truth, file=query.file
+            )
+        except UsageError:
+            raise
+        except InputError as error:
+            if total == 1:
+                raise
+            answer = Failure(name, localizer.method, str(error))
+        answers.append(answer)
+        if each is not None:
+            each(query, answer)
+        count(number + 1, total)
+    return answers
+
+
+def _log_depth_noise(query: Query, localizer: Localizer) -> None:
+    """Compare the noise of a query's depth with that of the sensor that the settings name."""
+    frame, sensor = query.frame, getattr(localizer.config, "depth_sensor", "unknown")
+    if sensor != "unknown" and frame.depth is not None and frame.has_depth:
+        remark = noise_remark(frame.depth, frame.intrinsics, sensor)
+        if remark is not None:
+            log.info("%s: %s", query.name, remark)

@@ -1,0 +1,247 @@
+"""Tracking of a whole sequence, and the path that results: its file of poses, its errors, its plot."""
+
+from __future__ import annotations
+
+import logging
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidnerf_core.captures.cameras import as_given
+from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, open_sequence
+from bidnerf_core.errors import InputError, InputWarning, amount
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import Localization, Localizer, Tracker, TrackerConfig
+from bidnerf_core.localization.localizer import Start
+from bidnerf_core.localization.problem import SceneMap
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.progress import Cancel, ProgressCallback, counter
+from bidnerf_core.results.answers import Answer, Answers, Failure
+from bidnerf_core.results.errors import standard_deviations, within
+from bidnerf_core.results.trajectory import ErrorSummary, TrajectoryErrors, spans
+from bidnerf_core.results.trajectory_plot import PlottedPath, plot_path
+
+log = logging.getLogger("bidnerf")
+
+TRIED = 3
+"""Number of unreadable frames at the beginning of a sequence after which it is given up: probably none can be read."""
+SAME_POSE = 1e-4
+"""Difference of two poses' matrices (metres) that rounding in files may cause."""
+
+
+def track(
+    scene: SceneMap | Localizer,
+    sequence: FrameSequence | str | Path,
+    *,
+    config: TrackerConfig | None = None,
+    start: Start | None = None,
+    depth: bool = True,
+    every: int = 1,
+    path: TrackedPath | None = None,
+    each: Callable[[Frame, Answer], None] | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> TrackedPath:
+    """Find the poses of a sequence's frames in a map, in chronological order.
+
+    ``scene``: a map, or a localizer with settings of its own. ``sequence``: one that ``open_sequence`` opened, or the path of a
+    dataset, of a folder of images or of a video, whose images have the camera of the map's if they have none of their own.
+    ``start``: a guess at the first T_world_camera. ``depth``: whether measured depth is used. ``every``: take every n-th frame.
+    ``path``: where the answers are kept, by default a new path; it holds those so far if an error ends the tracking. ``each`` is
+    called with each frame and its answer, ``progress`` after each frame.
+
+    A frame whose files cannot be read is left out with an ``InputWarning`` and counted in ``unread``. Raises ``InputError`` where
+    none of the first frames can be read, and ``Cancelled`` once ``cancel`` returns True.
+    """
+    if every < 1:
+        raise InputError(f"every is {every}, expected 1 or more")
+    localizer = scene if isinstance(scene, Localizer) else Localizer(scene)
+    if not isinstance(sequence, FrameSequence):
+        sequence = opened_for(localizer.map, sequence)
+    path = TrackedPath.of(localizer.map) if path is None else path
+    tracker = Tracker(localizer, config, start)
+    total = -(-len(sequence) // every)
+    count = counter("tracking", "frames", progress, cancel)
+    for number, timed in enumerate(_every(sequence, every)):
+        if isinstance(timed, TimedFrame):
+            frame = timed.frame if depth else replace(timed.frame, depth=None)
+            answer = path.add(frame, tracker(frame, timed.time), timed.time, timed.truth, every * number)
+            if each is not None:
+                each(timed.frame, answer)
+        elif not path.answers and number + 1 >= min(TRIED, total):
+            first = "the first frame cannot" if number == 0 else f"none of the first {number + 1} frames can"
+            raise InputError(f"{first} be read: {timed}")
+        else:
+            warnings.warn(f"{timed}; left out", InputWarning, stacklevel=2)
+            path.unread += 1
+        count(number + 1, total)
+    return path
+
+
+def opened_for(scene: SceneMap, path: str | Path, **options: Any) -> FrameSequence:
+    """Open a sequence as ``open_sequence`` does, with the map's background and its cameras for images that have none."""
+    landmarks = getattr(scene, "landmarks", None)
+    assumed = () if landmarks is None else landmarks.cameras
+    return open_sequence(path, assumed=assumed, background=scene.bounds.background, **options)
+
+
+def _every(frames: FrameSequence, every: int) -> Iterator[TimedFrame | InputError]:
+    """Yield every n-th frame; where each has files of its own, an unreadable one is yielded as an error."""
+    if not isinstance(frames, FileSequence):
+        yield from islice(frames, 0, None, every)
+        return
+    for place in range(0, len(frames), every):
+        try:
+            yield frames[place]
+        except InputError as error:
+            yield error
+
+
+class TrackedPath(Answers):
+    """The answers to the frames of a sequence, in the order of time."""
+
+    def __init__(self, info: MapInfo | None = None) -> None:
+        """Begin the path in a map that ``info`` describes."""
+        super().__init__("" if info is None else info.backend)
+        self.unread = 0  # frames whose files could not be read
+        cameras = () if info is None else as_given(info.cameras)
+        self._trained_on = {camera.name: camera.pose for camera in cameras}
+        self._lost_at: int | None = None
+        self._camera_sources: set[str] = set()
+
+    @staticmethod
+    def of(scene: SceneMap) -> TrackedPath:
+        """Return an empty path in a map."""
+        return TrackedPath(getattr(scene, "info", None))
+
+    def add(
+        self,
+        frame: Frame,
+        found: Localization,
+        time: float | None = None,
+        truth: SE3 | None = None,
+        number: int | None = None,
+    ) -> Answer:
+        """Keep the answer to a frame, and return it. Where the tracker gets lost and has recovered, the log says so.
+
+        ``number`` is the frame's index in its sequence, by default one more than the last. ``time`` is in seconds, ``truth`` is
+        the true T_world_camera.
+        """
+        if number is None:
+            number = self.answers[-1].number + 1 if self.given else 0
+        if frame.camera_source and frame.camera_source not in self._camera_sources:
+            self._camera_sources.add(frame.camera_source)
+            log.info("%s: %s", frame.name, frame.camera_source)
+        answer = Answer.of(frame, number, found, truth=truth, time=time)
+        self.append(answer)
+        if not found.converged and self._lost_at is None:
+            self._lost_at = len(self)
+            log.info("frame %d (%s): %s: %s", number + 1, frame.name, found.outcome, found.reason)
+        elif found.converged and self._lost_at is not None:
+            missed = amount(len(self) - self._lost_at, "frame")
+            log.info("frame %d (%s): tracking again after %s", number + 1, frame.name, missed)
+            self._lost_at = None
+        return answer
+
+    def plain(self, answer: Answer | Failure) -> dict[str, Any]:
+        """Return a frame's answer as JSON values: the keys of ``localize --json``, and ``time``."""
+        time = answer.time if isinstance(answer, Answer) else None
+        return {"frame": answer.name, "time": time} | super().plain(answer)
+
+    @property
+    def lost(self) -> list[tuple[int, int]]:
+        """The first and the last index of each run of frames without an accepted pose."""
+        return spans([not answer.accepted for answer in self.answers])
+
+    @property
+    def without_times(self) -> bool:
+        """Whether no frame has a time stamp."""
+        return all(answer.time is None for answer in self.answers)
+
+    def errors(self) -> TrajectoryErrors | None:
+        """Return the errors of the accepted poses whose truth is known, or None if there are none."""
+        known = [(a.found.T_world_camera, a.truth) for a in self.accepted if a.truth is not None]
+        if not known:
+            return None
+        return TrajectoryErrors.of(SE3.stack([found for found, _ in known]), SE3.stack([t for _, t in known]))
+
+    def consistency(self) -> float | None:
+        """Return the share of accepted poses whose error lies within the 95 % bound of their covariance, or None if unknown."""
+        inside = [
+            bool(within(answer.found.T_world_camera, answer.truth, answer.found.covariance))
+            for answer in self.accepted
+            if answer.truth is not None and answer.found.covariance is not None
+        ]
+        return sum(inside) / len(inside) if inside else None
+
+    def trained_on(self) -> int:
+        """Return the number of frames that are images of the map's training, by their names and true poses."""
+        return sum(map(self._is_of_training, self.answers))
+
+    def plot(self, file: str | Path, surface: SurfaceMap | None = None) -> None:
+        """Draw the path over the surface of its map, as PNG or SVG by the ending of the file's name.
+
+        Raises ``InputError`` without matplotlib or without any finite pose.
+        """
+        drawn = [a for a in self.answers if bool(a.found.T_world_camera.matrix().isfinite().all())]
+        if not drawn:
+            raise InputError(f"{file}: not drawn, since no frame was tracked")
+        path = PlottedPath(
+            SE3.stack([answer.found.T_world_camera for answer in drawn]),
+            torch.tensor([answer.accepted for answer in drawn]),
+            torch.tensor([_deviation(a.found.covariance) for a in drawn], dtype=torch.float64),
+            [answer.truth for answer in drawn],
+        )
+        plot_path(path, surface, Path(file))
+
+    def summary(self, seconds: float) -> list[tuple[str, str]]:
+        """Return the rows of a table that describes a run that took ``seconds``: frames, losses, errors."""
+        total, accepted, lost = len(self), len(self.accepted), self.lost
+        longest = max((last - first + 1 for first, last in lost), default=0)
+        rows = [
+            ("frames", f"{total}, {total / max(seconds, 1e-9):.1f} per second"),
+            ("tracked", f"{accepted} ({accepted / max(1, total):.1%})"),
+            ("not read", amount(self.unread, "frame") if self.unread else ""),
+            (
+                "lost",
+                f"{amount(len(lost), 'time')}, at most for {amount(longest, 'frame')}" if lost else "never",
+            ),
+        ]
+        if (errors := self.errors()) is not None:
+            rows.append(("raw error", _written(errors.raw)))
+            if errors.ate is not None:
+                rows.append(("ATE", f"{errors.ate:.4f} m (root mean square, rigidly aligned)"))
+            if errors.rpe is not None:
+                rows.append(("RPE per frame", _written(errors.rpe)))
+        if (share := self.consistency()) is not None:
+            rows.append(("inside 95 % bound", f"{share:.1%} (by the poses' covariances)"))
+        if seen := self.trained_on():
+            no_test = "errors of frames that trained the map are no test"
+            rows.append(("trained on", f"{amount(seen, 'frame')}; {no_test}"))
+        return [(name, text) for name, text in rows if text]
+
+    def _is_of_training(self, answer: Answer) -> bool:
+        given = self._trained_on.get(answer.name)
+        if given is None or answer.truth is None:
+            return False
+        return torch.allclose(given.matrix(), answer.truth.matrix(), rtol=0, atol=SAME_POSE)
+
+
+def _written(summary: ErrorSummary) -> str:
+    return (
+        f"median {summary.translation_median:.4f} m, {summary.rotation_deg_median:.3f} deg;"
+        f" 95 % within {summary.translation_p95:.4f} m, {summary.rotation_deg_p95:.3f} deg"
+    )
+
+
+def _deviation(covariance: Tensor | None) -> float:
+    return math.nan if covariance is None else standard_deviations(covariance)[0]
