@@ -58,7 +58,12 @@ if TYPE_CHECKING:
     from bidnerf_core.registry import load_backend as load_backend
     from bidnerf_core.results.errors import PoseError as PoseError
     from bidnerf_core.results.errors import pose_error as pose_error
+    from bidnerf_core.results.overlays import overlay as overlay
+    from bidnerf_core.results.pose_files import PosedImage as PosedImage
+    from bidnerf_core.results.pose_files import read_pose as read_pose
     from bidnerf_core.results.pose_files import write_poses as write_poses
+    from bidnerf_core.results.tracked_path import TrackedPath as TrackedPath
+    from bidnerf_core.results.tracked_path import track as track
 
 HOMES = {
     "AutoConfig": "localization",
@@ -76,6 +81,7 @@ HOMES = {
     "Observations": "fields.observations",
     "Outcome": "localization",
     "PoseError": "results.errors",
+    "PosedImage": "results.pose_files",
     "Progress": "progress",
     "ProgressCallback": "progress",
     "RadianceField": "fields.contract",
@@ -84,6 +90,7 @@ HOMES = {
     "Rays": "fields.contract",
     "SE3": "geometry.se3",
     "SceneBounds": "fields.contract",
+    "TrackedPath": "results.tracked_path",
     "Tracker": "localization",
     "TrackerConfig": "localization",
     "View": "frames.frame",
@@ -93,11 +100,14 @@ HOMES = {
     "load_map": "maps.map",
     "open_dataset": "datasets",
     "open_sequence": "datasets",
+    "overlay": "results.overlays",
     "perturb": "evaluation.protocols",
     "pose_error": "results.errors",
+    "read_pose": "results.pose_files",
     "render": "fields.rendering",
     "render_image": "fields.rendering",
     "settings_of": "localization",
+    "track": "results.tracked_path",
     "write_poses": "results.pose_files",
     "write_transforms": "datasets",
 }
