@@ -25,7 +25,11 @@ class Backend(Protocol):
 
     @property
     def config_type(self) -> type:
-        """A frozen dataclass of values that JSON can hold, with a default for every field."""
+        """A frozen dataclass of values that JSON can hold, with a default for every field.
+
+        One of its fields is ``steps``, an int above 0: the length of a training. A map is complete when its field was
+        trained for that many steps, and the command line shows progress as a share of them.
+        """
         ...
 
     def build(self, config: Any, bounds: SceneBounds) -> RadianceField:
@@ -33,7 +37,11 @@ class Backend(Protocol):
         ...
 
     def train(self, field: RadianceField, views: Sequence[View], config: Any, report: Report) -> None:
-        """Fit the field to views whose reference frame is the world, and pass each step's progress to ``report``."""
+        """Fit the field to views whose reference frame is the world, and pass each step's progress to ``report``.
+
+        Photos of one place differ in exposure, some are blurred, and landmarks give depth where no sensor did:
+        ``training.Supervision`` takes account of all of it.
+        """
         ...
 
 

@@ -17,17 +17,16 @@ import torch
 from bidnerf_core import Intrinsics, Localizer, Map, list_backends, load_backend
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.fields.contract import FieldValues, device_of
-from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object, orbit, views
-from bidnerf_core.training import RayBank, Silent, StepOutcome, fit, supervised_loss
+from bidnerf_core.training import Silent, Supervision, SupervisionConfig
 
 
 @dataclass(frozen=True)
-class BallsConfig:
+class BallsConfig(SupervisionConfig):
     balls: int = 64
     steps: int = 300
 
@@ -56,15 +55,13 @@ class BallsBackend:
     summary, config_type, build = "soft coloured balls", BallsConfig, staticmethod(Balls)
 
     def train(self, field, views, config, report):
-        bank = RayBank(views, field.bounds, device_of(field))
+        supervision = Supervision(views, field.bounds, config, device_of(field))
 
         def outcome(step, generator):
-            batch = bank.draw(256, generator)
-            return StepOutcome(
-                *supervised_loss(render(field, batch.rays, batch.background), batch, field.side, 0.1)
-            )
+            return supervision.step(field, 256, generator)
 
-        fit(field, [{"params": list(field.parameters()), "lr": 0.03}], outcome, config.steps, report)
+        groups = [{"params": list(field.parameters()), "lr": 0.03}]
+        supervision.fit(field, groups, outcome, config.steps, report)
 
 
 backend = BallsBackend()

@@ -77,7 +77,6 @@ def test_images_with_a_background_have_no_exposure_to_learn(alpha: bool) -> None
         views = [replace(view, frame=replace(view.frame, alpha=None)) for view in views]
     supervision = Supervision(views, demo_object().bounds, SupervisionConfig())
     assert (supervision.colours is None) == alpha
-    assert len(supervision.groups()) == (not alpha)
     assert isinstance(supervision.bank, RayBank)
     assert (
         Supervision(views, demo_object().bounds, replace(SupervisionConfig(), exposure=False)).colours is None

@@ -21,7 +21,16 @@ from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import View
 from bidnerf_core.testing import BackendContract
-from bidnerf_core.training import RayBank, Report, StepOutcome, TrainingStopped, fit
+from bidnerf_core.training import (
+    RayBank,
+    Report,
+    StepOutcome,
+    Supervision,
+    SupervisionConfig,
+    TrainingStopped,
+    fit,
+    supervised_loss,
+)
 from bidnerf_hashgrid import backend as hashgrid
 
 
@@ -60,7 +69,9 @@ class WaveField(nn.Module):
         return FieldValues(nn.functional.softplus(out[..., 0]) * self.width, out[..., 1:].sigmoid())
 
 
-class WaveBackend:
+class PlainWaves:
+    """Waves trained by the colours of the images alone."""
+
     summary: Any = "waves for tests"
     config_type: Any = WaveConfig
     field_type = WaveField
@@ -84,6 +95,21 @@ class WaveBackend:
 
         groups = [{"params": list(field.parameters()), "lr": 0.02}]
         fit(field, groups, outcome, config.steps, report, schedule=lambda step, total: 1.0, seed=config.seed)
+
+
+class WaveBackend(PlainWaves):
+    """Waves trained as the bundled backends are."""
+
+    def train(self, field: Any, views: Sequence[View], config: Any, report: Report) -> None:
+        supervision = Supervision(views, field.bounds, SupervisionConfig(), device_of(field))
+
+        def outcome(step: int, generator: Generator) -> StepOutcome:
+            return supervision.step(field, 256, generator)
+
+        groups = [{"params": list(field.parameters()), "lr": 0.02}]
+        supervision.fit(
+            field, groups, outcome, config.steps, report, schedule=lambda step, total: 1.0, seed=config.seed
+        )
 
 
 class TestWaves(BackendContract):
@@ -646,6 +672,25 @@ class Listener:
 
     def __getattr__(self, name: str) -> Any:
         return self._changes[name] if name in self._changes else getattr(self._report, name)
+
+
+def by_a_ray_bank(self: Any, field: Any, views: Sequence[View], config: Any, report: Report) -> None:
+    """A recipe of colour and depth that knows of no exposure."""
+    bank = RayBank(views, field.bounds, device_of(field))
+
+    def outcome(step: int, generator: Generator) -> StepOutcome:
+        batch = bank.draw(256, generator)
+        rendering = render(field, batch.rays, batch.background, generator)
+        return StepOutcome(*supervised_loss(rendering, batch, field.bounds.side, 0.1))
+
+    fit(field, [{"params": list(field.parameters()), "lr": 0.02}], outcome, config.steps, report)
+
+
+@pytest.mark.parametrize("backend", [PlainWaves(), with_members(train=by_a_ray_bank)])
+def test_recipes_that_ignore_exposure_are_named(backend: Any) -> None:
+    said = fault("test_training_learns_the_exposure_of_images", backend)
+    assert "of the images' exposures went into the colours of the field, expected 6% or less" in said
+    assert "train with bidnerf_core.training.Supervision" in said
 
 
 def reporting(**changes: Callable[[Report], Any]) -> Any:

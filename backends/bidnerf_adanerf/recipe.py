@@ -17,10 +17,10 @@ from bidnerf_adanerf.oracle_loss import oracle_loss
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.devices import moved
 from bidnerf_core.fields.contract import SceneBounds, device_of
-from bidnerf_core.fields.rendering import query_samples, render, rendering_weights
+from bidnerf_core.fields.rendering import query_samples, rendering_weights
 from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_core.frames.frame import View
-from bidnerf_core.training import Report, StepOutcome, Supervision, TrainingBatch, fit
+from bidnerf_core.training import Report, StepOutcome, Supervision, TrainingBatch
 
 PROBE = 4096
 """Number of rays from which the mean number of samples per ray is estimated."""
@@ -62,14 +62,13 @@ def train(field: AdaNerfField, views: Sequence[View], config: AdaNerfConfig, rep
         return max(1, min(config.rays_at_most, int(config.samples_per_step / evaluations)))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        phase = phase_at(step, config)
-        batch = supervision.draw(rays_per_step(phase is Phase.SPARSE), generator)
-        if phase is Phase.SPARSE:
-            return sparse_step(field, supervision, batch, generator)
+        if phase_at(step, config) is Phase.SPARSE:  # as in localization; the oracle is no longer trained
+            return supervision.step(field, rays_per_step(True), generator)
+        batch = supervision.draw(rays_per_step(False), generator)
         return dense_step(field, supervision, batch, room, config, step, generator)
 
-    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}, *supervision.groups()]
-    fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
+    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
+    supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)
 
 
 def room_for_matter(views: Sequence[View], bounds: SceneBounds, resolution: int) -> OccupancyMask:
@@ -98,12 +97,3 @@ def dense_step(
     loss = loss + sparsity(step, config) * scores.mean()
     shaded = (samples.valid & (scores > config.threshold)).sum() / len(scores)
     return StepOutcome(loss, mse, float(shaded))
-
-
-def sparse_step(
-    field: AdaNerfField, supervision: Supervision, batch: TrainingBatch, generator: Generator
-) -> StepOutcome:
-    """Return the loss of rendering as in localization, with samples chosen by the oracle, which is no longer trained."""
-    rendering = render(field, batch.rays, batch.background, generator)
-    loss, mse = supervision.loss(rendering, batch)
-    return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))

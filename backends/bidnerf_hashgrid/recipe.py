@@ -14,7 +14,7 @@ from bidnerf_core.fields.contract import SceneBounds, device_of
 from bidnerf_core.fields.rendering import Rendering, render
 from bidnerf_core.frames.frame import View
 from bidnerf_core.settings import Count, NotNegative, Positive, Range
-from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch, fit
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch
 from bidnerf_hashgrid.field import CoarseField, FieldConfig, HashGridField
 from bidnerf_hashgrid.occupancy import OccupancyGrid
 from bidnerf_hashgrid.threads import pools_only
@@ -81,7 +81,6 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
             "params": [*field.geometry.parameters(), *field.colour.parameters()],
             "lr": config.learning_rate / 4,
         },
-        *supervision.groups(),
     ]
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
@@ -97,7 +96,7 @@ def train(field: HashGridField, views: Sequence[View], config: HashGridConfig, r
         return StepOutcome(loss, mse, float(grid.samples_per_ray))
 
     with pools_only(device_of(field)):
-        fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
+        supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)
 
 
 def _update(

@@ -15,7 +15,7 @@ from bidnerf_core.fields.contract import device_of
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import View
 from bidnerf_core.settings import Count, Positive, Range
-from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch, fit
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig, TrainingBatch
 from bidnerf_vanilla.field import FieldConfig, VanillaField
 
 PROBE = 4096
@@ -58,8 +58,8 @@ def train(field: VanillaField, views: Sequence[View], config: VanillaConfig, rep
     def outcome(step: int, generator: Generator) -> StepOutcome:
         return step_outcome(field, supervision, supervision.draw(rays_per_step, generator), generator)
 
-    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}, *supervision.groups()]
-    fit(field, groups, outcome, config.steps, report, seed=config.seed, beside=supervision.colours)
+    groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
+    supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)
 
 
 def step_outcome(

@@ -179,6 +179,9 @@ class BackendContract(Subject):
     def test_training_learns_from_rgb(self) -> None:
         recipes.check_learning(self._backend(), self._build, self._config(), rgb_views(), "RGB")
 
+    def test_training_learns_the_exposure_of_images(self) -> None:
+        recipes.check_exposure(self._backend(), self._config())
+
     def test_training_reports_and_saves(self) -> None:
         recipes.check_reports(self._backend(), self._build(), self._config())
 

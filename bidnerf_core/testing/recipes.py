@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from safetensors.torch import load as tensors_from_bytes
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend
-from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import View
 from bidnerf_core.testing.faults import calling, require_that
-from bidnerf_core.testing.scene import BOUNDS, camera_rays, rgbd_views
+from bidnerf_core.testing.scene import BOUNDS, DIMMED_BOUNDS, camera_rays, exposed_views, rgbd_views
 from bidnerf_core.training import Progress, TrainingState, TrainingStopped
 
 LEARNED = 0.8
 """Factor by which the squared error of colour must have fallen."""
+EXPOSURE = 0.06
+"""Logarithm of the factor by which the contract's images are brighter and darker than they should be."""
+EXPOSURE_STEPS = 100
+"""Training steps within which the exposures of the images can be learned."""
+BAKED_IN = 0.06
+"""Share of the images' exposures that may be found in the field: above 0.1 where a recipe ignores exposure, 0.01 where
+it learns it."""
 
 
 class Recorder:
@@ -72,6 +81,33 @@ def check_learning(
         " is given? does the test's config suffice?",
     )
     return field
+
+
+def check_exposure(backend: Backend, config: Any) -> None:
+    """Check that images that are brighter or darker than the others do not make the field brighter or darker there.
+
+    A field is trained with alternately brighter and darker images, and another one with the exposures exchanged. Where the
+    two differ as the images do, exposure went into the field. A field that learns slowly shows little of either.
+    """
+    config = replace(config, steps=max(config.steps, EXPOSURE_STEPS))
+    fields = []
+    for log_gain in (EXPOSURE, -EXPOSURE):
+        with calling(f"{_name(backend)}.build"):
+            fields.append(backend.build(config, DIMMED_BOUNDS))
+        views = exposed_views(log_gain)
+        _train(backend, fields[-1], views, config, Recorder(), "on RGB views of different exposure")
+    found = []
+    for number, view in enumerate(exposed_views(0.0)):
+        bright, dark = (rendered(field, view, DIMMED_BOUNDS) for field in fields)
+        ratio = (bright * dark).sum() / dark.square().sum().clamp(min=1e-12)
+        found.append((-1) ** number * math.log(max(float(ratio), 1e-6)) / (2 * EXPOSURE))
+    share = sum(found) / len(found)
+    require_that(
+        share <= BAKED_IN,
+        f"{_name(backend)}.train: {share:.0%} of the images' exposures went into the colours of the field, expected"
+        f" {BAKED_IN:.0%} or less; train with bidnerf_core.training.Supervision, which learns the exposure of each image"
+        " beside the field (its fit, step and loss do)",
+    )
 
 
 def check_reports(backend: Backend, field: RadianceField, config: Any) -> None:
@@ -142,13 +178,15 @@ def check_resuming(backend: Backend, make: Callable[[], RadianceField], config: 
 
 def colour_error(field: RadianceField) -> float:
     """Return the mean squared error of colour over all pixels of the training views."""
-    with torch.no_grad(), calling(f"render by {type(field).__name__}"):
-        found = [
-            render(field, camera_rays(view.T_ref_camera.to(torch.float32)), BOUNDS.background).rgb
-            for view in rgbd_views()
-        ]
+    found = [rendered(field, view, BOUNDS) for view in rgbd_views()]
     seen = torch.cat([view.frame.rgb.reshape(-1, 3) for view in rgbd_views()])
     return float((torch.cat(found) - seen).square().mean())
+
+
+def rendered(field: RadianceField, view: View, bounds: SceneBounds) -> Float[Tensor, "r 3"]:
+    """Return the field's colours at all pixels of a view."""
+    with torch.no_grad(), calling(f"render by {type(field).__name__}"):
+        return render(field, camera_rays(view.T_ref_camera.to(torch.float32)), bounds.background).rgb
 
 
 def _train(

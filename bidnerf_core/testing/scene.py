@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -21,6 +22,9 @@ SIZE = 24
 CAMERA = Intrinsics(32.0, 32.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
 BOUNDS = demo_object().bounds
 SIDE = max(BOUNDS.size)  # metres
+DIMMED = 0.6
+"""Brightness of the views of ``exposed_views`` and of the background behind them, so that no exposure saturates."""
+DIMMED_BOUNDS = replace(BOUNDS, background=tuple(DIMMED * part for part in BOUNDS.background))
 
 
 @cache
@@ -37,6 +41,15 @@ def rgbd_views(coverage: bool = True) -> tuple[View, ...]:
 def rgb_views() -> tuple[View, ...]:
     """Return six views of the toy in front of white, without depth or alpha."""
     return tuple(replace(v, frame=replace(v.frame, depth=None)) for v in rgbd_views(coverage=False))
+
+
+def exposed_views(log_gain: float) -> tuple[View, ...]:
+    """Return the views without depth, dimmed and then alternately brighter and darker by a factor of ``exp(log_gain)``."""
+    gains = [DIMMED * math.exp(log_gain * (-1) ** number) for number in range(len(rgb_views()))]
+    return tuple(
+        replace(v, frame=replace(v.frame, rgb=g * v.frame.rgb))
+        for v, g in zip(rgb_views(), gains, strict=True)
+    )
 
 
 def camera_rays(T_world_camera: SE3) -> Rays:

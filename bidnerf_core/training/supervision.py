@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 
 from bidnerf_core.captures.photos import detail_kept
-from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.fields.rendering import Rendering
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.fields.rendering import Rendering, render
 from bidnerf_core.frames.frame import View
 from bidnerf_core.settings import NotNegative, Settings
 from bidnerf_core.training.colour_transform import ColourTransforms
+from bidnerf_core.training.loop import StepOutcome, cosine, fit
 from bidnerf_core.training.loss import distortion, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
+from bidnerf_core.training.report import Report
 
 COLOUR_RATE = 2e-3  # learning rate of the colour transforms
 COLOUR_PENALTY = 1e-3  # weight of their penalty relative to the colour error
@@ -35,7 +37,12 @@ class SupervisionConfig(Settings):
 
 
 class Supervision:
-    """The rays of training views and their loss, on the device of the trained field."""
+    """The rays of training views and their loss, on the device of the trained field.
+
+    It learns the exposure and white balance of each image beside the field, so that images of different exposure do not spoil
+    the field's colours, gives blurred images less weight, and takes depth from sensors and from landmarks. A simple recipe is
+    ``fit`` with ``step`` as its outcome; others compose ``draw``, ``render`` and ``loss``.
+    """
 
     def __init__(
         self, views: Sequence[View], bounds: SceneBounds, config: SupervisionConfig, device: torch.device | str = "cpu"
@@ -49,14 +56,32 @@ class Supervision:
         # None where no image is blurred, so that the loss is then unweighted.
         self.image_weight = None if kept is None or bool((kept == 1).all()) else kept.float().to(device)
 
-    def draw(self, count: int, generator: Generator) -> TrainingBatch:
-        return self.bank.draw(count, generator)
+    def fit(
+        self,
+        field: nn.Module,
+        groups: list[dict[str, Any]],
+        outcome: Callable[[int, Generator], StepOutcome],
+        steps: int,
+        report: Report,
+        schedule: Callable[[int, int], float] = cosine,
+        seed: int = 0,
+    ) -> None:
+        """Call ``training.fit`` such that it also learns what belongs to the images, and resumes it with the field."""
+        learned: list[dict[str, Any]] = []
+        if self.colours is not None:
+            learned = [{"params": list(self.colours.parameters()), "lr": COLOUR_RATE}]
+        fit(field, [*groups, *learned], outcome, steps, report, schedule, seed, beside=self.colours)
 
-    def groups(self) -> list[dict[str, Any]]:
-        """Return the parameters that are learned jointly with the field, as a group for ``fit``."""
-        if self.colours is None:
-            return []
-        return [{"params": list(self.colours.parameters()), "lr": COLOUR_RATE}]
+    def step(self, field: RadianceField, count: int, generator: Generator) -> StepOutcome:
+        """Return the loss of rendering ``count`` rays that are drawn from the views."""
+        batch = self.draw(count, generator)
+        rendering = render(field, batch.rays, batch.background, generator)
+        loss, mse = self.loss(rendering, batch)
+        return StepOutcome(loss, mse, float(rendering.samples.valid.sum() / len(batch)))
+
+    def draw(self, count: int, generator: Generator) -> TrainingBatch:
+        """Return a batch of ``count`` rays; see ``RayBank.draw``."""
+        return self.bank.draw(count, generator)
 
     def loss(self, rendering: Rendering, batch: TrainingBatch) -> tuple[Float[Tensor, ""], float]:
         """Return the loss of a rendering of the batch's rays, and its colour term alone for display."""

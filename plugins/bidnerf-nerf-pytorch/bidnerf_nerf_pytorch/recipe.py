@@ -14,20 +14,19 @@ from bidnerf_core.fields.contract import device_of
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import View
 from bidnerf_core.settings import Count, NotNegative, Range
-from bidnerf_core.training import RayBank, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
 from bidnerf_nerf_pytorch.checkpoint import read_checkpoint
 from bidnerf_nerf_pytorch.field import FieldConfig, NerfPytorchField
 from bidnerf_nerf_pytorch.network import NetworkConfig
 
 
 @dataclass(frozen=True)
-class NerfPytorchConfig(FieldConfig):
+class NerfPytorchConfig(FieldConfig, SupervisionConfig):
     """Architecture and training. The defaults are those of the checkpoints that nerf-pytorch offers."""
 
     steps: Count = 200_000  # steps of the optimizer
     rays_per_step: Count = 1024  # number of rays per step
     learning_rate: NotNegative = 5e-3  # initial learning rate
-    depth_weight: NotNegative = 0.1  # weight of the depth term relative to colour; 0 leaves depth out
     seed: Annotated[int, Range(0)] = 0  # seed of the initial weights and of all random draws
     checkpoint: str = ""  # file with the initial weights; "" for random ones
 
@@ -42,18 +41,17 @@ def train(field: NerfPytorchField, views: Sequence[View], config: NerfPytorchCon
     """Fit ``field`` to ``views``; see ``fit`` on checkpoints and stopping."""
     if config.checkpoint and report.resume() is None:
         _start_from(Path(config.checkpoint), field)
-    bank = RayBank(views, field.bounds, device_of(field))
-    side = max(field.bounds.size)
+    supervision = Supervision(views, field.bounds, config, device_of(field))
 
     def outcome(step: int, generator: Generator) -> StepOutcome:
-        batch = bank.draw(config.rays_per_step, generator)
+        batch = supervision.draw(config.rays_per_step, generator)
         coarse, fine = (render(level, batch.rays, batch.background, generator) for level in field.levels)
-        rough, _ = supervised_loss(coarse, batch, side, config.depth_weight)
-        loss, mse = supervised_loss(fine, batch, side, config.depth_weight)
+        rough, _ = supervision.loss(coarse, batch)
+        loss, mse = supervision.loss(fine, batch)
         return StepOutcome(rough + loss, mse, float(fine.samples.valid.sum() / len(batch)))
 
     groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
-    fit(field, groups, outcome, config.steps, report, seed=config.seed)
+    supervision.fit(field, groups, outcome, config.steps, report, seed=config.seed)
 
 
 def _start_from(path: Path, field: NerfPytorchField) -> None:

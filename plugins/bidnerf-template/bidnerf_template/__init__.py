@@ -10,16 +10,15 @@ from torch import Generator, Tensor, nn
 from torch.nn import functional
 
 from bidnerf_core.fields.contract import FieldValues, SceneBounds, device_of
-from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import View
-from bidnerf_core.training import RayBank, Report, StepOutcome, fit, supervised_loss
+from bidnerf_core.training import Report, StepOutcome, Supervision, SupervisionConfig
 
 __all__ = ["TemplateBackend", "TemplateConfig", "TemplateField", "backend"]
 
 
 @dataclass(frozen=True)
-class TemplateConfig:
+class TemplateConfig(SupervisionConfig):
     """Each field is an option of ``bidnerf train`` and is stored with the map, so it must be what JSON can hold."""
 
     resolution: int = 96  # grid points along each axis of the modelled space
@@ -27,7 +26,6 @@ class TemplateConfig:
     steps: int = 1500  # steps of the optimizer
     rays_per_step: int = 2048  # number of rays per step
     learning_rate: float = 0.1  # initial learning rate
-    depth_weight: float = 0.1  # weight of the depth term relative to the colour term
 
 
 class TemplateField(nn.Module):
@@ -65,15 +63,13 @@ class TemplateBackend:
     def train(
         self, field: TemplateField, views: Sequence[View], config: TemplateConfig, report: Report
     ) -> None:
-        bank = RayBank(views, field.bounds, device_of(field))
+        supervision = Supervision(views, field.bounds, config, device_of(field))
 
         def outcome(step: int, generator: Generator) -> StepOutcome:
-            batch = bank.draw(config.rays_per_step, generator)
-            rendering = render(field, batch.rays, batch.background, generator)
-            return StepOutcome(*supervised_loss(rendering, batch, field.side, config.depth_weight))
+            return supervision.step(field, config.rays_per_step, generator)
 
         groups = [{"params": list(field.parameters()), "lr": config.learning_rate}]
-        fit(field, groups, outcome, config.steps, report)
+        supervision.fit(field, groups, outcome, config.steps, report)
 
 
 backend = TemplateBackend()
