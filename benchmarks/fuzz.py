@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import gc
 import io
 import json
@@ -37,7 +36,6 @@ import torch
 from fuzz_cases import Case, draw_case, files_of, sound_folder
 from safetensors import safe_open
 
-from bidnerf_core import registry
 from bidnerf_core.cli import main as bidnerf
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.provenance import write_record
@@ -268,9 +266,6 @@ def main() -> None:
     parser.add_argument("--only", type=int, nargs="*", help="run these cases and record nothing")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    registry.list_backends = functools.cache(
-        registry.list_backends
-    )  # they do not change, and take half a second
     with TemporaryDirectory() as folder:
         os.chmod(folder, 0o755)
         sound, work = Path(folder) / "sound", Path(folder) / "work"

@@ -20,6 +20,7 @@ except Exception:
     os.environ.setdefault("TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 if TYPE_CHECKING:
+    from bidnerf_core.backend import load_backend as load_backend
     from bidnerf_core.camera.intrinsics import Intrinsics as Intrinsics
     from bidnerf_core.datasets import Dataset as Dataset
     from bidnerf_core.datasets import FrameSequence as FrameSequence
@@ -54,8 +55,9 @@ if TYPE_CHECKING:
     from bidnerf_core.maps.map import load_map as load_map
     from bidnerf_core.progress import Progress as Progress
     from bidnerf_core.progress import ProgressCallback as ProgressCallback
-    from bidnerf_core.registry import list_backends as list_backends
-    from bidnerf_core.registry import load_backend as load_backend
+    from bidnerf_core.registry import list_plugins as list_plugins
+    from bidnerf_core.registry import load_plugin as load_plugin
+    from bidnerf_core.registry import register as register
     from bidnerf_core.results.errors import PoseError as PoseError
     from bidnerf_core.results.errors import pose_error as pose_error
     from bidnerf_core.results.overlays import overlay as overlay
@@ -95,8 +97,10 @@ HOMES = {
     "TrackerConfig": "localization",
     "View": "frames.frame",
     "levels": "fields.contract",
-    "list_backends": "registry",
-    "load_backend": "registry",
+    "list_plugins": "registry",
+    "load_backend": "backend",
+    "load_plugin": "registry",
+    "register": "registry",
     "load_map": "maps.map",
     "open_dataset": "datasets",
     "open_sequence": "datasets",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.frames.frame import View
+from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.training import Report
 
 
@@ -43,6 +44,24 @@ class Backend(Protocol):
         ``training.Supervision`` takes account of all of it.
         """
         ...
+
+
+def _defects(backend: Any) -> Iterator[str]:
+    methods = {"build": ("config", "bounds"), "train": ("field", "views", "config", "report")}
+    yield from interface_defects(backend, ("summary", "config_type"), methods)
+
+
+BACKENDS: Plugins[Backend] = Plugins("backends", _defects)
+"""The backends by name."""
+
+
+def load_backend(name: str, wanted_by: str = "") -> Backend:
+    """Return the backend of that name, imported and checked.
+
+    Raises ``PluginError``, an ``InputError`` that names the entry point and, where it is given, the map that needs it
+    (``wanted_by``).
+    """
+    return BACKENDS.load(name, wanted_by)
 
 
 @runtime_checkable

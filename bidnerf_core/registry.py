@@ -1,8 +1,8 @@
-"""Discovery of backends by entry-point name.
+"""What strangers register, by name: backends, readers, methods, features, faults and writers.
 
-A distribution offers a backend through an entry point of the group ``bidnerf.backends``. Listing reads only metadata and
-source text, so that a broken backend cannot break the list: its fault surfaces when that backend is loaded, in an error
-that names the entry point, its value, its distribution and the cause.
+A distribution offers an object through an entry point of the group ``bidnerf.GROUP``; the bundled ones come the same way. A
+script or a notebook offers one with ``register``. Listing reads only metadata and source text, so that a broken plugin cannot
+break the list: its fault surfaces when that plugin is loaded, in an error that names it, its distribution and the cause.
 """
 
 from __future__ import annotations
@@ -12,126 +12,236 @@ import dataclasses
 import importlib
 import importlib.util
 import inspect
-from collections.abc import Iterator
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from email import message_from_string
 from functools import reduce
 from importlib.machinery import ModuleSpec, PathFinder
-from importlib.metadata import EntryPoint, distributions
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from importlib.metadata import EntryPoint, distribution, distributions
+from itertools import pairwise
+from typing import Any, Generic, TypeAlias, TypeVar
 
-from bidnerf_core.errors import InputError, spelling_hint
+from bidnerf_core.errors import InputError, spelling_hint, unknown_name
 
-if TYPE_CHECKING:
-    from bidnerf_core.backend import Backend
-else:
-    Backend = Any  # its module imports torch, which takes seconds and is not needed to list backends
+GROUPS: Mapping[str, str] = {
+    "backends": "backend",
+    "readers": "reader",
+    "methods": "method",
+    "features": "detector",
+    "faults": "fault",
+    "writers": "writer",
+}
+"""What can be registered, and the noun for one of it. The entry-point group has the prefix ``bidnerf.``."""
 
-GROUP = "bidnerf.backends"
-
-AnyDistribution: TypeAlias = Any
-AnyEntryPoint: TypeAlias = Any
-"""Types of ``importlib.metadata``, left open: once anything imports the backport ``importlib_metadata``, look-ups return
-its own classes, which are not subclasses of the standard library's."""
-
+BUNDLED = "bidnerf"
+"""The distribution whose plugins are bundled."""
 UNREADABLE = "?"
 """Stands for the name of entry points that cannot be read."""
+NAME = re.compile(r"[\w.-]+")
 
-REQUIRED_METHODS = {"build": ("config", "bounds"), "train": ("field", "views", "config", "report")}
+Defects: TypeAlias = Callable[[Any], Iterator[str]]
+"""A function that yields the reasons why an object is not of its kind, the most informative one first."""
+AnyDistribution: TypeAlias = Any
+"""A distribution of ``importlib.metadata``, left open: once anything imports the backport ``importlib_metadata``, look-ups
+return its own classes, which are not subclasses of the standard library's."""
+
+Plugin = TypeVar("Plugin")
+
+registered: dict[tuple[str, str], Any] = {}
+"""What ``register`` was given, by group and name."""
 
 
-class BackendError(InputError):
-    """A backend cannot be loaded; the message names it, its distribution and the cause."""
+class PluginError(InputError):
+    """A plugin cannot be loaded; the message names it, its distribution and the cause."""
 
 
 @dataclass(frozen=True)
-class BackendInfo:
-    """What is known about a backend without importing it."""
+class PluginInfo:
+    """What is known about a plugin without importing it."""
 
+    group: str
     name: str
-    value: str  # "module:object", as declared
+    value: str  # "module:object", as declared; the object's type where it was registered in this process
     distribution: str
     version: str
     summary: str = ""
     fault: str | None = None  # why it cannot be loaded, as far as the metadata shows
-    hidden: tuple[str, ...] = ()  # other versions of the same distribution, later on sys.path
+
+    @property
+    def is_bundled(self) -> bool:
+        return _normalized(self.distribution) == BUNDLED
 
     def __str__(self) -> str:
-        return f"backend '{self.name}' ({self.value}, from {self.distribution} {self.version})"
+        origin = f"from {self.distribution} {self.version}" if self.version else "registered in this process"
+        return f"{GROUPS[self.group]} '{self.name}' ({self.value}, {origin})"
 
 
-def list_backends() -> list[BackendInfo]:
-    """Return all declared backends, sorted by name, without importing any. A name that is declared twice is listed twice."""
-    infos = [info for dist, hidden in _installed() for info in _declared(dist, hidden)]
-    return sorted(_with_rivals(infos), key=lambda info: (info.name, info.distribution, info.value))
+def register(group: str, name: str, value: Any, replace: bool = False) -> None:
+    """Offer ``value`` under ``name`` in this process, for scripts and notebooks; other processes do not see it.
+
+    ``group``: one of ``GROUPS``, such as "methods". ``replace``: whether ``value`` may take the place of a plugin of that name,
+    be it registered before, installed or bundled. Raises ``InputError`` for an unknown group, a name that is no name, and one
+    that is taken.
+    """
+    _check_group(group)
+    if not (isinstance(name, str) and NAME.fullmatch(name)):
+        raise InputError(f"register: name is {name!r}, expected letters, digits, '.', '-' and '_'")
+    taken = [info for info in list_plugins(group) if info.name == name]
+    if taken and not replace and registered.get((group, name)) is not value:
+        raise InputError(
+            f"register: the name is taken by {taken[0]}; choose another name, or replace it on purpose with replace=True"
+        )
+    registered[group, name] = value
 
 
-def load_backend(name: str, wanted_by: str = "") -> Backend:
-    """Return the backend of that name, imported and checked.
+def list_plugins(group: str) -> list[PluginInfo]:
+    """Return all plugins of a group, sorted by name, without importing any.
 
-    Raises ``BackendError``, which names the entry point and, where it is given, the map that needs it (``wanted_by``).
+    A name that two distributions declare is listed twice, with a fault: neither can be loaded.
+    """
+    _check_group(group)
+    own = [_registered_info(group, name) for of, name in list(registered) if of == group]
+    replaced = {info.name for info in own}
+    sources: dict[str, ast.Module | None] = {}
+    found = [_described_info(info, sources) for info in _declared(group) if info.name not in replaced]
+    return sorted([*own, *found], key=lambda info: (info.name, info.distribution, info.value))
+
+
+def plugin_names(group: str, first: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the names in a group: ``first``, then the other bundled ones, then the others, each sorted."""
+    _check_group(group)
+    known = {info.name: info.is_bundled for info in _declared(group) if info.name != UNREADABLE}
+    known |= {name: known.get(name, False) for of, name in list(registered) if of == group}
+    ranks = {name: rank for rank, name in enumerate(first)}
+    return tuple(sorted(known, key=lambda name: (ranks.get(name, len(ranks)), not known[name], name)))
+
+
+def load_plugin(group: str, name: str, defects: Defects | None = None, wanted_by: str = "") -> Any:
+    """Return the plugin of that name, imported and, where ``defects`` is given, checked by it.
+
+    Raises ``PluginError``, which names the plugin and, where it is given, what needs it (``wanted_by``).
     """
     try:
-        return _loaded(name)
-    except BackendError as error:
-        raise BackendError(f"{wanted_by}: {error}" if wanted_by else str(error)) from error.__cause__
+        return _loaded(group, name, defects)
+    except PluginError as error:
+        raise PluginError(f"{wanted_by}: {error}" if wanted_by else str(error)) from error.__cause__
 
 
-def _loaded(name: str) -> Backend:
-    infos = list_backends()
-    found = [info for info in infos if info.name == name and name != UNREADABLE]
+class Plugins(Mapping[str, Plugin], Generic[Plugin]):
+    """The plugins of a group by name. Iterating imports nothing; a plugin is imported and checked when it is looked up."""
+
+    def __init__(self, group: str, defects: Defects, first: Sequence[str] = ()) -> None:
+        """``first``: the names that come first in their order; then come the other bundled ones, then the others."""
+        self._group, self._defects, self._first = group, defects, first
+
+    def load(self, name: str, wanted_by: str = "") -> Plugin:
+        """Return a plugin as ``load_plugin`` does."""
+        found: Plugin = load_plugin(self._group, name, self._defects, wanted_by)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(plugin_names(self._group, self._first))
+
+    def __len__(self) -> int:
+        return len(plugin_names(self._group))
+
+    def __contains__(self, name: object) -> bool:
+        return name in plugin_names(self._group)
+
+    def __getitem__(self, name: str) -> Plugin:
+        if name not in self:
+            raise KeyError(name)
+        return self.load(name)
+
+
+def _loaded(group: str, name: str, defects: Defects | None) -> Any:
+    _check_group(group)
+    if (group, name) in registered:
+        return _checked(_registered_info(group, name), registered[group, name], defects)
+    found = [info for info in _declared(group) if info.name == name and name != UNREADABLE]
     if not found:
-        raise BackendError(_unknown(name, infos))
-    info = found[0]
+        raise PluginError(_unknown(group, name))
+    info = _described_info(found[0], {})
     if info.fault is not None:
-        raise BackendError(f"{info}: {info.fault}")
-    return _checked(info, _imported(info))
+        raise PluginError(f"{info}: {info.fault}")
+    return _checked(info, _imported(info), defects)
+
+
+def _check_group(group: str) -> None:
+    if group not in GROUPS:
+        raise unknown_name("group of plugins", group, GROUPS)
+
+
+def _registered_info(group: str, name: str) -> PluginInfo:
+    value = registered[group, name]
+    summary = getattr(value, "summary", None) or inspect.getdoc(value) or ""
+    return PluginInfo(group, name, _type_name(value), "this process", "", str(summary).partition("\n")[0])
 
 
 # Reading metadata. Any metadata file of any distribution may be malformed.
 
+_cache: tuple[object, dict[str, tuple[PluginInfo, ...]]] = (None, {})
 
-def _installed() -> Iterator[tuple[AnyDistribution, tuple[str, ...]]]:
-    """Yield the distributions that ``import`` would use, the first on sys.path, each with the versions that it hides."""
-    copies: dict[str, list[AnyDistribution]] = {}
+
+def _declared(group: str) -> tuple[PluginInfo, ...]:
+    """Return what the installed distributions declare in a group; read again when a folder of ``sys.path`` has changed."""
+    global _cache
+    key = tuple((path, _modified(path)) for path in sys.path)
+    if _cache[0] != key:
+        found = [info for dist in _installed() for info in _entries(dist)]
+        _cache = key, {of: tuple(_with_rivals([i for i in found if i.group == of])) for of in GROUPS}
+    return _cache[1][group]
+
+
+def _modified(path: str) -> int:
+    try:
+        return os.stat(path or os.curdir).st_mtime_ns
+    except OSError:
+        return 0
+
+
+def _installed() -> Iterator[AnyDistribution]:
+    """Yield the distributions that have to do with bidnerf; of several versions the one that ``import`` would use."""
+    seen = set()
     for dist in distributions():
-        copies.setdefault(_normalized(_label(dist)), []).append(dist)
-    for first, *others in copies.values():
-        shown = _version(first)
-        yield first, tuple(dict.fromkeys(v for v in map(_version, others) if v != shown))
+        if "bidnerf." not in _text(dist, "entry_points.txt"):
+            continue
+        name = _label(dist)
+        if _normalized(name) not in seen and not _is_hidden(dist, name):
+            seen.add(_normalized(name))
+            yield dist
 
 
-def _declared(dist: AnyDistribution, hidden: tuple[str, ...]) -> Iterator[BackendInfo]:
-    about = BackendInfo(UNREADABLE, UNREADABLE, _label(dist), _version(dist), hidden=hidden)
+def _is_hidden(dist: AnyDistribution, name: str) -> bool:
     try:
-        points = tuple(dist.entry_points.select(group=GROUP))
-    except Exception as error:
-        if _mentions_group(dist):
-            yield replace(about, fault=f"entry_points.txt cannot be read ({_described(error)})")
-        return
-    for point in points:
-        yield _read(replace(about, name=point.name, value=point.value), point, dist)
+        first = distribution(name)
+    except Exception:  # it has no name by which it could be hidden
+        return False
+    return [_text(first, f) for f in ("METADATA", "entry_points.txt")] != [
+        _text(dist, f) for f in ("METADATA", "entry_points.txt")
+    ]
 
 
-def _read(info: BackendInfo, point: AnyEntryPoint, dist: AnyDistribution) -> BackendInfo:
-    fallback = _metadata(dist, "Summary") or ""
-    try:
-        module = point.module  # fails where the value is not of the form module:object
-    except Exception:
-        return replace(info, summary=fallback, fault="expected a value of the form 'module:object'")
-    try:
-        spec = _spec(module)
-    except Exception as error:
-        return replace(
-            info, summary=fallback, fault=f"module '{module}' cannot be found ({_described(error)})"
-        )
-    if spec is None:
-        return replace(info, summary=fallback, fault=f"module '{module}' is not installed")
-    return replace(info, summary=_first_line(spec) or fallback)
+def _entries(dist: AnyDistribution) -> Iterator[PluginInfo]:
+    about = PluginInfo(
+        "", UNREADABLE, UNREADABLE, _label(dist), _metadata(dist, "Version") or "of unknown version"
+    )
+    about = replace(about, summary=_metadata(dist, "Summary") or "")
+    for group in GROUPS:
+        try:
+            for point in dist.entry_points.select(group=f"bidnerf.{group}"):
+                yield replace(about, group=group, name=point.name, value=point.value)
+        except Exception as error:
+            if f"bidnerf.{group}" in _text(dist, "entry_points.txt"):
+                fault = f"entry_points.txt cannot be read ({_described(error)})"
+                yield replace(about, group=group, summary="", fault=fault)
 
 
-def _with_rivals(infos: list[BackendInfo]) -> Iterator[BackendInfo]:
-    """Yield the backends, with a fault for each name that is declared more than once, and is therefore ambiguous."""
+def _with_rivals(infos: list[PluginInfo]) -> Iterator[PluginInfo]:
+    """Yield plugins, with a fault for each name that is declared more than once, and is therefore ambiguous."""
     for info in infos:
         rivals = [x for x in infos if x.name == info.name and x is not info]
         if rivals and info.name != UNREADABLE:
@@ -141,9 +251,16 @@ def _with_rivals(infos: list[BackendInfo]) -> Iterator[BackendInfo]:
             yield info
 
 
+def _text(dist: AnyDistribution, file: str) -> str:
+    try:
+        return dist.read_text(file) or ""
+    except Exception:
+        return ""
+
+
 def _metadata(dist: AnyDistribution, key: str) -> str | None:
     try:
-        head, _, readme = (dist.read_text("METADATA") or "").partition("\n\n")
+        head, _, readme = _text(dist, "METADATA").partition("\n\n")
         # The README after the headers would take nearly all of the parsing time.
         values = (message_from_string(head) if readme else dist.metadata).get_all(key)
     except Exception:
@@ -155,22 +272,31 @@ def _label(dist: AnyDistribution) -> str:
     return _metadata(dist, "Name") or f"unnamed distribution {getattr(dist, '_path', id(dist))}"
 
 
-def _version(dist: AnyDistribution) -> str:
-    return _metadata(dist, "Version") or "of unknown version"
-
-
 def _normalized(name: str) -> str:
     return name.lower().replace("-", "_").replace(".", "_")
 
 
-def _mentions_group(dist: AnyDistribution) -> bool:
+# Summaries: the first line of a docstring, from the source as text.
+
+
+def _described_info(info: PluginInfo, sources: dict[str, ast.Module | None]) -> PluginInfo:
+    """Return what the module of an entry point adds: its summary, or why it leads nowhere."""
+    if info.name == UNREADABLE:
+        return info
+    point = EntryPoint(info.name, info.value, "")
     try:
-        return GROUP in (dist.read_text("entry_points.txt") or "")
+        module = point.module  # fails where the value is not of the form module:object
     except Exception:
-        return False
-
-
-# Summaries: the first line of the docstring, from the source as text.
+        return replace(info, fault=info.fault or "expected a value of the form 'module:object'")
+    try:
+        spec = _spec(module)
+    except Exception as error:
+        return replace(info, fault=info.fault or f"module '{module}' cannot be found ({_described(error)})")
+    if spec is None:
+        return replace(info, fault=info.fault or f"module '{module}' is not installed")
+    if module not in sources:
+        sources[module] = _parsed(spec)
+    return replace(info, summary=_summary(sources[module], point.attr) or info.summary)
 
 
 def _spec(module: str) -> ModuleSpec | None:
@@ -184,56 +310,92 @@ def _spec(module: str) -> ModuleSpec | None:
     return spec
 
 
-def _first_line(spec: ModuleSpec) -> str:
+def _parsed(spec: ModuleSpec) -> ast.Module | None:
     read = getattr(spec.loader, "get_source", None)
     try:
-        source = read(spec.name) if read else None
-        text = ast.get_docstring(ast.parse(source)) if source else None
-    except Exception:  # the source is not valid Python, which loading the backend will report
+        return ast.parse(read(spec.name) or "") if read else None
+    except Exception:  # the source is not valid Python, which loading the plugin will report
+        return None
+
+
+def _summary(tree: ast.Module | None, attr: str | None) -> str:
+    """Return the first line of the docstring of what an entry point names, else of its module.
+
+    The docstring of an assigned object is the text below the assignment, or ``summary="..."`` in the call that makes it.
+    """
+    if tree is None:
         return ""
+    own: str | None = None
+    for node, below in pairwise([*tree.body, ast.Pass()]):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == attr:
+            own = ast.get_docstring(node)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            if any(isinstance(target, ast.Name) and target.id == attr for target in targets):
+                words = node.value.keywords if isinstance(node.value, ast.Call) else []
+                given = [word.value for word in words if word.arg == "summary"]
+                own = next(filter(None, map(_constant_text, [*given, getattr(below, "value", None)])), None)
+    return _first_line(own) or _first_line(ast.get_docstring(tree))
+
+
+def _constant_text(node: Any) -> str | None:
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else None
+
+
+def _first_line(text: str | None) -> str:
     return text.strip().splitlines()[0] if text and text.strip() else ""
 
 
 # Loading.
 
 
-def _imported(info: BackendInfo) -> Any:
-    point = EntryPoint(info.name, info.value, GROUP)
+def _imported(info: PluginInfo) -> Any:
+    point = EntryPoint(info.name, info.value, "")
     try:
         module = importlib.import_module(point.module)
-    except (Exception, SystemExit) as error:
-        raise BackendError(f"{info}: cannot be imported: {_described(error)}") from error
+    except KeyboardInterrupt:
+        raise  # somebody is tired of waiting for the import
+    except BaseException as error:  # also SystemExit and the like, which must not end the caller's program
+        raise PluginError(f"{info}: cannot be imported: {_described(error)}") from error
     try:
         return reduce(getattr, filter(None, (point.attr or "").split(".")), module)
     except Exception as error:
-        raise BackendError(f"{info}: there is no such object: {_described(error)}") from error
+        raise PluginError(f"{info}: there is no such object: {_described(error)}") from error
 
 
-def _checked(info: BackendInfo, backend: Any) -> Backend:
+def _checked(info: PluginInfo, plugin: Any, defects: Defects | None) -> Any:
+    noun = GROUPS[info.group]
     try:
-        wrong = next(_defects(backend), None)
+        wrong = None if defects is None else next(defects(plugin), None)
     except Exception as error:  # a property may do anything
-        raise BackendError(f"{info}: not a backend: {_described(error)}") from error
+        raise PluginError(f"{info}: not a {noun}: {_described(error)}") from error
     if wrong is not None:
-        raise BackendError(f"{info}: not a backend: {wrong}")
-    return cast(Backend, backend)
+        raise PluginError(f"{info}: not a {noun}: {wrong}")
+    return plugin
 
 
-def _defects(backend: Any) -> Iterator[str]:
-    """Yield the reasons why an object is not a ``Backend``, the most informative one first."""
-    missing = [name for name in ("summary", "config_type", *REQUIRED_METHODS) if not hasattr(backend, name)]
+def interface_defects(
+    plugin: Any, attributes: Sequence[str], methods: Mapping[str, Sequence[str]]
+) -> Iterator[str]:
+    """Yield why an object lacks an interface: ``attributes`` by name, ``methods`` by name with their parameters.
+
+    ``summary``, if it is one of the attributes, must be text, and ``config_type`` a frozen dataclass with defaults. The method
+    ``__call__`` stands for a plain function.
+    """
+    missing = [name for name in (*attributes, *methods) if not hasattr(plugin, name)]
     if missing:
-        who = f"class {backend.__name__}" if isinstance(backend, type) else type(backend).__name__
+        who = f"class {plugin.__name__}" if isinstance(plugin, type) else _type_name(plugin)
         yield f"{who} has no {', '.join(missing)}"
         return
-    if isinstance(backend, type):
-        yield f"it is the class {backend.__name__} itself, expected an object of it"
-    if not isinstance(backend.summary, str):
-        yield f"summary is {backend.summary!r}, expected text"
-    yield from _config_defects(backend.config_type)
-    for name, parameters in REQUIRED_METHODS.items():
-        if not _accepts(getattr(backend, name), len(parameters)):
-            yield f"{name} does not take ({', '.join(parameters)})"
+    if isinstance(plugin, type):
+        yield f"it is the class {plugin.__name__} itself, expected an object of it"
+    if "summary" in attributes and not isinstance(plugin.summary, str):
+        yield f"summary is {plugin.summary!r}, expected text"
+    if "config_type" in attributes:
+        yield from _config_defects(plugin.config_type)
+    for name, parameters in methods.items():
+        if not _accepts(plugin if name == "__call__" else getattr(plugin, name), len(parameters)):
+            yield f"{'it' if name == '__call__' else name} does not take ({', '.join(parameters)})"
 
 
 def _config_defects(config_type: Any) -> Iterator[str]:
@@ -242,13 +404,11 @@ def _config_defects(config_type: Any) -> Iterator[str]:
         return
     if not config_type.__dataclass_params__.frozen:  # type: ignore[attr-defined]
         yield f"config_type {config_type.__name__} is a dataclass that is not frozen"
-    bare = [field.name for field in dataclasses.fields(config_type) if field.init and not _defaulted(field)]
+    nothing = dataclasses.MISSING
+    fields = [field for field in dataclasses.fields(config_type) if field.init]
+    bare = [field.name for field in fields if field.default is field.default_factory is nothing]
     if bare:
         yield f"config_type {config_type.__name__} has no default for {', '.join(bare)}"
-
-
-def _defaulted(field: dataclasses.Field[Any]) -> bool:
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def _accepts(method: Any, count: int) -> bool:
@@ -263,14 +423,20 @@ def _accepts(method: Any, count: int) -> bool:
     return True
 
 
+def _type_name(value: Any) -> str:
+    return type(value).__name__
+
+
 def _described(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _unknown(name: str, infos: list[BackendInfo]) -> str:
-    names = sorted({info.name for info in infos} - {UNREADABLE})
-    message = (
-        f"no backend {name!r}{spelling_hint(name.lower(), names)}; installed: {', '.join(names) or 'none'}"
-    )
+def _unknown(group: str, name: str) -> str:
+    infos, noun = _declared(group), GROUPS[group]
+    names = plugin_names(group)
+    if not any(info.is_bundled for info in infos):
+        return f"no {noun} {name!r}: the metadata of the installed bidnerf names no {group}; install bidnerf anew"
+    hint = spelling_hint(str(name).lower(), names)
+    message = f"no {noun} {name!r}{hint}; installed: {', '.join(sorted(names))}"
     unread = [f"{x.distribution} {x.version}: {x.fault}" for x in infos if x.name == UNREADABLE]
     return "; ".join([message, *unread])

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from bidnerf_core import Intrinsics, Localizer, list_backends, load_backend, load_map
+from bidnerf_core import Intrinsics, Localizer, list_plugins, load_backend, load_map
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.io.json import to_plain
@@ -28,7 +28,7 @@ parser.add_argument("--steps", type=int, default=200)
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 given = parser.parse_args()
 
-for info in list_backends():  # reads only metadata, without importing any
+for info in list_plugins("backends"):  # reads only metadata, without importing any
     print(f"{info.name}: {info.fault or info.summary} ({info.distribution} {info.version})")
 try:
     backend = load_backend(given.backend)

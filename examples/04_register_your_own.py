@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from bidnerf_core import Intrinsics, Localizer, Map, list_backends, load_backend
+from bidnerf_core import Intrinsics, Localizer, Map, list_plugins, load_backend
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.fields.contract import FieldValues, device_of
 from bidnerf_core.fields.sampling import Stratified
@@ -84,7 +84,7 @@ def main() -> None:
     scene, camera = demo_object(), Intrinsics(fx=90.0, fy=90.0, cx=32.0, cy=32.0, width=64, height=64)
     with tempfile.TemporaryDirectory() as folder:
         register(Path(folder))
-        print(", ".join(f"{info.name} ({info.distribution})" for info in list_backends()))
+        print(", ".join(f"{info.name} ({info.distribution})" for info in list_plugins("backends")))
         mine = load_backend("balls")
     config = mine.config_type(steps=given.steps)
     field = mine.build(config, scene.bounds)

@@ -11,7 +11,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from bidnerf_core import Intrinsics, list_backends
+from bidnerf_core import Intrinsics, list_plugins
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import write_transforms
 from bidnerf_core.scenes.demo import demo_object, orbit, views
@@ -42,7 +42,7 @@ def trained() -> list[Path]:
     splits = {"train": views(scene, camera, seen), "test": views(scene, camera, unseen)}
     write_transforms(given.data, splits, scene.bounds.background)
     maps = []
-    for info in list_backends():
+    for info in list_plugins("backends"):
         if info.fault is None:
             maps.append(given.out / info.name)
             options = ["--steps", given.steps, "--overwrite"]

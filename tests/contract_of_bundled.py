@@ -5,10 +5,10 @@ Not collected by ``pytest`` in the checkout, where each backend's own tests hold
 
 from __future__ import annotations
 
-from bidnerf_core.registry import list_backends
+from bidnerf_core.registry import list_plugins
 from bidnerf_core.testing import BackendContract
 
-for info in list_backends():
+for info in list_plugins("backends"):
     if info.distribution == "bidnerf":
         name = f"Test{info.name.title()}"
         globals()[name] = type(name, (BackendContract,), {"name": info.name})

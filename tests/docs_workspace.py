@@ -13,6 +13,7 @@ from PIL import Image
 from PIL.ExifTags import Base
 
 import tiny
+from bidnerf_core.backend import load_backend
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.datasets import write_transforms
@@ -22,7 +23,6 @@ from bidnerf_core.localization import Outcome
 from bidnerf_core.mapping import BakeConfig, bake
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.files import save_map, save_surface
-from bidnerf_core.registry import load_backend
 from bidnerf_core.scenes.closed_form import views as views_of
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit

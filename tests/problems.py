@@ -12,6 +12,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import Localization, find_method, settings_of
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.landmarks import LandmarkMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +22,9 @@ class FieldMap:
     field: RadianceField
     bounds: SceneBounds
     surface: SurfaceMap | None = None
+    landmarks: LandmarkMap | None = None
+    colour_noise: float | None = None
+    has_distances: bool = True
 
 
 def single(
@@ -39,4 +43,4 @@ def localize(problem: Problem, method: str, config: Any = None, seed: int = 0) -
     """Solve a problem by a method. ``config``: its settings, or some of them by flat name."""
     if config is None or isinstance(config, dict):
         config = settings_of(method, config or {})
-    return find_method(method).run(problem, config, seed)
+    return find_method(method).solve(problem, config, seed)

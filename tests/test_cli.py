@@ -25,18 +25,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
+from bidnerf_core.backend import load_backend
 from bidnerf_core.cli import COMMANDS, main, progress
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.map import load_map
-from bidnerf_core.registry import list_backends, load_backend
+from bidnerf_core.registry import list_plugins
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training import Progress
 from commands import CommandResult, Run
-from tiny import backends_listed_once  # noqa: F401
-
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 LOCALIZE_KEYS = {
     "frame", "T_world_camera", "converged", "outcome", "reason", "steps", "seconds", "covariance", "loss", "backend",
@@ -264,7 +262,7 @@ def test_names_that_do_not_exist_are_told_with_those_that_do(
 ) -> None:
     data, place = shared / "data", shared / "map"
     train = ["train", data, "--out", tmp_path / "out"]
-    known = ", ".join(sorted(info.name for info in list_backends()))
+    known = ", ".join(sorted(info.name for info in list_plugins("backends")))
     assert_refused(
         bidnerf(*train, "--backend", "hashgird"), 1, "'hashgird'", "mean 'hashgrid'", f"installed: {known}"
     )
@@ -853,8 +851,8 @@ def test_no_start_is_refused_by_methods_that_need_one(bidnerf: Run, shared: Path
 def test_a_backend_whose_module_has_no_docstring_is_listed_with_its_own_summary(
     bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bare = [replace(info, summary="") for info in list_backends() if info.name == "hashgrid"]
-    monkeypatch.setattr("bidnerf_core.cli.backends.list_backends", lambda: bare)
+    bare = [replace(info, summary="") for info in list_plugins("backends") if info.name == "hashgrid"]
+    monkeypatch.setattr("bidnerf_core.cli.backends.list_plugins", lambda group: bare)
     (row,) = strict(bidnerf("backends", "--json").out)
     assert row["summary"] == load_backend("hashgrid").summary
 

@@ -29,9 +29,6 @@ from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_hashgrid import HashGridConfig
 from bidnerf_hashgrid import backend as hashgrid
 from commands import Run
-from tiny import backends_listed_once  # noqa: F401
-
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 COARSE = ["--cells", "30000"]
 

@@ -12,10 +12,7 @@ import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 from commands import Run
-from tiny import backends_listed_once  # noqa: F401
 from tum_folder import Recorded, write_recording
-
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 
 @pytest.fixture(scope="module")

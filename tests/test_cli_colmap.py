@@ -17,9 +17,7 @@ from bidnerf_core.evaluation.results import read_results
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.training import Progress
 from commands import CommandResult, Run
-from tiny import backends_listed_once  # noqa: F401
 
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64", "--json"]
 
 

@@ -27,9 +27,6 @@ from bidnerf_core.errors import printable
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.settings import EXPERT, Settings
 from commands import Run
-from tiny import backends_listed_once  # noqa: F401
-
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 FOCAL = ["--focal", tiny.CAMERA.fx]
 QUICK = ["--method", "bid", "--max-steps", "2", "--rays", "64"]

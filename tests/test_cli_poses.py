@@ -24,9 +24,7 @@ from bidnerf_core.maps.files import load_capture
 from commands import Run
 from landmark_scene import Points, ring
 from test_cli import assert_same_map, stop_at
-from tiny import backends_listed_once  # noqa: F401
 
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 UPDATE = torch.tensor([0.01, -0.02, 0.0, 0.0, 0.03, 0.0], dtype=torch.float64)
 
 

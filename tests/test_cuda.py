@@ -14,7 +14,7 @@ import baked
 import module_fields
 import tiny
 from bidnerf_core import Localizer, devices
-from bidnerf_core.backend import quick_config
+from bidnerf_core.backend import load_backend, quick_config
 from bidnerf_core.cli import main
 from bidnerf_core.devices import constant
 from bidnerf_core.evaluation.protocols import perturb
@@ -24,7 +24,6 @@ from bidnerf_core.localization import settings_of
 from bidnerf_core.localization.solvers import adam
 from bidnerf_core.localization.solvers.cuda_graph import captured
 from bidnerf_core.maps.map import load_map
-from bidnerf_core.registry import load_backend
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views
 from bidnerf_core.training import Progress, Silent, TrainingState, TrainingStopped
 from problems import FieldMap

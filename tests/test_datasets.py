@@ -412,7 +412,7 @@ def test_another_reader_can_join(tmp_path: Path, blender: Path) -> None:
             return open_dataset(blender)
 
     (tmp_path / "magic.bin").touch()
-    assert open_dataset(tmp_path, readers=[*READERS, Other()]).path == blender
+    assert open_dataset(tmp_path, readers=[*READERS.values(), Other()]).path == blender
 
 
 # Bad input

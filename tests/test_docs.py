@@ -32,10 +32,10 @@ from bidnerf_core.localization.auto import auto
 from bidnerf_core.localization.by_colour import ByColourConfig, ColourRefinementSettings
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.registry import registered
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training import Silent
-from tiny import backends_listed_once  # noqa: F401
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -104,7 +104,7 @@ def quick_auto(monkeypatch: pytest.MonkeyPatch) -> None:
         )
         return auto(problem, few, seed)
 
-    monkeypatch.setitem(METHODS, "auto", dataclasses.replace(METHODS["auto"], run=quick))
+    monkeypatch.setitem(registered, ("methods", "auto"), dataclasses.replace(METHODS["auto"], solve=quick))
 
 
 def given(page: Path) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def executed(page: Path) -> dict[str, Any]:
 
 @each([page for page in PAGES if blocks(page, "python")])
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
-@pytest.mark.usefixtures("backends_listed_once", "quick_auto")
+@pytest.mark.usefixtures("quick_auto")
 def test_python_blocks_run(page: Path, inside: Path) -> None:
     before = dict(residuals.DEPTH_RESIDUALS)
     try:
@@ -157,7 +157,7 @@ def test_blocks_are_of_known_languages() -> None:
 
 
 @each([page for page in PAGES if any(words[0] == "bidnerf" for words in commands(page))])
-@pytest.mark.usefixtures("backends_listed_once", "quick_auto")
+@pytest.mark.usefixtures("quick_auto")
 def test_bidnerf_commands_work(page: Path, inside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands that are quick are run on tiny files; the others are parsed."""
     parsers = {True: tyro.cli, False: parsed_only(tyro.cli)}
@@ -206,7 +206,7 @@ def extras(arguments: list[str]) -> set[str]:
     return {name for word in arguments for name in re.findall(r"\[([\w,]+)\]", word)}
 
 
-@pytest.mark.usefixtures("backends_listed_once", "quick_auto")
+@pytest.mark.usefixtures("quick_auto")
 def test_the_backend_of_the_readme_trains_and_localizes(inside: Path) -> None:
     namespace = executed(ROOT / "README.md")
     backend, scene, views = namespace["backend"], demo_object(), tiny.views(16)

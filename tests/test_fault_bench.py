@@ -24,10 +24,9 @@ from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.results import ResultsFile, key_of, result_line
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trials import trial_views
+from bidnerf_core.registry import registered
 from bidnerf_core.scenes.closed_form_data import closed_form_data
-from tiny import backends_listed_once  # noqa: F401
 
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
@@ -106,7 +105,7 @@ def test_results_notice_when_a_fault_has_changed(tmp_path: Path, monkeypatch: py
     with ResultsFile(tmp_path / "r.jsonl") as file:
         assert left_to_do(planned(plan), file) == []
         other = dataclasses.replace(FAULTS["exposure"], change=FAULTS["blur"].change)
-        monkeypatch.setitem(FAULTS, "exposure", other)
+        monkeypatch.setitem(registered, ("faults", "exposure"), other)
         with pytest.raises(InputError, match="made with other images"):
             left_to_do(planned(plan), file)
 
@@ -255,7 +254,8 @@ def test_an_interrupted_run_goes_on_with_rows_of_the_same_content(
     both = run(2, "none", "mirror")
     assert len(asked) == 6
     assert list(both["cells"]["map"]["RGB-D"]) == ["none", "mirror:1"]
-    monkeypatch.setitem(FAULTS, "mirror", dataclasses.replace(FAULTS["mirror"], change=FAULTS["flip"].change))
+    other = dataclasses.replace(FAULTS["mirror"], change=FAULTS["flip"].change)
+    monkeypatch.setitem(registered, ("faults", "mirror"), other)
     run(1, "none", "mirror")
     assert [words.split()[0] for words in asked[6:]] == ["mirror:1"] * 3  # those images are others now
 

@@ -177,7 +177,7 @@ def test_words_name_single_and_composed_faults() -> None:
     ("word", "said"),
     [
         ("depth-scal:1.02", "no fault 'depth-scal', did you mean 'depth-scale'"),
-        ("gravity:2", "expected one of depth-scale, "),
+        ("gravity:2", "installed: added, blur, "),
         ("depth-scale", "has no size, expected NAME:SIZE"),
         ("mirror:", "has no size"),
         ("mirror:0.5", "expected a whole number, 0 to 1"),

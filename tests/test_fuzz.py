@@ -42,10 +42,8 @@ from bidnerf_core.results.pose_files import read_pose
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from commands import Run
-from tiny import backends_listed_once  # noqa: F401
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,7 @@ from bidnerf_core.io.files import FileInUse, is_temporary, locked, temporary, wr
 from bidnerf_core.maps.map import load_map
 from bidnerf_core.results.plot_style import new_figure, save_figure
 from commands import Run
-from tiny import backends_listed_once  # noqa: F401
 
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 BAKE = ["--cells", "2000"]
 QUICK = ["--trials", "2", "--workers", "1", "--method", "bid", "--max-steps", "1", "--rays", "32"]
 

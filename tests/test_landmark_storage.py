@@ -25,9 +25,6 @@ from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from landmark_scene import Points, ring
-from tiny import backends_listed_once  # noqa: F401
-
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 BOUNDS = demo_object().bounds
 

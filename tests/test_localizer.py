@@ -129,7 +129,7 @@ MIRRORED[:3, 0] *= -1
         (FRAME, "pose.json", "start is a str, expected an SE3 or a 4x4 matrix"),
         (FRAME, [[10**400] * 4] * 4, "start is a list, expected an SE3 or a 4x4 matrix"),
         (FRAME, SE3.stack([START, START]), "start holds 2 poses, expected one"),
-        (FRAME, None, "method 'bid' needs a start; give one, or take method 'auto'"),
+        (FRAME, None, "method 'bid' needs a start; give one, or take a method that needs none"),
         (
             [FRAME, FRAME],
             START,
@@ -159,7 +159,7 @@ def test_a_bad_query_is_refused_in_one_line(query: Any, start: Any, message: str
         (Path("maps/room"), "auto", None, r"Localizer: got a PosixPath, expected a Map; load_map\(folder\)"),
         (FIELD, "auto", None, "Localizer: got a GaussianBlobs, expected a Map$"),
         (None, "auto", None, "Localizer: got a NoneType, expected a Map$"),
-        (MAP, "icp", None, "method 'icp' is unknown, expected one of auto, bid, bid-lm, inerf, inerf-lm"),
+        (MAP, "icp", None, "no method 'icp'; installed: auto, bid, bid-lm, inerf, inerf-lm"),
         (MAP, "bid", AutoConfig(), "method 'bid' takes a BidConfig, got a AutoConfig"),
         (MAP, "bid", {"rays": 5}, "method 'bid' takes a BidConfig, got a dict"),
     ],

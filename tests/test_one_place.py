@@ -12,13 +12,12 @@ import tiny
 from bidnerf_core import SE3, InputError, Localizer, Outcome, Tracker, View, load_map
 from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.cli.train import train_map
-from bidnerf_core.localization.direction_only import direction_only, has_distances
+from bidnerf_core.localization.direction_only import direction_only
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
 from bidnerf_core.maps.description import load_info
 from bidnerf_hashgrid import backend as hashgrid
 from landmark_scene import Points, looking_in, ring
 from textured_field import MapWithLandmarks, textured_map, unseen
-from tiny import backends_listed_once  # noqa: F401
 
 CENTRE = looking_in(0.0)
 
@@ -71,7 +70,7 @@ class WithoutDistances(MapWithLandmarks):
 def test_an_accepted_pose_is_imprecise_and_a_rejected_one_stays_rejected() -> None:
     scene = textured_map()
     flat = WithoutDistances(scene.field, scene.bounds, scene.landmarks)
-    assert has_distances(scene)
+    assert scene.has_distances
     frame = unseen().frame
     usual, cautious = Localizer(scene)(frame), Localizer(flat)(frame)
     assert usual.converged
@@ -90,7 +89,6 @@ def test_there_is_no_tracking_without_distances() -> None:
         Tracker(Localizer(WithoutDistances(scene.field, scene.bounds, scene.landmarks)))
 
 
-@pytest.mark.usefixtures("backends_listed_once")
 def test_training_goes_on_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pose = tiny.views(1)[0].T_ref_camera
     photos = [

@@ -99,8 +99,8 @@ def test_an_installed_wheel_offers_and_loads_its_backends(installed: Path) -> No
     program = (
         "import json\n"
         "from bidnerf_core import registry\n"
-        "from bidnerf_core.registry import list_backends, load_backend\n"
-        "mine = [i for i in list_backends() if i.distribution == 'bidnerf']\n"
+        "from bidnerf_core.backend import load_backend\nfrom bidnerf_core.registry import list_plugins\n"
+        "mine = [i for i in list_plugins('backends') if i.distribution == 'bidnerf']\n"
         "loaded = {i.name: type(load_backend(i.name)).__module__ for i in mine}\n"
         "print(json.dumps([registry.__file__, [[i.name, i.value, i.fault] for i in mine], loaded]))"
     )

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from bidnerf_core.backend import Backend
+from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.errors import InputError
-from bidnerf_core.registry import GROUP, UNREADABLE, BackendError, BackendInfo, list_backends, load_backend
+from bidnerf_core.registry import UNREADABLE, PluginError, PluginInfo, list_plugins
 
 GOOD = '''"""A field of {word}.
 
@@ -57,7 +57,7 @@ class Site:
         return info
 
     def plugin(self, name: str, value: str, dist: str = "stranger", version: str = "1.0") -> None:
-        self.metadata(dist, version, f"[{GROUP}]\n{name} = {value}\n")
+        self.metadata(dist, version, f"[bidnerf.backends]\n{name} = {value}\n")
 
 
 @pytest.fixture
@@ -82,12 +82,12 @@ def site(new_site: Callable[[str], Site]) -> Site:
     return new_site("site")
 
 
-def listed(name: str) -> list[BackendInfo]:
-    return [info for info in list_backends() if info.name == name]
+def listed(name: str) -> list[PluginInfo]:
+    return [info for info in list_plugins("backends") if info.name == name]
 
 
 def refusal(name: str) -> str:
-    with pytest.raises(BackendError) as caught:
+    with pytest.raises(PluginError) as caught:
         load_backend(name)
     assert isinstance(caught.value, InputError)
     assert "\n" not in str(caught.value)
@@ -97,7 +97,9 @@ def refusal(name: str) -> str:
 def test_a_strangers_backend_is_listed_and_loaded(site: Site) -> None:
     site.module("stranger_fog.py", GOOD.format(word="fog"))
     site.plugin("fog", "stranger_fog:backend", version="2.3")
-    assert listed("fog") == [BackendInfo("fog", "stranger_fog:backend", "stranger", "2.3", "A field of fog.")]
+    assert listed("fog") == [
+        PluginInfo("backends", "fog", "stranger_fog:backend", "stranger", "2.3", "A field of fog.")
+    ]
     backend = load_backend("fog")
     assert isinstance(backend, Backend)
     assert backend.summary == "a field of fog"
@@ -140,8 +142,8 @@ def test_listing_imports_nothing(site: Site) -> None:
     site.plugin("loud", "stranger_loud.kind:backend")
     program = (
         "import json, sys\n"
-        "from bidnerf_core.registry import list_backends\n"
-        "infos = {i.name: i.summary for i in list_backends()}\n"
+        "from bidnerf_core.registry import list_plugins\n"
+        "infos = {i.name: i.summary for i in list_plugins('backends')}\n"
         "foreign = [m for m in sys.modules if m.startswith(('stranger', 'bidnerf_')) and 'core' not in m]\n"
         "print(json.dumps([infos, foreign]))"
     )
@@ -190,7 +192,7 @@ def test_a_module_that_does_not_import_is_told_with_its_cause(
     message = refusal("broken")
     for part in ["'broken'", "stranger_broken:backend", "stranger-broken 0.7", *causes]:
         assert part in message
-    with pytest.raises(BackendError) as caught:
+    with pytest.raises(PluginError) as caught:
         load_backend("broken")
     assert caught.value.__cause__ is not None
 
@@ -252,7 +254,7 @@ def test_of_two_versions_the_first_on_the_path_wins_as_for_import(new_site: Call
     first.module("stranger_new.py", GOOD.format(word="fog"))
     first.plugin("fog", "stranger_new:backend", dist="stranger-fog", version="2.0")
     (info,) = listed("fog")
-    assert (info.value, info.version, info.hidden) == ("stranger_new:backend", "2.0", ("1.0",))
+    assert (info.value, info.version) == ("stranger_new:backend", "2.0")
     assert isinstance(load_backend("fog"), Backend)
 
 
@@ -271,7 +273,7 @@ def test_a_folder_that_is_on_the_path_twice_hides_nothing(
     site.plugin("fog", "stranger_fog:backend")
     monkeypatch.setattr(sys, "path", [str(site.folder), *sys.path])
     (info,) = listed("fog")
-    assert (info.hidden, info.fault) == ((), None)
+    assert info.fault is None
 
 
 @pytest.mark.parametrize(
@@ -308,7 +310,7 @@ def test_malformed_metadata_of_others_breaks_nothing(site: Site, text: str) -> N
 
 
 def test_malformed_metadata_that_names_our_group_is_reported(site: Site) -> None:
-    site.metadata("stranger-fog", "1.0", f"[{GROUP}]\nfog\n")
+    site.metadata("stranger-fog", "1.0", "[bidnerf.backends]\nfog\n")
     (info,) = listed(UNREADABLE)
     assert info.distribution == "stranger-fog"
     assert "entry_points.txt cannot be read" in (info.fault or "")
@@ -320,7 +322,7 @@ def test_malformed_metadata_that_names_our_group_is_reported(site: Site) -> None
 def test_distributions_without_a_name_do_not_hide_each_other(site: Site) -> None:
     site.module("stranger_fog.py", GOOD.format(word="fog"))
     for name in ("fog", "mist"):
-        points = f"[{GROUP}]\n{name} = stranger_fog:backend\n"
+        points = f"[bidnerf.backends]\n{name} = stranger_fog:backend\n"
         site.module(f"{name}-1.0.dist-info/entry_points.txt", points)
     assert all("unnamed distribution" in listed(name)[0].distribution for name in ("fog", "mist"))
     assert isinstance(load_backend("mist"), Backend)
@@ -333,7 +335,7 @@ def test_a_distribution_installed_by_pip_is_found(new_site: Callable[[str], Site
         "pyproject.toml",
         '[build-system]\nrequires = ["hatchling"]\nbuild-backend = "hatchling.build"\n'
         '[project]\nname = "stranger-real"\nversion = "3.1"\n'
-        f'[project.entry-points."{GROUP}"]\nstone = "stranger_real:backend"\n',
+        '[project.entry-points."bidnerf.backends"]\nstone = "stranger_real:backend"\n',
     )
     target = new_site("installed").folder
     pip = [
@@ -355,6 +357,8 @@ def test_a_distribution_installed_by_pip_is_found(new_site: Callable[[str], Site
 def test_the_backport_may_answer_in_place_of_the_library() -> None:
     """Some packages import ``importlib_metadata``, which then finds all distributions, with classes of its own."""
     pytest.importorskip("importlib_metadata")
-    code = "import importlib_metadata; from bidnerf_core import list_backends; print(*(b.name for b in list_backends()))"
+    code = (
+        "import importlib_metadata, bidnerf_core as bn; print(*(b.name for b in bn.list_plugins('backends')))"
+    )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert {"adanerf", "hashgrid", "vanilla"} <= set(shown.split())

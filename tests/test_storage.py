@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 import baked
 import tiny
+from bidnerf_core.backend import load_backend
 from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
@@ -30,13 +31,9 @@ from bidnerf_core.maps import map as map_module
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.files import load_state, save_map, save_surface
 from bidnerf_core.maps.map import load_map
-from bidnerf_core.registry import load_backend
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import HashGridField, backend
-from tiny import backends_listed_once  # noqa: F401
-
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 
 BOUNDS = SceneBounds((-0.1, -1 / 3, -1.0), (1.0, 2 / 3, 1e-17), 0.1, 5.0, (1.0, 0.5, 0.0))
 

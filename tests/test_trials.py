@@ -20,9 +20,7 @@ from bidnerf_core.evaluation.trials import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.results.errors import pose_error
-from tiny import backends_listed_once  # noqa: F401
 
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 QUICK = '{"max_steps": 4, "rays": 64}'
 
 

@@ -65,6 +65,7 @@ class MapWithLandmarks:
     landmarks: LandmarkMap | None
     surface: SurfaceMap | None = None
     colour_noise: float | None = 0.0
+    has_distances: bool = True
 
 
 @functools.cache

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
-import pytest
 import torch
 
-from bidnerf_core import registry
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.fields.contract import Rays
 from bidnerf_core.fields.observations import Observations
@@ -30,14 +26,6 @@ BACKGROUND = demo_object().bounds.background
 CAMERA = Intrinsics(32.0, 32.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
 ENCODING = HashEncodingConfig(levels=3, log2_table_size=9, base_resolution=4, finest_resolution=16)
 STEPS = 12
-
-
-@pytest.fixture(scope="module")
-def backends_listed_once() -> Iterator[None]:
-    """Which backends are installed does not change, and to find out takes longer than most tests that load a map."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(registry, "list_backends", functools.cache(registry.list_backends))
-        yield
 
 
 def config(steps: int = STEPS, **changes: Any) -> HashGridConfig:

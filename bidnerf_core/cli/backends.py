@@ -8,7 +8,7 @@ from rich.table import Table
 
 from bidnerf_core.cli.options import Flag, option, parse
 from bidnerf_core.cli.output import print_json, print_table
-from bidnerf_core.registry import BackendError, BackendInfo, list_backends, load_backend
+from bidnerf_core.registry import PluginError, PluginInfo, list_plugins, load_plugin
 
 
 def run(arguments: list[str]) -> None:
@@ -17,7 +17,7 @@ def run(arguments: list[str]) -> None:
 
 def backends(json: Annotated[Flag, option(None, "print a JSON list", "")] = False) -> None:
     """List the installed kinds of field."""
-    infos = list_backends()
+    infos = list_plugins("backends")
     if json:
         print_json([_row(info) for info in infos])
         return
@@ -29,17 +29,17 @@ def backends(json: Annotated[Flag, option(None, "print a JSON list", "")] = Fals
     print_table(table)
 
 
-def _summary(info: BackendInfo) -> str:
+def _summary(info: PluginInfo) -> str:
     """Return the summary from the module's docstring or the metadata or, without these, from the imported backend itself."""
     if info.summary or info.fault:
         return info.summary
     try:
-        return load_backend(info.name).summary
-    except BackendError:
+        return str(load_plugin("backends", info.name).summary)
+    except PluginError:
         return ""  # the fault is reported when the backend is loaded for use
 
 
-def _row(info: BackendInfo) -> dict[str, str | None]:
+def _row(info: PluginInfo) -> dict[str, str | None]:
     return {
         "name": info.name,
         "summary": _summary(info),

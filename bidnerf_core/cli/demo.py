@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 from rich.table import Table
 
-from bidnerf_core.backend import Backend, quick_config
+from bidnerf_core.backend import Backend, load_backend, quick_config
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.options import DEFAULT_BACKEND, LARGEST_SEED, Flag, option, parse, require
@@ -28,7 +28,6 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.registry import load_backend
 from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.results.overlays import Painter
 from bidnerf_core.scenes.closed_form import views

@@ -44,13 +44,14 @@ from bidnerf_core.evaluation.provenance import command_line, note_run, provenanc
 from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.localization import METHODS
+from bidnerf_core.localization.methods import USUAL_METHOD
 
 Place = Annotated[str, tyro.conf.Positional]
 
 
 def run(arguments: list[str]) -> None:
     """Run the command; its options include the settings of the method that the arguments name."""
-    settings = chosen_settings(arguments, "auto")
+    settings = chosen_settings(arguments, USUAL_METHOD)
 
     def evaluate(
         map: Annotated[Place, option("MAP", "folder of a map, or demo:blobs")],
@@ -68,7 +69,7 @@ def run(arguments: list[str]) -> None:
             tuple[str, ...],
             option("SIZE...", "error of the start: e_t, or METRES:DEGREES for perturb", "the protocol's"),
         ] = (),
-        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = "auto",
+        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = USUAL_METHOD,
         trials: Annotated[
             int | None, option("N", "number of trials of each size", "the protocol's, 24 or 25")
         ] = None,

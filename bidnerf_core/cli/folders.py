@@ -66,7 +66,7 @@ def _make_writable(out: Path) -> None:
 
 def check_pose_file(out: Path) -> None:
     """Raise, before any work is done, where a file of poses cannot be written."""
-    from bidnerf_core.results.answers import (
+    from bidnerf_core.results.pose_files import (
         pose_format,
     )  # here, since it imports torch, which 'report' can do without
 

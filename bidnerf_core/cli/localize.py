@@ -33,21 +33,26 @@ from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.evaluation.trials import places_of
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
-from bidnerf_core.localization import METHODS, AutoConfig, Localization, Localizer
-from bidnerf_core.localization.methods import require_use_of_depth
+from bidnerf_core.localization import METHODS, Localization, Localizer
+from bidnerf_core.localization.methods import (
+    USUAL_METHOD,
+    matches_landmarks,
+    require_start,
+    require_use_of_depth,
+)
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.map import Map
-from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each, pose_format
+from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
 from bidnerf_core.results.errors import PoseError, pose_error, standard_deviations
 from bidnerf_core.results.overlays import overlay
-from bidnerf_core.results.pose_files import read_pose
+from bidnerf_core.results.pose_files import pose_format, read_pose
 
 one_start = tyro.conf.create_mutex_group(required=False, title="where to start (default: no start is known)")
 
 
 def run(arguments: list[str]) -> None:
     """Parse with the settings of the method that the arguments name, and localize."""
-    settings = chosen_settings(arguments, "auto")
+    settings = chosen_settings(arguments, USUAL_METHOD)
 
     def localize(
         map: MapFolder,
@@ -76,7 +81,7 @@ def run(arguments: list[str]) -> None:
             option("NAME...", "frames of a dataset, together as a rig", "each of the split, on its own"),
         ] = (),
         split: Annotated[str, option("NAME", "split of the dataset")] = "test",
-        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = "auto",
+        method: Annotated[str, option("NAME", "how poses are found: " + ", ".join(METHODS))] = USUAL_METHOD,
         start: Annotated[
             Path | None, one_start, option("POSE.json", "file with a 4x4 T_world_camera to start from", "")
         ] = None,
@@ -133,8 +138,7 @@ def run(arguments: list[str]) -> None:
             part.check()
         if not query:
             raise UsageError("no QUERY, expected image files, folders of photos, or a folder of a dataset")
-        if METHODS[method].needs_start and not begin.given:
-            raise InputError(f"method {method!r} needs a start; give one by --start, or take method 'auto'")
+        require_start(method, begin.given)
         if depth_points is not None:
             require_use_of_depth(method)
         if out is not None:
@@ -143,7 +147,7 @@ def run(arguments: list[str]) -> None:
             make_folder(draw)
         stored = opened_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
-        photos = replace(photos, assumed=_assumed_cameras(stored.landmarks, config))
+        photos = replace(photos, assumed=_assumed_cameras(stored.landmarks, method, config))
         source = open_queries(query, photos, frames, stored.bounds.background, points)
         if perturb is not None and isinstance(source, Photos):
             raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")
@@ -161,9 +165,9 @@ def _depth_points(path: Path, stored: Map, choice: SparseChoice) -> DepthPoints:
     return DepthPoints(path, sparse)
 
 
-def _assumed_cameras(landmarks: LandmarkMap | None, config: Any) -> tuple[Intrinsics, ...]:
+def _assumed_cameras(landmarks: LandmarkMap | None, method: str, config: Any) -> tuple[Intrinsics, ...]:
     """Return the cameras of a map's images if photos without a focal length can be localized, which takes landmarks."""
-    if landmarks is None or not (isinstance(config, AutoConfig) and config.landmarks):
+    if landmarks is None or not matches_landmarks(method, config):
         return ()
     return landmarks.cameras
 

@@ -10,7 +10,7 @@ from bidnerf_core.localization import find_method
 
 Preset: TypeAlias = Annotated[
     str | None,
-    option("NAME", "settings to begin with: paper or paper-scene for bid, paper for inerf", "the defaults"),
+    option("NAME", "settings of the method to begin with, such as the paper's", "the defaults"),
 ]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.cli.options import require, require_different
-from bidnerf_core.datasets import READERS, DepthRegistration, ReadOptions, open_dataset
+from bidnerf_core.datasets import DepthRegistration, ReadOptions, open_dataset
 from bidnerf_core.datasets.queries import (
     DatasetFrames,
     DepthPoints,
@@ -18,6 +18,7 @@ from bidnerf_core.datasets.queries import (
     depth_files,
     photo_files,
 )
+from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.errors import UsageError
 
 
@@ -75,7 +76,7 @@ def open_queries(
 
     Raises ``InputError`` where there is nothing of either kind, and ``UsageError`` for options of the other kind.
     """
-    datasets = [path for path in paths if path.is_dir() and any(r.recognises(path) for r in READERS)]
+    datasets = [path for path in paths if path.is_dir() and find_reader(path) is not None]
     if frames.names or datasets:
         return _dataset(paths, photos, frames, background, points)
     if frames.window > 1:

@@ -32,7 +32,8 @@ from bidnerf_core.cli.watch_folder import STDIN, requests
 from bidnerf_core.datasets import FileSequence, FrameSequence, ReadOptions
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, UsageError, amount
-from bidnerf_core.localization import AutoConfig, Localizer, Tracker, TrackerConfig
+from bidnerf_core.localization import Localizer, Tracker, TrackerConfig, settings_of
+from bidnerf_core.localization.methods import USUAL_METHOD
 from bidnerf_core.maps.map import Map
 from bidnerf_core.results import tracked_path as library
 from bidnerf_core.results.plot_style import require_matplotlib
@@ -109,7 +110,10 @@ def run(arguments: list[str]) -> None:
             check_video(video)
         registration = depth_registration(register_depth)
         sensor = ReadOptions(register_depth=registration).sensor(sequence) if follow else None
-        begin, settings = None if start is None else read_pose(start), AutoConfig(depth_sensor=depth_sensor)
+        begin, settings = (
+            None if start is None else read_pose(start),
+            settings_of(USUAL_METHOD, {"depth_sensor": depth_sensor}),
+        )
         stored = opened_map(map)
         assumed = () if stored.landmarks is None else stored.landmarks.cameras
         path, began = TrackedPath.of(stored), clocks.perf_counter()

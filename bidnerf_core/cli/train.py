@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import torch
 
-from bidnerf_core.backend import Backend
+from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.captures.cameras import as_given, at_stored_poses, stored_cameras
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.cli.bake import bake_map
@@ -41,7 +41,6 @@ from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.files import load_state
 from bidnerf_core.maps.map import build_field
-from bidnerf_core.registry import load_backend
 from bidnerf_core.settings import to_flat
 from bidnerf_core.training import TrainingStopped
 

@@ -7,12 +7,17 @@ from pathlib import Path
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets.colmap_project import ColmapReader
 from bidnerf_core.datasets.dataset import Dataset, ReadingProgress
 from bidnerf_core.datasets.image_folders import open_images
-from bidnerf_core.datasets.reader import DepthRegistration, Reader, ReadOptions
+from bidnerf_core.datasets.reader import (
+    READERS,
+    DepthRegistration,
+    Reader,
+    ReadOptions,
+    expected_files,
+    find_reader,
+)
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
-from bidnerf_core.datasets.scanner_app import ScannerAppReader
 from bidnerf_core.datasets.sequence import (
     FileSequence,
     FrameSequence,
@@ -20,10 +25,7 @@ from bidnerf_core.datasets.sequence import (
     TimedFrame,
     sequence_of,
 )
-from bidnerf_core.datasets.seven_scenes import SevenScenesReader
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
-from bidnerf_core.datasets.transforms import TransformsReader
-from bidnerf_core.datasets.tum import TumReader
 from bidnerf_core.datasets.video import VIDEO_SUFFIXES, open_video
 from bidnerf_core.datasets.writing import write_transforms
 from bidnerf_core.depth.registration import DepthCamera
@@ -56,16 +58,6 @@ __all__ = [
 ]
 
 
-READERS: list[Reader] = [
-    TransformsReader(),
-    ScannerAppReader(),
-    TumReader(),
-    SevenScenesReader(),
-    ColmapReader(),
-]
-"""The formats that ``open_dataset`` tries, in this order; append a reader to add one."""
-
-
 def open_dataset(
     path: str | Path,
     background: Background | None = None,
@@ -86,7 +78,6 @@ def open_dataset(
         raise InputError(f"{folder}: no such folder")
     if not folder.is_dir():
         raise InputError(f"{folder}: is a file, expected the folder of a dataset")
-    readers = READERS if readers is None else readers
     reader = _reader_of(folder, readers)
     if reader is None:
         raise InputError(f"{folder}: {_without_dataset(folder, readers)}")
@@ -123,7 +114,7 @@ def open_sequence(
         if register_depth is not None:
             raise InputError(f"{place}: is a video, which has no depth to register")
         return open_video(place, given)
-    reader = _reader_of(place, READERS if readers is None else readers)
+    reader = _reader_of(place, readers)
     if reader is None:
         sensor = ReadOptions(register_depth=register_depth).sensor(place)
         return open_images(place, given, sensor, background)
@@ -150,7 +141,7 @@ def _options(
     return ReadOptions(background, Path(given) if isinstance(given, str) else given, register)
 
 
-def _without_dataset(folder: Path, readers: Sequence[Reader]) -> str:
+def _without_dataset(folder: Path, readers: Sequence[Reader] | None) -> str:
     """Return why a folder is no dataset, and what to do."""
     inside = [
         child.name for child in sorted(folder.iterdir()) if child.is_dir() and _reader_of(child, readers)
@@ -158,7 +149,7 @@ def _without_dataset(folder: Path, readers: Sequence[Reader]) -> str:
     if inside:
         return f"no dataset found, expected one of the folders in it, such as {inside[0]}"
     photos, _ = photos_in(folder)
-    expected = "expected " + "; or ".join(reader.expected for reader in readers)
+    expected = "expected " + expected_files(readers)
     if not photos:
         return f"no dataset found, {expected}"
     return (
@@ -167,5 +158,7 @@ def _without_dataset(folder: Path, readers: Sequence[Reader]) -> str:
     )
 
 
-def _reader_of(folder: Path, readers: Sequence[Reader]) -> Reader | None:
+def _reader_of(folder: Path, readers: Sequence[Reader] | None) -> Reader | None:
+    if readers is None:
+        return find_reader(folder)
     return next((reader for reader in readers if reader.recognises(folder)), None)

@@ -110,3 +110,6 @@ def _frame(model: Path, folder: Path, image: ModelImage, cameras: dict[int, Intr
     if not is_file(folder / name):
         raise InputError(f"{folder / name}: no such file, expected it as {model} has that image")
     return ColmapFrame(name, folder / name, cameras[image.camera], image.T_camera_model.inverse())
+
+
+reader = ColmapReader()

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from bidnerf_core.camera.source import CameraSource
-from bidnerf_core.datasets import READERS, Dataset
+from bidnerf_core.datasets import Dataset
 from bidnerf_core.datasets.colmap import SparsePoints
 from bidnerf_core.datasets.dataset import unique_names
 from bidnerf_core.datasets.points import read_depth_points
+from bidnerf_core.datasets.reader import expected_files
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, InputWarning, UsageError, amount
@@ -183,7 +184,7 @@ def photo_files(paths: Sequence[Path], depth: Sequence[Path] = ()) -> list[Path]
         found, others = photos_in(path)
         others = [file for file in others if file not in depth]
         if not found:
-            formats = " or ".join(reader.expected for reader in READERS)
+            formats = expected_files()
             raise InputError(f"{path}: no photos in it, and no dataset ({formats})")
         if others:
             named = ", ".join(file.name for file in others[:NAMED])

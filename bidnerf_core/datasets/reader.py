@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import warnings
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.sequence import FrameSequence, sequence_of
 from bidnerf_core.depth.registration import DepthCamera
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, InputWarning, enumeration
 from bidnerf_core.io.images import Background
+from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
 DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
 """The registration of depth to colour images: from a sensor or a file of one, from the format's own (True), or none (False)."""
@@ -75,3 +77,59 @@ class Reader(Protocol):
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
         """Return the frames in chronological order, also those that no split has; by default, all frames in order of names."""
         return sequence_of(self.open(path, options))
+
+
+def _defects(reader: Any) -> Iterator[str]:
+    options = ("path", "options")
+    methods = {"recognises": ("path",), "open": options, "open_sequence": options}
+    yield from interface_defects(reader, ("accepts", "expected"), methods)
+
+
+ORDER = ("transforms", "scanner-app", "tum", "seven-scenes", "colmap")
+"""The bundled readers in the order in which they are asked; a folder may hold files of several formats."""
+
+READERS: Plugins[Reader] = Plugins("readers", _defects, first=ORDER)
+"""The readers by name."""
+
+
+def find_reader(folder: Path) -> Reader | None:
+    """Return the reader that recognises a folder, or None: the first bundled one, or else the only other one.
+
+    A reader that cannot be loaded or that fails is reported by an ``InputWarning``. Raises ``InputError`` where several readers
+    that are not bundled recognise the folder.
+    """
+    for name in ORDER:
+        if READERS[name].recognises(folder):
+            return READERS[name]
+    claims = {name: reader for name, reader in _others() if _claims(name, reader, folder)}
+    if len(claims) > 1:
+        raise InputError(
+            f"{folder}: is recognised by the readers {enumeration(list(claims))}, expected one; uninstall the others"
+        )
+    return next(iter(claims.values()), None)
+
+
+def expected_files(readers: Sequence[Reader] | None = None) -> str:
+    """Return what the folders of the formats hold, for messages; by default those of all readers."""
+    if readers is None:
+        readers = [*(READERS[name] for name in ORDER), *(reader for _, reader in _others())]
+    return "; or ".join(reader.expected for reader in readers)
+
+
+def _others() -> Iterator[tuple[str, Reader]]:
+    """Yield the readers that are not bundled, except those that cannot be loaded."""
+    for name in READERS:
+        if name not in ORDER:
+            try:
+                yield name, READERS.load(name)
+            except PluginError as error:
+                warnings.warn(str(error), InputWarning, stacklevel=2)
+
+
+def _claims(name: str, reader: Reader, folder: Path) -> bool:
+    try:
+        return bool(reader.recognises(folder))
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}"
+        warnings.warn(f"{folder}: reader {name!r} fails to look at it: {why}", InputWarning, stacklevel=2)
+        return False

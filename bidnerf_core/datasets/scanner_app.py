@@ -253,3 +253,6 @@ def _numbers(record: Record, key: str, count: int) -> list[float]:
     if len(found) != count:
         raise record.error(f"{key} has {len(found)} entries, expected {count} numbers")
     return [record.checked_number(value, f"a number of {key}") for value in found]
+
+
+reader = ScannerAppReader()

@@ -204,3 +204,6 @@ def _sequence_folders(path: Path) -> dict[int, Path]:
 
 def _has_frames(folder: Path) -> bool:
     return any(COLOUR.fullmatch(file.name) for file in folder.glob("frame-*"))
+
+
+reader = SevenScenesReader()

@@ -125,3 +125,6 @@ class TransformsDataset(SplitDataset[FrameRecord]):
             return read_header(self._image_file(frame)).has_alpha
         except InputError:  # the error is raised again when that frame is read
             return False
+
+
+reader = TransformsReader()

@@ -210,3 +210,6 @@ def _listed(path: Path) -> list[TimedRow]:
     rows = read_timed_rows(path, "filename")
     require_distinct_times(rows)
     return rows
+
+
+reader = TumReader()

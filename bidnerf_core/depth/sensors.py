@@ -93,8 +93,11 @@ EXACT = DepthSensorModel(scale=0.0, noise=DepthNoise())
 RENDERED = DepthSensorModel(scale=0.0, noise=DepthNoise(linear=0.001))
 """Depth computed from a model of the scene: exact but for rounding, such as to the whole millimetres of a PNG from 1 m on."""
 
+UNKNOWN_SENSOR = "unknown"
+"""The name of a sensor that is not known."""
+
 DEPTH_SENSORS: dict[str, DepthSensorModel] = {
-    "unknown": UNKNOWN,
+    UNKNOWN_SENSOR: UNKNOWN,
     "kinect": KINECT,
     "realsense": REALSENSE,
     "lidar": LIDAR,

@@ -38,6 +38,7 @@ from bidnerf_core.localization.by_landmarks import (
 )
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.covariance import position_deviation
+from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -294,3 +295,15 @@ def _descended(problem: Problem, seed: int, why: str) -> Localization:
         raise InputError(f"{why}: method 'auto' needs a start then; give one")
     found = bid(problem, BidConfig(), seed)
     return replace(found, reason=f"{why}; {found.reason}")
+
+
+AUTO = Method(
+    auto,
+    AutoConfig,
+    needs_start=False,
+    uses_landmarks=True,
+    matches_landmarks=lambda config: config.landmarks,
+    depth_sensor=lambda config: config.depth_sensor,
+    by_colour=lambda config: config.by_colour,
+    summary="landmarks, then search on the baked surface by depth or colour; no start needed",
+)

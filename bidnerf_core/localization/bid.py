@@ -13,6 +13,7 @@ from bidnerf_core.localization.method_settings import (
     ReachSettings,
     objective_of,
 )
+from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.settings import Settings
@@ -48,3 +49,12 @@ def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
     objective = objective_of(config.colour, config.depth)
     depth_rays = config.depth.depth_rays
     return descended(problem, config.descent, config.adam, objective, depth_rays, seed, "bid", config.reach)
+
+
+BID = Method(
+    bid,
+    BidConfig,
+    needs_start=True,
+    presets=BID_PRESETS,
+    summary="Adam on colour and depth at the coarse level (BID-NeRF)",
+)

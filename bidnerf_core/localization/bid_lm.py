@@ -18,6 +18,7 @@ from bidnerf_core.localization.method_settings import (
     RenderedThresholds,
     SpreadSettings,
 )
+from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import refine
 from bidnerf_core.localization.result import Localization
@@ -97,3 +98,11 @@ def stages(config: BidLmConfig) -> tuple[RefinementStage, ...]:
         RefinementStage(s.middle_steps, s.middle_rays, s.middle_poses, 0, s.blur, *scales, sigma),
         RefinementStage(s.fine_steps, s.fine_rays, 1, None, 1, *scales, sigma / 3, s.depth_window),
     )
+
+
+BID_LM = Method(
+    bid_lm,
+    BidLmConfig,
+    needs_start=True,
+    summary="second-order steps on colour and depth, from coarse to fine",
+)

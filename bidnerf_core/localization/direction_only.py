@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.result import Localization, Outcome
 
 NO_DISTANCES = "the map's photos are from one place and show no distances"
-
-
-def has_distances(scene: SceneMap) -> bool:
-    """Return whether a map's images determine distances; this is assumed of a map without an attribute ``has_distances``."""
-    return bool(getattr(scene, "has_distances", True))
 
 
 def direction_only(found: Localization) -> Localization:

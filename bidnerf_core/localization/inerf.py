@@ -17,6 +17,7 @@ from bidnerf_core.localization.method_settings import (
     DescentSettings,
     objective_of,
 )
+from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.settings import Settings
@@ -41,3 +42,13 @@ def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:
         raise InputError(f"method inerf takes one image, got {len(problem.views)}; method bid takes several")
     objective = objective_of(config.colour, None)
     return descended(problem, config.descent, config.adam, objective, 0, seed, "inerf")
+
+
+INERF = Method(
+    inerf,
+    InerfConfig,
+    needs_start=True,
+    uses_depth=False,
+    presets=INERF_PRESETS,
+    summary="Adam on the colours of one image in full detail (iNeRF)",
+)

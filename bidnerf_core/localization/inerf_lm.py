@@ -20,6 +20,7 @@ from bidnerf_core.localization.method_settings import (
     RenderedThresholds,
     SpreadSettings,
 )
+from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.by_images import ImageSearch, ImageStage
@@ -75,3 +76,12 @@ def inerf_lm(problem: Problem, config: InerfLmConfig, seed: int = 0) -> Localiza
     refinement = ByColourConfig(config.steps, config.colour, config.refinement, config.thresholds)
     answer = refine_by_colour(replace(problem, start=start), found, refinement, generator)
     return localization_of(problem, answer, refinement, began, "inerf-lm")
+
+
+INERF_LM = Method(
+    inerf_lm,
+    InerfLmConfig,
+    needs_start=True,
+    uses_depth=False,
+    summary="second-order steps on colour alone, from coarse to fine",
+)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel, find_depth_sensor
+from bidnerf_core.depth.sensors import DepthSensorModel, find_depth_sensor
 from bidnerf_core.devices import constant
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import device_of
@@ -18,9 +18,9 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
-from bidnerf_core.localization.auto_config import AutoConfig
-from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only, has_distances
-from bidnerf_core.localization.methods import METHODS, Method, find_method, require_use_of_depth
+from bidnerf_core.localization.by_colour import ByColourConfig
+from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only
+from bidnerf_core.localization.methods import USUAL_METHOD, Method, find_method, require_use_of_depth
 from bidnerf_core.localization.problem import SceneMap, on_device, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.matching import LandmarkMatcher
@@ -40,8 +40,8 @@ class Localizer:
 
     def __init__(
         self,
-        map: Any,
-        method: str = "auto",
+        map: SceneMap,
+        method: str = USUAL_METHOD,
         config: Any = None,
         device: torch.device | str | None = None,
         warm_up: bool = True,
@@ -55,18 +55,13 @@ class Localizer:
         elsewhere are copied. ``warm_up``: do now what the first call would otherwise have to wait for. Raises ``InputError``
         for what does not fit.
         """
-        if not isinstance(map, SceneMap):
-            hint = (
-                "; load_map(folder) gives one"
-                if isinstance(map, str | bytes) or hasattr(map, "__fspath__")
-                else ""
-            )
-            raise InputError(f"Localizer: got a {type(map).__name__}, expected a Map{hint}")
+        map = _checked_map(map)
         self.method = method
         self.map: SceneMap = map if device is None else on_device(map, device)
-        self.config = _checked_config(find_method(method), method, config, preset)
-        landmarks = getattr(self.map, "landmarks", None)
-        self.matcher = None if landmarks is None or method != "auto" else LandmarkMatcher(landmarks)
+        self._method = find_method(method)
+        self.config = _checked_config(self._method, method, config, preset)
+        landmarks = self.map.landmarks if self._method.uses_landmarks else None
+        self.matcher = None if landmarks is None else LandmarkMatcher(landmarks)
         if warm_up:
             self._warm_up()
 
@@ -80,7 +75,7 @@ class Localizer:
         """Find T_world_camera of a frame, or of the last of several views.
 
         ``query``: a frame, or views with known relative poses (``T_ref_camera`` in any common frame): a rig, or a window of
-        a sequence. ``start``: a guess at T_world_camera of the last view, which method ``auto`` does without.
+        a sequence. ``start``: a guess at T_world_camera of the last view, which some methods do without.
         ``depth_rays``: distances that another sensor measured, such as a lidar, in the frame of the last camera; methods
         that use colour alone refuse them. Raises ``InputError`` for a query that cannot be localized at all; a pose that is
         merely doubtful is returned, with an ``outcome`` other than ``CONVERGED``.
@@ -90,14 +85,28 @@ class Localizer:
         problem = rig(
             self.map, _views(query), None if start is None else start_pose(start), depth_rays, self.matcher
         )
-        found = METHODS[self.method].run(problem, self.config, seed)
-        return found if has_distances(self.map) else direction_only(found)
+        found = self._method.solve(problem, self.config, seed)
+        return found if self.map.has_distances else direction_only(found)
 
     @property
     def depth_sensor(self) -> DepthSensorModel:
         """The model of the sensor that measures depth; methods without such a setting have that of an unknown one."""
-        config = self.config
-        return find_depth_sensor(config.depth_sensor) if isinstance(config, AutoConfig) else UNKNOWN
+        return find_depth_sensor(self.depth_sensor_name)
+
+    @property
+    def depth_sensor_name(self) -> str:
+        """The name of the sensor that measures depth, as the settings say."""
+        return self._method.depth_sensor(self.config)
+
+    @property
+    def by_colour(self) -> ByColourConfig:
+        """The settings of refinement by colour alone; methods without such settings have the usual ones."""
+        return self._method.by_colour(self.config)
+
+    @property
+    def matches_landmarks(self) -> bool:
+        """Whether the map has landmarks and the method matches them, with its settings."""
+        return self.matcher is not None and self._method.matches_landmarks(self.config)
 
     @torch.no_grad()
     def _warm_up(self) -> None:
@@ -114,11 +123,19 @@ class Localizer:
 
 def map_with_distances(localizer: Localizer) -> SceneMap:
     """Return the localizer's map. Raises ``InputError`` where it was made from one place: nothing has a position in it."""
-    if not has_distances(localizer.map):
+    if not localizer.map.has_distances:
         raise InputError(
             f"tracking needs positions, but {NO_DISTANCES}; expected a map of photos from several places"
         )
     return localizer.map
+
+
+def _checked_map(given: object) -> SceneMap:
+    if isinstance(given, SceneMap):
+        return given
+    is_path = isinstance(given, str | bytes) or hasattr(given, "__fspath__")
+    hint = "; load_map(folder) gives one" if is_path else ""
+    raise InputError(f"Localizer: got a {type(given).__name__}, expected a Map{hint}")
 
 
 def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:

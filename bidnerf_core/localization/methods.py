@@ -1,37 +1,51 @@
-"""The table of methods, by name."""
+"""``Method``, what a stranger registers to find poses in a way of their own, and the methods by name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from bidnerf_core.depth.sensors import UNKNOWN_SENSOR
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.auto import auto
-from bidnerf_core.localization.auto_config import AutoConfig
-from bidnerf_core.localization.bid import BID_PRESETS, BidConfig, bid
-from bidnerf_core.localization.bid_lm import BidLmConfig, bid_lm
-from bidnerf_core.localization.inerf import INERF_PRESETS, InerfConfig, inerf
-from bidnerf_core.localization.inerf_lm import InerfLmConfig, inerf_lm
+from bidnerf_core.localization.by_colour import ByColourConfig
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import from_flat
+
+
+def _always(config: Any) -> bool:
+    return True
+
+
+def _unknown_sensor(config: Any) -> str:
+    return UNKNOWN_SENSOR
+
+
+def _usual_colour(config: Any) -> ByColourConfig:
+    return ByColourConfig()
 
 
 @dataclass(frozen=True)
 class Method:
-    """A localization method: its function and the frozen dataclass of its settings.
+    """A localization method: how it finds poses, its settings, what it needs and what it offers.
 
-    ``needs_start``: whether it needs a guess at the pose. ``uses_depth``: whether it uses measured depth. ``presets``: other
-    settings than the defaults, by name.
+    The functions of a config return what the settings say about a question that is asked outside of the method.
     """
 
-    run: Callable[[Problem, Any, int], Localization]
-    config_type: type
-    summary: str
-    needs_start: bool
-    uses_depth: bool = True
-    presets: Mapping[str, Any] = field(default_factory=dict)
+    solve: Callable[[Problem, Any, int], Localization]
+    """Returns the pose for a problem, by settings of ``config_type``; all random choices are drawn from the seed."""
+    config_type: type  # a frozen dataclass of settings, with a default for every field
+    needs_start: bool  # whether it needs a guess at the pose
+    uses_depth: bool = True  # whether it uses measured depth
+    presets: Mapping[str, Any] = field(default_factory=dict)  # other settings than the defaults, by name
+    uses_landmarks: bool = False  # whether the map's landmarks are prepared for it, as ``Problem.matcher``
+    matches_landmarks: Callable[[Any], bool] = _always  # whether it matches images with them, by its settings
+    depth_sensor: Callable[[Any], str] = _unknown_sensor  # the name of the sensor that measured the depth
+    by_colour: Callable[[Any], ByColourConfig] = _usual_colour  # how a tracker refines poses by colour alone
+    summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:
         """Return the default settings or those of a preset. Raises ``InputError`` for an unknown one."""
@@ -39,54 +53,58 @@ class Method:
             return self.config_type()
         if preset not in self.presets:
             offered = ", ".join(self.presets) or "none"
-            others = "" if self.presets else "; 'bid' and 'inerf' have presets"
-            raise InputError(f"preset {preset!r} is unknown, this method offers {offered}{others}")
+            raise InputError(f"preset {preset!r} is unknown, this method offers {offered}")
         return self.presets[preset]
 
 
-METHODS = {
-    "auto": Method(
-        auto,
-        AutoConfig,
-        "landmarks, then search on the baked surface by depth or colour; no start needed",
-        False,
-    ),
-    "bid": Method(
-        bid, BidConfig, "Adam on colour and depth at the coarse level (BID-NeRF)", True, presets=BID_PRESETS
-    ),
-    "inerf": Method(
-        inerf,
-        InerfConfig,
-        "Adam on the colours of one image in full detail (iNeRF)",
-        True,
-        False,
-        INERF_PRESETS,
-    ),
-    "bid-lm": Method(
-        bid_lm, BidLmConfig, "second-order steps on colour and depth, from coarse to fine", True
-    ),
-    "inerf-lm": Method(
-        inerf_lm, InerfLmConfig, "second-order steps on colour alone, from coarse to fine", True, False
-    ),
-}
+def _defects(method: Any) -> Iterator[str]:
+    if not isinstance(method, Method):
+        yield f"it is a {type(method).__name__}, expected a bidnerf_core.localization.Method"
+        return
+    yield from interface_defects(method, ("summary", "config_type"), {"solve": ("problem", "config", "seed")})
+
+
+METHODS: Plugins[Method] = Plugins("methods", _defects, first=("auto", "bid", "inerf", "bid-lm", "inerf-lm"))
+"""The methods by name."""
+USUAL_METHOD = "auto"
+"""The method that is used where none is named."""
 
 RENAMED = {"play": "surface_sigma"}
 """Current names of renamed settings, by the names under which earlier versions stored them."""
 
 
 def find_method(name: str) -> Method:
-    """Return a method by name. Raises ``InputError`` for an unknown one."""
-    chosen = METHODS.get(name)
-    if chosen is None:
-        raise InputError(f"method {name!r} is unknown, expected one of {', '.join(sorted(METHODS))}")
-    return chosen
+    """Return a method by name. Raises ``PluginError``, an ``InputError``, for an unknown name and a broken plugin."""
+    return METHODS.load(name)
 
 
 def require_use_of_depth(method: str) -> None:
     """Raise ``InputError`` for a method that would ignore depth points, which were given on purpose."""
     if not find_method(method).uses_depth:
-        others = " or ".join(name for name, other in METHODS.items() if other.uses_depth)
+        others = _names_of(lambda other: other.uses_depth)
         raise InputError(f"method {method!r} uses colour alone, got depth points; take method {others}")
+
+
+def require_start(method: str, given: bool) -> None:
+    """Raise ``InputError`` for a method that needs a start where none is given."""
+    if find_method(method).needs_start and not given:
+        others = _names_of(lambda other: not other.needs_start)
+        raise InputError(f"method {method!r} needs a start; give one by --start, or take method {others}")
+
+
+def _names_of(wanted: Callable[[Method], bool]) -> str:
+    """Return the names of the methods that have a property, leaving out those that cannot be loaded."""
+    found = []
+    for name in METHODS:
+        with contextlib.suppress(PluginError):
+            found += [name] if wanted(METHODS[name]) else []
+    return " or ".join(map(repr, found)) or "(none has that)"
+
+
+def matches_landmarks(method: str, config: Any) -> bool:
+    """Return whether a method, with these settings, matches images with a map's landmarks."""
+    chosen = find_method(method)
+    return chosen.uses_landmarks and chosen.matches_landmarks(config)
 
 
 def settings_of(method: str, values: dict[str, Any], where: str = "config", preset: str | None = None) -> Any:

@@ -19,6 +19,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.landmarks import LandmarkMap
 
 _Item = TypeVar("_Item")
 _Map = TypeVar("_Map", bound="SceneMap")
@@ -26,7 +27,7 @@ _Map = TypeVar("_Map", bound="SceneMap")
 
 @runtime_checkable
 class SceneMap(Protocol):
-    """The parts of a map that localization uses; ``bidnerf_core.Map`` has them."""
+    """The parts of a map that localization uses, some of which may be absent; ``bidnerf_core.Map`` is one."""
 
     @property
     def field(self) -> RadianceField: ...
@@ -35,7 +36,24 @@ class SceneMap(Protocol):
     def bounds(self) -> SceneBounds: ...
 
     @property
-    def surface(self) -> SurfaceMap | None: ...
+    def surface(self) -> SurfaceMap | None:
+        """The baked surface; None where there is none."""
+        ...
+
+    @property
+    def landmarks(self) -> LandmarkMap | None:
+        """The landmarks; None where there are none."""
+        ...
+
+    @property
+    def colour_noise(self) -> float | None:
+        """Root mean square difference of the field's colours from its own training images; None where unknown."""
+        ...
+
+    @property
+    def has_distances(self) -> bool:
+        """Whether the map's images determine distances; images from one place do not."""
+        ...
 
 
 def on_device(scene: _Map, device: torch.device | str) -> _Map:
@@ -48,7 +66,7 @@ def on_device(scene: _Map, device: torch.device | str) -> _Map:
         raise InputError(
             f"device {device}: the map's field is a {type(field).__name__}, expected an nn.Module"
         )
-    parts = {name: getattr(scene, name, None) for name in ("field", "surface", "landmarks")}
+    parts = {"field": field, "surface": scene.surface, "landmarks": scene.landmarks}
     there = moved(parts, working_device(device))
     if there is parts:
         return scene
@@ -88,7 +106,7 @@ class Problem:
     def start_for(self, method: str) -> SE3:
         """Return the start. Raises ``InputError``, which names ``method``, if there is none."""
         if self.start is None:
-            raise InputError(f"method {method!r} needs a start; give one, or take method 'auto'")
+            raise InputError(f"method {method!r} needs a start; give one, or take a method that needs none")
         return self.start
 
     @property
@@ -149,8 +167,9 @@ def rig(
         View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views
     )
     start = None if start is None else start.to("cpu", torch.float64)
-    noise = getattr(scene, "colour_noise", None)
-    return Problem(scene.field, scene.bounds, relative, start, depth_rays, scene.surface, matcher, noise)
+    return Problem(
+        scene.field, scene.bounds, relative, start, depth_rays, scene.surface, matcher, scene.colour_noise
+    )
 
 
 def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> tuple[_Item, ...]:

@@ -9,10 +9,11 @@ from typing import Any
 
 import torch
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
+from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.tracking.answers import (
     METHOD,
@@ -43,7 +44,6 @@ from bidnerf_core.localization.tracking.relocalization import (
     scene_extent,
     search_due,
     typical_error,
-    uses_landmarks,
 )
 from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
@@ -72,12 +72,12 @@ class Tracker:
     ) -> None:
         """Track in the map of ``localizer``, which must have distances. ``start``: a guess at the first T_world_camera."""
         config = TrackerConfig() if config is None else config
-        self.localizer, self.config = localizer, config
+        self.localizer, self.config = _checked_localizer(localizer), config
         self._state = TrackerState(Clock(None, config.frame_seconds))
         self._start = None if start is None else start_pose(start)
         scene = map_with_distances(localizer)
         self._by_landmarks: ByLandmarks | None = None
-        if uses_landmarks(localizer) and localizer.matcher is not None:
+        if localizer.matches_landmarks and localizer.matcher is not None:
             detector = LandmarkDetector(localizer.matcher.landmarks, Sift(count=config.keypoints))
             self._by_landmarks = ByLandmarks(scene, detector, config, localizer.depth_sensor)
         self._odometry = Odometry(config.points, localizer.depth_sensor.noise)
@@ -211,7 +211,7 @@ class Tracker:
         if self._by_landmarks is not None and image is not None:
             known = points[points.landmark != FRESH]
             return self._by_landmarks(frame, image, state, known, predicted)
-        surface, config = self.localizer.map.surface, self.localizer.config
+        surface = self.localizer.map.surface
         if image is not None:
             state = replace(state, points=points)
         if surface is not None and has_points(frame):
@@ -219,8 +219,7 @@ class Tracker:
         elif image is None:
             return None
         else:
-            colour = config.by_colour if isinstance(config, AutoConfig) else AutoConfig().by_colour
-            found = by_colour(self.localizer.map, frame, state, predicted, colour)
+            found = by_colour(self.localizer.map, frame, state, predicted, self.localizer.by_colour)
         covariance = predicted.corrected(found.pose).covariance
         return replace(found, verdict=determined(found.verdict, covariance, self._extent))
 
@@ -298,3 +297,10 @@ class Tracker:
     def _key(self) -> str:
         info: Any = getattr(self.localizer.map, "info", None)
         return "" if info is None else str(info.weights)
+
+
+def _checked_localizer(given: object) -> Localizer:
+    if isinstance(given, Localizer):
+        return given
+    hint = "; Localizer(map) makes one" if isinstance(given, SceneMap) else ""
+    raise InputError(f"Tracker: got a {type(given).__name__}, expected a Localizer{hint}")

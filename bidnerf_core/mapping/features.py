@@ -77,6 +77,7 @@ class Sift(Settings):
 
 
 SIFT = Sift()
+"""SIFT (Lowe 2004) by OpenCV, with root normalisation."""
 
 
 def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:

@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from bidnerf_core.backend import Backend
+from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.io.json import from_plain
@@ -20,7 +20,6 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, MapInfo, load_info
 from bidnerf_core.maps.files import load_landmarks, load_surface
 from bidnerf_core.maps.weights import checked_weights
-from bidnerf_core.registry import load_backend
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from bidnerf_core.localization import Localization, Localizer, Outcome
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, LandmarkThresholds
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 from bidnerf_core.results.errors import PoseError, pose_error
-from bidnerf_core.results.pose_files import POSE_WRITERS, PosedImage, write_poses
+from bidnerf_core.results.pose_files import PosedImage, pose_format, write_poses
 
 log = logging.getLogger("bidnerf")
 
@@ -160,14 +160,6 @@ def plain_localization(found: Localization, backend: str, error: PoseError | Non
     return found.plain() | {"backend": backend, "error": None if error is None else error.plain()}
 
 
-def pose_format(path: Path) -> str:
-    """Return the ending that selects the format of a file of poses. Raises ``UsageError`` for a name without any of them."""
-    for ending in POSE_WRITERS:
-        if path.name.lower().endswith(ending):
-            return ending
-    raise UsageError(f"{path}: expected a name that ends with {', '.join(POSE_WRITERS)}")
-
-
 def question_about_scene(found: Collection[Localization]) -> str:
     """Return a question to append to a summary: empty unless there are several images and none was recognised."""
     if len(found) < SEVERAL or any(map(_shows_scene, found)):
@@ -240,7 +232,7 @@ def localize_each(
 
 def _log_depth_noise(query: Query, localizer: Localizer) -> None:
     """Compare the noise of a query's depth with that of the sensor that the settings name."""
-    frame, sensor = query.frame, getattr(localizer.config, "depth_sensor", "unknown")
+    frame, sensor = query.frame, localizer.depth_sensor_name
     if sensor != "unknown" and frame.depth is not None and frame.has_depth:
         remark = noise_remark(frame.depth, frame.intrinsics, sensor)
         if remark is not None:

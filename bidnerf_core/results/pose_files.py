@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -19,10 +19,11 @@ from bidnerf_core.camera.exif import read_exif
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.orientation import UPRIGHT, Orientation
 from bidnerf_core.datasets.writing import OPENCV_TO_OPENGL, camera_entry
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.io.files import read_file, write_file
 from bidnerf_core.io.json import parse_json
+from bidnerf_core.registry import Plugins, interface_defects
 
 TUM_HEAD = "# timestamp tx ty tz qx qy qz qw (camera to world, OpenCV axes)\n"
 EXPECTED_POSE = '{"T_world_camera": 4x4 rows}'
@@ -149,37 +150,45 @@ def _as_stored(image: PosedImage, orientation: Orientation) -> tuple[Intrinsics,
 
 
 def write_tum(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write ``tum_trajectory``, whole or not at all."""
+    """Write a TUM trajectory: rows of time, position and unit quaternion."""
     write_file(path, tum_trajectory(images).encode())
 
 
 def write_pose_json(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write ``poses_json``, whole or not at all."""
+    """Write JSON: a list of frames with poses and covariances."""
     write_file(path, poses_json(images).encode())
 
 
 def write_pose_transforms(path: Path, images: Sequence[PosedImage]) -> None:
-    """Write ``transforms_json``, whole or not at all."""
+    """Write a transforms.json as nerfstudio reads it: poses with OpenGL axes, and cameras."""
     write_file(path, transforms_json(images, path.parent).encode())
 
 
-POSE_WRITERS: dict[str, Callable[[Path, Sequence[PosedImage]], None]] = {
-    "transforms.json": write_pose_transforms,
-    ".json": write_pose_json,
-    ".txt": write_tum,
-    ".tum": write_tum,
-}
-"""Writers by the ending of the file's name; the first that matches is used."""
+def _defects(writer: Any) -> Iterator[str]:
+    yield from interface_defects(writer, (), {"__call__": ("path", "images")})
+
+
+PoseWriter: TypeAlias = Callable[[Path, Sequence[PosedImage]], None]
+"""A function that writes poses to a file, whole or not at all."""
+
+POSE_WRITERS: Plugins[PoseWriter] = Plugins(
+    "writers", _defects, first=("transforms.json", ".json", ".txt", ".tum")
+)
+"""Writers by the ending of the file's name; where several match, the longest ending is used."""
+
+
+def pose_format(path: Path) -> str:
+    """Return the ending that selects the format of a file of poses. Raises ``UsageError`` for a name without any of them."""
+    found = max((e for e in POSE_WRITERS if path.name.lower().endswith(e)), key=len, default=None)
+    if found is None:
+        raise UsageError(f"{path}: expected a name that ends with {', '.join(POSE_WRITERS)}")
+    return found
 
 
 def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
     """Write poses in the format that the ending of the file's name selects. Raises ``InputError`` for an unknown ending."""
     path = Path(path)
-    for ending, write in POSE_WRITERS.items():
-        if path.name.lower().endswith(ending):
-            write(path, images)
-            return
-    raise InputError(f"{path}: expected a name that ends with {', '.join(POSE_WRITERS)}")
+    POSE_WRITERS[pose_format(path)](path, images)
 
 
 def read_pose(path: str | Path) -> SE3:

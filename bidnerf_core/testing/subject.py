@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 import torch
 from torch import nn
 
+from bidnerf_core.backend import load_backend
 from bidnerf_core.fields.contract import RadianceField, levels
 from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.registry import load_backend
 from bidnerf_core.testing import recipes
 from bidnerf_core.testing.faults import calling, query, require_that
 from bidnerf_core.testing.scene import BOUNDS, points, rgbd_views

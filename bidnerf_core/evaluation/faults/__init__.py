@@ -1,6 +1,5 @@
 """Faults of sensors and scenes: named, seeded changes of an image that test whether a localizer rejects its wrong answers."""
 
-from bidnerf_core.evaluation.faults.catalogue import FAULTS, find_fault
 from bidnerf_core.evaluation.faults.composition import (
     NO_FAULT,
     AppliedFault,
@@ -9,7 +8,7 @@ from bidnerf_core.evaluation.faults.composition import (
     faulty,
     parse_faults,
 )
-from bidnerf_core.evaluation.faults.fault import Fault
+from bidnerf_core.evaluation.faults.fault import FAULTS, Fault, find_fault
 
 __all__ = [
     "FAULTS",

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults.catalogue import find_fault
+from bidnerf_core.evaluation.faults.fault import find_fault
 from bidnerf_core.frames.frame import View
 
 NO_FAULT = "none"

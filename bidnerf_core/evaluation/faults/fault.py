@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeAlias, cast
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +14,7 @@ from torch import Generator, Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.registry import Plugins
 from bidnerf_core.settings import Range
 
 Change: TypeAlias = Callable[[Frame, float, Generator], Frame]
@@ -38,7 +39,6 @@ SWITCH = WholeNumbers(0, 1)
 class Fault:
     """A kind of fault. Its random choices depend on the seed and the frame, not on the size, so sizes are comparable."""
 
-    summary: str
     unit: str  # of the size, in words
     allowed: Range
     neutral: float | None  # the size that leaves the frame as it is; None where no size does
@@ -47,11 +47,26 @@ class Fault:
     needs_depth: bool = False
     T_true_faulty: SE3 | None = None
     """Pose of the faulty camera in the true camera's frame, at any size but the neutral one; None where they coincide."""
+    summary: str = field(kw_only=True)
 
     @property
     def is_switch(self) -> bool:
         """Whether the fault is simply on (size 1) or off (size 0)."""
         return self.allowed is SWITCH
+
+
+def _defects(fault: Any) -> Iterator[str]:
+    if not isinstance(fault, Fault):
+        yield f"it is a {type(fault).__name__}, expected a bidnerf_core.evaluation.faults.Fault"
+
+
+FAULTS: Plugins[Fault] = Plugins("faults", _defects)
+"""All faults by name."""
+
+
+def find_fault(name: str) -> Fault:
+    """Return a fault by name. Raises ``PluginError``, an ``InputError``, for an unknown name and a broken plugin."""
+    return FAULTS.load(name)
 
 
 def depth_of(frame: Frame) -> Float[Tensor, "h w"]:

@@ -10,7 +10,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import is_blank
-from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
+from bidnerf_core.localization.auto_config import LEAST_POINTS
 from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.localizer import Localizer
@@ -32,7 +32,7 @@ def search_due(localizer: Localizer, frame: Frame, lost: int, patience: int, wai
     """
     if not is_searchable(frame):
         return False
-    if uses_landmarks(localizer):
+    if localizer.matches_landmarks:
         return lost <= patience or lost % 2 == 0 or waited >= LONG_WAIT
     return lost == 0 or _due(lost, 1)
 
@@ -46,7 +46,7 @@ def relocalized(
     intervals; it is the only one in maps without landmarks. ``lost`` is the number of frames since the last accepted pose
     that could be searched, 0 at the beginning of a sequence.
     """
-    if uses_landmarks(localizer):
+    if localizer.matches_landmarks:
         assert localizer.matcher is not None
         began = time.perf_counter()
         problem = rig(localizer.map, [View(frame, SE3.identity())], None, None, localizer.matcher)
@@ -64,12 +64,6 @@ def relocalized(
         if lost:  # the sequence has begun, so this frame is to blame and not the map or the settings
             return None
         raise
-
-
-def uses_landmarks(localizer: Localizer) -> bool:
-    """Return whether the map has landmarks and the method of the localizer makes use of them."""
-    config = localizer.config
-    return localizer.matcher is not None and isinstance(config, AutoConfig) and config.landmarks
 
 
 def typical_error(localizer: Localizer) -> float:

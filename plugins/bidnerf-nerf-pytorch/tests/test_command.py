@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from bidnerf_core.backend import load_backend
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.map import load_map
-from bidnerf_core.registry import load_backend
 from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, rgb_views
 from bidnerf_core.training import Silent
