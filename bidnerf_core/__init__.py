@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from bidnerf_core.localization import Tracker as Tracker
     from bidnerf_core.localization import TrackerConfig as TrackerConfig
     from bidnerf_core.localization import settings_of as settings_of
+    from bidnerf_core.localization.corrector import Corrector as Corrector
     from bidnerf_core.maps.map import Map as Map
     from bidnerf_core.maps.map import load_map as load_map
     from bidnerf_core.progress import Progress as Progress
@@ -70,6 +71,7 @@ if TYPE_CHECKING:
 HOMES = {
     "AutoConfig": "localization",
     "Cancelled": "errors",
+    "Corrector": "localization.corrector",
     "Dataset": "datasets",
     "FieldValues": "fields.contract",
     "Frame": "frames.frame",

@@ -1,0 +1,110 @@
+"""``Corrector``: localizes in a thread of its own, behind a loop at the rate of a camera, and corrects its odometry."""
+
+from __future__ import annotations
+
+import threading
+from types import TracebackType
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.localizer import Localizer
+from bidnerf_core.localization.result import Localization
+
+
+class Corrector:
+    """Localizes frames in a background thread, and keeps ``T_world_odom``, which corrects the drift of an odometry.
+
+    A loop hands over frames with ``give``, which never waits: a localization takes longer than a frame, so a frame is dropped if
+    another one waits already. Each accepted answer replaces the correction, which belongs to the odometry of the frame that was
+    localized, so that it may arrive late. From then on, localizations start from the corrected odometry. An error of the
+    localizer is raised by the next ``give`` or ``close``, once; the thread goes on with the frames after it. All methods may be
+    called from any thread. Use it as a context manager, or call ``close``.
+    """
+
+    def __init__(self, localizer: Localizer) -> None:
+        """Start the thread."""
+        self._localizer = localizer
+        self._changed = threading.Condition()
+        self._waiting: tuple[Frame, SE3] | None = None
+        self._closed = False
+        self._error: BaseException | None = None
+        self._found: Localization | None = None
+        self._T_world_odom: SE3 | None = None
+        self._thread = threading.Thread(target=self._run, name="bidnerf-corrector", daemon=True)
+        self._thread.start()
+
+    @property
+    def T_world_odom(self) -> SE3 | None:
+        """The correction by the last accepted answer; None until there is one."""
+        return self._T_world_odom
+
+    @property
+    def found(self) -> Localization | None:
+        """The last answer, accepted or not; None until there is one."""
+        return self._found
+
+    def corrected(self, T_odom_camera: SE3) -> SE3 | None:
+        """Return T_world_camera of a pose in the odometry's frame; None until an answer was accepted."""
+        T_world_odom = self._T_world_odom
+        return None if T_world_odom is None else T_world_odom @ T_odom_camera
+
+    def give(self, frame: Frame, T_odom_camera: SE3) -> bool:
+        """Hand over a frame and its pose by odometry; return False if it was dropped, since another one waits already.
+
+        Raises the error of an earlier frame's localization, and ``InputError`` after ``close``.
+        """
+        with self._changed:
+            self._raise_error()
+            if self._closed:
+                raise InputError("the corrector is closed, expected no more frames")
+            if self._waiting is not None:
+                return False
+            self._waiting = frame, T_odom_camera
+            self._changed.notify_all()
+            return True
+
+    def close(self) -> None:
+        """End the thread after the localization at work, whose answer still counts; a frame that waits is dropped.
+
+        Raises the error of a localization that was not raised yet.
+        """
+        with self._changed:
+            self._closed, self._waiting = True, None
+            self._changed.notify_all()
+        self._thread.join()
+        with self._changed:
+            self._raise_error()
+
+    def __enter__(self) -> Corrector:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _raise_error(self) -> None:
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _run(self) -> None:
+        while (taken := self._next()) is not None:
+            frame, T_odom_camera = taken
+            try:
+                found = self._localizer(frame, start=self.corrected(T_odom_camera))
+            except BaseException as error:  # for the caller, whose thread is another one
+                with self._changed:
+                    self._error = error
+                continue
+            self._found = found
+            if found.converged:
+                self._T_world_odom = found.T_world_camera @ T_odom_camera.inverse()
+
+    def _next(self) -> tuple[Frame, SE3] | None:
+        """Wait for a frame; return None once the corrector is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._waiting is not None)
+            taken, self._waiting = self._waiting, None
+            return taken
