@@ -623,7 +623,7 @@ def test_damaged_files(nerfstudio: Callable[..., Path], what: str, how: str) -> 
     assert text.startswith(f"{folder / what}: not readable as an image (")
     assert "BufferedReader" not in text
     assert ("the file is empty" in text) == (how == "empty")
-    assert ("no known image format" in text) == (how == "text")
+    assert ("none of the formats PNG" in text) == (how == "text")
 
 
 def test_damaged_jpeg_and_array(nerfstudio: Callable[..., Path]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 import tracemalloc
@@ -12,13 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, features
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.io import files
 from bidnerf_core.io.images import (
+    IMAGE_SUFFIXES,
     LARGEST_IMAGE,
     ImageHeader,
+    decode,
     open_image,
     over,
     pixel_array,
@@ -136,6 +139,75 @@ def test_heic_without_its_package_names_the_package(tmp_path: Path, monkeypatch:
     monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
     with pytest.raises(InputError, match=r"IMG_1\.HEIC: reading HEIC needs the package pillow-heif \(pip"):
         read_image(tmp_path / "IMG_1.HEIC")
+
+
+FOREIGN = {
+    "eps": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\n{} loop\n",
+    "psd": b"8BPS\x00\x01" + bytes(6) + struct.pack(">HIIHH", 3, 8, 8, 8, 3) + bytes(40),
+    "icns": b"icns" + struct.pack(">I", 16) + b"ic07" + struct.pack(">I", 8),
+}
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".eps", ".tif"])
+def test_only_formats_of_images_are_decoded_and_no_program_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    """EPS is drawn by a program; whatever a file is called, its content is not given to one."""
+    started = tmp_path / "started"
+    for name in ("gs", "gswin32c", "gswin64c"):
+        (tmp_path / name).write_text(f"#!/bin/sh\ntouch {started}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    for kind, content in FOREIGN.items():
+        path = tmp_path / f"{kind}{suffix}"
+        path.write_bytes(content)
+        for read in (read_image, read_header, decode):
+            with pytest.raises(InputError, match="is of none of the formats PNG, JPEG, TIFF"):
+                read(path)
+    assert not started.exists()
+
+
+def test_the_formats_that_photos_have_are_decoded(tmp_path: Path) -> None:
+    for suffix in (*IMAGE_SUFFIXES, ".gif", *([".avif"] if features.check("avif") else [])):
+        path = tmp_path / f"a{suffix}"
+        Image.fromarray(noise(16, 24)).convert("L" if suffix == ".pgm" else "RGB").save(path)
+        assert read_image(path)[0].shape == (16, 24, 3)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA"])
+def test_strips_give_what_the_whole_image_gives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    path = tmp_path / "a.png"
+    image = Image.fromarray(noise(50, 41, 4))
+    (image.convert("RGB").quantize(16) if mode == "P" else image.convert(mode)).save(path)
+    background = (0.2, 0.5, 0.9)
+    whole = [
+        read_image(path, background),
+        read_image(path, background, (13, 16)),
+        (torch.tensor(decode(path)),),
+    ]
+    monkeypatch.setattr("bidnerf_core.io.images.STRIP", 41 * 7)
+    strips = [
+        read_image(path, background),
+        read_image(path, background, (13, 16)),
+        (torch.tensor(decode(path)),),
+    ]
+    for before, after in zip(itertools.chain(*whole), itertools.chain(*strips), strict=True):
+        assert (before is None) == (after is None)
+        if before is not None and after is not None:
+            assert before.equal(after)
+    small, large = whole[1][0], whole[0][0]
+    torch.testing.assert_close(small, reduced(large, 13, 16))
+
+
+def test_a_large_image_that_is_reduced_takes_little_memory(tmp_path: Path) -> None:
+    path = empty_png(tmp_path / "large.png", 6000, 6000)
+    tracemalloc.start()
+    rgb, _ = read_image(path, size=(64, 64))
+    assert rgb.shape == (64, 64, 3)
+    assert tracemalloc.get_traced_memory()[1] < 60e6  # 432 MB as floats
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])

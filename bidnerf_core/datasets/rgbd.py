@@ -11,7 +11,7 @@ from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
-from bidnerf_core.io.images import over, read_header, read_image
+from bidnerf_core.io.images import read_header, read_image
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,15 @@ def read_rgbd(
     """
     header = read_header(image)
     camera = camera_of(header.width, header.height)
-    colour, alpha = read_image(image)
+    rgb, alpha = read_image(image, background)
     metres = None
     if depth is not None:
         metres = depth.read(depth.path, depth.unit).metres
         if depth.sensor is not None:
             metres = depth.sensor.registered(metres, camera, depth.path)
-        elif metres.shape != colour.shape[:2]:
+        elif metres.shape != rgb.shape[:2]:
             raise InputError(
                 f"{depth.path}: depth is {metres.shape[1]}x{metres.shape[0]}, expected {header.width}x{header.height} as its"
                 f" image {image.name}, to which it is registered"
             )
-    return Frame(name, over(colour, alpha, background), camera, metres, alpha)
+    return Frame(name, rgb, camera, metres, alpha)

@@ -20,10 +20,8 @@ from bidnerf_core.io.images import (
     IMAGE_SUFFIXES,
     Background,
     background_colour,
-    over,
     read_header,
     read_image,
-    reduced,
     resampled,
 )
 
@@ -62,10 +60,9 @@ def read_photo(
     found = camera.find(path, raster, exif)
     measured = None if depth is None else read_depth_image(depth, depth_unit)
     found, size = _limited(found, largest)
-    colour, alpha = read_image(path)
-    rgb = _sized(exif.orientation.upright(over(colour, alpha, colour_behind)), size)
-    if alpha is not None:
-        alpha = _sized(exif.orientation.upright(alpha), size)
+    rgb, alpha = read_image(path, colour_behind, exif.orientation.upright_size(*size))
+    rgb = exif.orientation.upright(rgb)
+    alpha = None if alpha is None else exif.orientation.upright(alpha)
     if measured is None or depth is None:
         return Photo(rgb, alpha, found, None, None)
     fitted = (
@@ -136,7 +133,3 @@ def _limited(source: FoundCamera, largest: int | None) -> tuple[FoundCamera, tup
         return source, (camera.width, camera.height)
     camera = camera.scaled(largest / longer)
     return replace(source, intrinsics=camera), (camera.width, camera.height)
-
-
-def _sized(image: Float[Tensor, "h w *c"], size: tuple[int, int]) -> Float[Tensor, "nh nw *c"]:
-    return image if tuple(image.shape[:2]) == size[::-1] else reduced(image, *size)

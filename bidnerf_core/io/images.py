@@ -8,6 +8,7 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
@@ -15,7 +16,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Shaped
 from PIL import Image, UnidentifiedImageError
-from scipy.sparse import csr_array
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
@@ -26,6 +26,10 @@ Background: TypeAlias = str | Sequence[float]
 
 LARGEST_IMAGE = 100_000_000
 """Pixels. A small file can describe an image of any size, so the size is checked before memory is allocated."""
+STRIP = 2**21
+"""Pixels that are converted at a time: a conversion takes many times as much memory as the bytes of the image."""
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "AVIF", "HEIF")
+"""The formats that are decoded, whatever a file's name. Pillow knows more, and reads EPS by starting another program."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -51,13 +55,32 @@ def read_header(path: Path) -> ImageHeader:
         return ImageHeader(image.width, image.height, has_alpha)
 
 
-def read_image(path: Path) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
-    """Read straight (not premultiplied) colour in [0, 1], and alpha where there is such a channel.
+def read_image(
+    path: Path, background: Sequence[float] = (0.0, 0.0, 0.0), size: tuple[int, int] | None = None
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
+    """Read colour in [0, 1] over ``background``, and alpha where there is such a channel.
 
-    Grey becomes three channels. The raster is the stored one, whatever the EXIF orientation. Raises ``InputError`` where
-    the file is not a complete image of 1 to 4 channels of 8 bits (or 16 bits of grey), or is too large.
+    Grey becomes three channels. The raster is the stored one, whatever the EXIF orientation, reduced to ``size`` (width,
+    height) as ``reduced`` does: the image is read in strips, so that no more than its bytes and the result are in memory.
+    Raises ``InputError`` where the file is not a complete image of 1 to 4 channels of 8 bits (or 16 bits of grey), or is too
+    large.
     """
-    return channels(decode(path), f"{path}: image decodes to")
+    rgb, alpha = None, None
+    with open_image(path) as image:
+        height, width = image.height, image.width if size is None else size[0]
+        for top, strip in _strips(path, image):
+            colour, cover = channels(strip, f"{path}: image decodes to")
+            laid = over(colour, cover, background)
+            if width != image.width:
+                laid = reduced(laid, width, len(strip))
+                cover = None if cover is None else reduced(cover, width, len(strip))
+            rgb = _placed(rgb, laid.numpy(), top, height)
+            alpha = None if cover is None else _placed(alpha, cover.numpy(), top, height)
+    assert rgb is not None  # no image is without rows
+    found, mask = torch.from_numpy(rgb), None if alpha is None else torch.from_numpy(alpha)
+    if size is None or size[1] == height:
+        return found, mask
+    return reduced(found, *size), None if mask is None else reduced(mask, *size)
 
 
 def channels(raw: np.ndarray, finding: str) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"] | None]:
@@ -152,18 +175,10 @@ def background_colour(background: Background) -> tuple[float, float, float]:
 
 def reduced(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "nh nw *c"]:
     """Reduce an image to a smaller size; each new pixel is the mean over the area that it covers."""
-    rows = _area_weights(image.shape[0], height) @ image.reshape(image.shape[0], -1).numpy()
-    columns = rows.reshape(height, image.shape[1], -1).swapaxes(0, 1).reshape(image.shape[1], -1)
-    small = (_area_weights(image.shape[1], width) @ columns).reshape(width, height, *image.shape[2:])
-    return torch.from_numpy(small.swapaxes(0, 1).copy())
+    import cv2  # here, as most images keep their size
 
-
-def _area_weights(old: int, new: int) -> csr_array:
-    """Return a matrix (new, old): the share of each new pixel, along an axis, that lies in each old one."""
-    edges = np.union1d(np.arange(old + 1), np.linspace(0, old, new + 1))
-    middles, lengths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-    places = ((middles * new / old).astype(int), middles.astype(int))
-    return csr_array(((lengths * new / old).astype(np.float32), places), shape=(new, old))
+    small = cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(small.reshape(height, width, *image.shape[2:]))
 
 
 def resampled(image: Shaped[Tensor, "h w"], width: int, height: int) -> Shaped[Tensor, "nh nw"]:
@@ -178,14 +193,37 @@ def decode(path: Path) -> np.ndarray:
 
     Raises ``InputError`` where the file is not a whole image, and for colour spaces other than grey and RGB.
     """
+    pixels = None
     with open_image(path) as image:
-        if image.mode in OTHER_COLOURS:
-            raise InputError(f"{path}: image is {image.mode}, expected grey, RGB or RGBA")
-        if image.mode in ("P", "PA"):
-            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        pixels = np.array(image)
+        for top, strip in _strips(path, image):
+            pixels = _placed(pixels, strip, top, image.height)
+    assert pixels is not None  # no image is without rows
+    return pixels
+
+
+def _strips(path: Path, image: Image.Image) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the first row and the pixels of one strip of an open image after another, from top to bottom."""
+    if image.mode in OTHER_COLOURS:
+        raise InputError(f"{path}: image is {image.mode}, expected grey, RGB or RGBA")
+    rows = max(1, STRIP // image.width)
+    for top in range(0, image.height, rows):
+        last = min(top + rows, image.height)
+        strip = image if rows >= image.height else image.crop((0, top, image.width, last))
+        if strip.mode in ("P", "PA"):
+            strip = strip.convert("RGBA" if image.has_transparency_data else "RGB")
+        pixels = np.array(strip)
         sixteen_bits = image.format == "PNG" and pixels.dtype == np.int32  # Pillow before 11.3
-        return pixels.astype(np.uint16) if sixteen_bits else pixels
+        yield top, pixels.astype(np.uint16) if sixteen_bits else pixels
+
+
+def _placed(whole: np.ndarray | None, strip: np.ndarray, top: int, height: int) -> np.ndarray:
+    """Write a strip from row ``top`` on into an array of ``height`` rows, which is made for the first strip."""
+    if len(strip) == height:
+        return strip
+    if whole is None:
+        whole = np.empty((height, *strip.shape[1:]), strip.dtype)
+    whole[top : top + len(strip)] = strip
+    return whole
 
 
 @contextlib.contextmanager
@@ -200,7 +238,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     with open_binary(path, "an image file") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's warnings about large images, odd EXIF, palettes
         try:
-            with Image.open(file) as image:
+            with Image.open(file, formats=_formats()) as image:
                 _check_pixels(path, image.width, image.height)
                 yield image
         except InputError:
@@ -213,11 +251,20 @@ def open_image(path: Path) -> Iterator[Image.Image]:
             ) from error
 
 
+def _formats() -> list[str]:
+    """Return those of ``FORMATS`` that this installation of Pillow reads; each is registered by a module of its own."""
+    Image.preinit()
+    for module in ("AvifImagePlugin", "TiffImagePlugin", "WebPImagePlugin"):
+        with contextlib.suppress(ImportError):
+            import_module(f"PIL.{module}")
+    return [name for name in FORMATS if name in Image.OPEN]
+
+
 def _why_unreadable(file: BinaryIO, error: Exception) -> str:
     if os.fstat(file.fileno()).st_size == 0:
         return "the file is empty"
     if isinstance(error, UnidentifiedImageError):  # its text has the repr of the open file
-        return "its content is of no known image format"
+        return f"its content is of none of the formats {', '.join(FORMATS)}"
     return reason(error)
 
 
