@@ -289,7 +289,7 @@ def far(positions: Tensor) -> Tensor:
     ("backend", "said"),
     [
         (changed(density=lambda d, p: d - 5), "expected 0 or more"),
-        (changed(rgb=lambda c, p: 1.5 * c), "expected 0 to 1"),
+        (changed(rgb=lambda c, p: 4 * c), "expected 0 to 1"),
         (changed(rgb=lambda c, p: c - 0.5), "expected 0 to 1"),
         (changed(density=lambda d, p: torch.where(far(p), torch.nan, d)), "far outside the box: density is NaN"),
         (changed(rgb=lambda c, p: c.where(~far(p)[..., None], c / 0)), "far outside the box: rgb is NaN"),

@@ -24,7 +24,8 @@ BOUNDS = demo_object().bounds
 SIDE = max(BOUNDS.size)  # metres
 DIMMED = 0.6
 """Brightness of the views of ``exposed_views`` and of the background behind them, so that no exposure saturates."""
-DIMMED_BOUNDS = replace(BOUNDS, background=tuple(DIMMED * part for part in BOUNDS.background))
+_R, _G, _B = BOUNDS.background
+DIMMED_BOUNDS = replace(BOUNDS, background=(DIMMED * _R, DIMMED * _G, DIMMED * _B))
 
 
 @cache
