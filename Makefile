@@ -47,7 +47,7 @@ format: $(VENV)/.installed-dev ## put the code into shape
 	@$(BIN)/ruff format
 
 docs: $(VENV)/.installed-docs ## the documentation as a web site, in site/
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet && echo "open site/index.html"
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict && echo "open site/index.html"
 
 clean: ## remove what these targets made
 	rm -rf $(VENV) $(DEMO_OUT) site build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks

@@ -1,6 +1,7 @@
-"""MkDocs hook: tables of settings, made from the dataclasses, so that the documentation cannot contradict the code.
+"""MkDocs hook: what the documentation takes from the code and the README, so that it cannot contradict them.
 
-A line ``<!-- settings of METHOD -->`` in a page becomes the table of that method's settings.
+The first page of the site is the README. In a page, ``<!-- settings of METHOD -->`` becomes the table of that method's settings,
+and ``<!-- names of bidnerf_core -->`` the reference of all names that can be imported from ``bidnerf_core`` itself.
 """
 
 from __future__ import annotations
@@ -14,18 +15,53 @@ import re
 import textwrap
 import tokenize
 import typing
+from pathlib import Path
 from typing import Any
 
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+import bidnerf_core
 from bidnerf_core.localization import METHODS
 from bidnerf_core.settings import Above, OneOf, Range, is_expert
 
-MARKER = re.compile(r"^<!-- settings of ([a-z-]+) -->$", re.MULTILINE)
+SETTINGS = re.compile(r"^<!-- settings of ([a-z-]+) -->$", re.MULTILINE)
+NAMES = "<!-- names of bidnerf_core -->"
 HEAD = "| setting | default | values | meaning |\n| --- | --- | --- | --- |\n"
+README = Path(__file__).parents[1] / "README.md"
+LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)([^)]+)\)")
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add the README as the first page."""
+    files.append(File.generated(config, "index.md", content=index_page(README.read_text(encoding="utf-8"))))
+    return files
+
+
+def index_page(readme: str) -> str:
+    """Return the README as a page of the site; links to files that are not in the site lose their target."""
+
+    def link(found: re.Match[str]) -> str:
+        text, target = found.groups()
+        return f"[{text}]({target.removeprefix('docs/')})" if target.startswith("docs/") else text
+
+    return LINK.sub(link, readme)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace each marker by its table."""
-    return MARKER.sub(lambda found: settings_table(found[1]), markdown)
+    """Replace the markers of a page."""
+    return SETTINGS.sub(lambda found: settings_table(found[1]), markdown).replace(NAMES, public_names())
+
+
+def public_names() -> str:
+    """Return the directives that document the public names, under the package that defines them."""
+    by_package: dict[str, list[str]] = {}
+    for name, module in bidnerf_core.HOMES.items():
+        by_package.setdefault(module.partition(".")[0], []).append(f"::: bidnerf_core.{module}.{name}\n")
+    return "\n".join(
+        f"### {package.capitalize()}\n\n" + "\n".join(directives)
+        for package, directives in sorted(by_package.items())
+    )
 
 
 def settings_table(method: str) -> str:
