@@ -35,12 +35,12 @@ from scipy.stats import chi2
 from bidnerf_core import Localization, Localizer, Map, load_map
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.bench import local_processes
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults, faulty, find_fault, parse_faults
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trial import views_digest
 from bidnerf_core.evaluation.trials import parse_settings
+from bidnerf_core.evaluation.workers import local_processes
 from bidnerf_core.frames.frame import View
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import normalized_error_squared, pose_error, success_rate

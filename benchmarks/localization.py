@@ -25,12 +25,13 @@ from typing import Any
 import torch
 from scipy.stats import chi2
 
-from bidnerf_core.evaluation.bench import Plan, left_to_do, local_processes, planned, run_trials
+from bidnerf_core.evaluation.bench import Plan, left_to_do, planned, run_trials
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.summary import median, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import opened
+from bidnerf_core.evaluation.workers import local_processes
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import normalized_error_squared, success_rate

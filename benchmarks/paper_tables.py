@@ -33,7 +33,6 @@ from bidnerf_core.evaluation.bench import (
     Plan,
     changed_settings,
     left_to_do,
-    local_processes,
     planned,
     run_trials,
 )
@@ -43,6 +42,7 @@ from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.summary import pairwise_tests, summarize
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trials import opened
+from bidnerf_core.evaluation.workers import local_processes
 from bidnerf_core.localization import METHODS
 
 RESULTS = Path(__file__).parent / "results"
@@ -145,8 +145,8 @@ def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float |
         todo = left_to_do(trials, file)
         if todo and minutes != 0:
             note_run(path, provenance(script_command(), f"{workers} local processes of one thread"))
-            with local_processes(workers) as pool, TrialProgress(len(todo), workers) as progress:
-                run_trials(todo, file, pool, workers, progress.done, lambda: progress.stopping or late())
+            with local_processes(workers) as pool, TrialProgress() as progress:
+                run_trials(todo, file, pool, workers, progress, lambda: progress.stopping or late())
         left = len(left_to_do(trials, file))
         if left == len(trials) or (left and minutes is None):
             raise SystemExit(f"stopped; {path} is kept, the same command goes on")

@@ -30,7 +30,11 @@ if TYPE_CHECKING:
     from bidnerf_core.errors import Cancelled as Cancelled
     from bidnerf_core.errors import InputError as InputError
     from bidnerf_core.errors import InputWarning as InputWarning
+    from bidnerf_core.evaluation.comparison import Comparison as Comparison
+    from bidnerf_core.evaluation.evaluate import compare as compare
+    from bidnerf_core.evaluation.evaluate import evaluate as evaluate
     from bidnerf_core.evaluation.protocols import perturb as perturb
+    from bidnerf_core.evaluation.results import ResultTable as ResultTable
     from bidnerf_core.fields.contract import FieldValues as FieldValues
     from bidnerf_core.fields.contract import RadianceField as RadianceField
     from bidnerf_core.fields.contract import Rays as Rays
@@ -71,6 +75,7 @@ if TYPE_CHECKING:
 HOMES = {
     "AutoConfig": "localization",
     "Cancelled": "errors",
+    "Comparison": "evaluation.comparison",
     "Corrector": "localization.corrector",
     "Dataset": "datasets",
     "FieldValues": "fields.contract",
@@ -92,12 +97,15 @@ HOMES = {
     "RaySampler": "fields.contract",
     "RaySamples": "fields.contract",
     "Rays": "fields.contract",
+    "ResultTable": "evaluation.results",
     "SE3": "geometry.se3",
     "SceneBounds": "fields.contract",
     "TrackedPath": "results.tracked_path",
     "Tracker": "localization",
     "TrackerConfig": "localization",
     "View": "frames.frame",
+    "compare": "evaluation.evaluate",
+    "evaluate": "evaluation.evaluate",
     "levels": "fields.contract",
     "list_plugins": "registry",
     "load_backend": "backend",

@@ -53,6 +53,16 @@ class Above(Range):
         return least if self.most == math.inf else f"{least}, at most {_written(self.most)}"
 
 
+class WholeNumbers(Range):
+    """The whole numbers from ``least`` to ``most``."""
+
+    def __contains__(self, value: object) -> bool:
+        return super().__contains__(value) and float(cast(float, value)).is_integer()
+
+    def __str__(self) -> str:
+        return f"a whole number, {super().__str__()}"
+
+
 def _written(limit: float) -> str:
     """Return a limit as messages show it, the same for 1 and 1.0: ``Annotated`` does not distinguish equal ranges."""
     return f"{int(limit) if float(limit).is_integer() else limit:,}"

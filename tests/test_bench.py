@@ -20,13 +20,15 @@ import torch
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.bench import InThisProcess, Plan, planned, run_trials, shard_of
-from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation.bench import Plan, planned, run_trials, shard_of
+from bidnerf_core.evaluation.json_lines import RowStore, as_line
 from bidnerf_core.evaluation.provenance import read_runs, write_record
-from bidnerf_core.evaluation.results import ResultsFile, read_results, result_line
+from bidnerf_core.evaluation.results import ResultsFile, ResultTable, read_results
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import run_trial
+from bidnerf_core.evaluation.workers import InThisProcess
 from bidnerf_core.geometry.arcs import arc, mean_up, seen_middle, turned_about
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import METHODS
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
@@ -223,7 +225,7 @@ def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(
 
 def _written(path: Path, *seeds: int) -> list[TrialResult]:
     results = [run_trial(blob_trial(seed)) for seed in seeds]
-    path.write_bytes(b"".join(map(result_line, results)))
+    ResultTable(tuple(results)).save(path)
     return results
 
 
@@ -232,12 +234,12 @@ def test_a_half_written_last_line_is_dropped_and_nothing_else(tmp_path: Path, ke
     path = tmp_path / "r.jsonl"
     first, second = _written(path, 0, 1)
     whole = path.read_bytes()
-    half = result_line(second)
-    path.write_bytes(result_line(first) + half[: max(1, int(kept * len(half)) - 1)])
+    half = as_line(to_plain(second))
+    path.write_bytes(as_line(to_plain(first)) + half[: max(1, int(kept * len(half)) - 1)])
     assert read_results([path]) == [first]
     with ResultsFile(path) as file:
         assert list(file.results.values()) == [first]
-        assert path.read_bytes() == result_line(first)
+        assert path.read_bytes() == as_line(to_plain(first))
         file.add(second)
     assert path.read_bytes() == whole
 
@@ -405,7 +407,7 @@ def test_results_that_are_removed_meanwhile_are_missed(tmp_path: Path, replaced:
 def test_numbers_and_text_that_nothing_can_hold_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
 ) -> None:
-    line = result_line(run_trial(blob_trial(0))).decode()
+    line = as_line(to_plain(run_trial(blob_trial(0)))).decode()
     assert old in line
     path = tmp_path / "r.jsonl"
     path.write_text(line.replace(old, new))
@@ -495,7 +497,7 @@ def test_ctrl_c_keeps_what_is_finished(
         patch.setattr(ResultsFile, "add", add)
         status, err = evaluate("--trials", 5, "--size", 0.3)
     assert status == 130
-    assert "3 trials are left, the same command goes on" in err
+    assert "3 trials are left in" in err
     assert len(read_results([tmp_path / "r.jsonl"])) == 2
     assert evaluate("--trials", 5, "--size", 0.3)[0] == 0
     assert [r.seed for r in read_results([tmp_path / "r.jsonl"])] == list(range(5))
@@ -506,8 +508,8 @@ def test_ctrl_c_keeps_what_is_finished(
     [
         (["--size", "half"], 2, "--size is half, expected numbers"),
         (["--size", "-1"], 2, "size is -1, expected e_t"),
-        (["--trials", "0"], 2, "--trials is 0"),
-        (["--trials", "999999999"], 2, "--trials is 999999999, expected 1 to"),
+        (["--trials", "0"], 2, "trials is 0"),
+        (["--trials", "999999999"], 2, "trials is 999999999, expected a whole number, 1 to"),
         (["--shards", "2", "--shard", "2"], 2, "--shard is 2"),
         (["--protocol", "none"], 1, "needs a start"),
         (["--protocol", "prallel"], 2, "did you mean 'parallel'"),

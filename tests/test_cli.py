@@ -768,7 +768,7 @@ def test_a_frame_is_no_rig_by_being_named_twice(bidnerf: Run, shared: Path) -> N
         "0001",
         "0001",
     ]
-    assert_refused(bidnerf(*bench), 2, "--frame names 0001 more than once")
+    assert_refused(bidnerf(*bench), 2, "frames names 0001 more than once")
 
 
 def test_a_window_is_the_frame_and_those_before_it(

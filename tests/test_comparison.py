@@ -11,20 +11,22 @@ import pytest
 
 import tiny
 from bidnerf_core.cli import main
+from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation.bench import Plan
 from bidnerf_core.evaluation.comparison import (
     Comparison,
-    compare_maps,
     map_bytes,
     map_labels,
     map_row,
     plan_comparison,
 )
 from bidnerf_core.evaluation.comparison_figure import comparison_figure
+from bidnerf_core.evaluation.evaluate import run_comparison
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
-from bidnerf_core.evaluation.trial_process import Measured, TrialProcess, samples_per_ray
 from bidnerf_core.evaluation.trials import run_trial
+from bidnerf_core.evaluation.workers import Measured, TrialProcess, samples_per_ray
 from bidnerf_core.io.json import from_plain, to_plain
 
 QUICK = json.dumps({"rays": 32, "max_steps": 3})
@@ -46,15 +48,18 @@ def maps(data: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def usual(data: Path) -> Trial:
-    return Trial("", str(data), ("",), "bid", (0.5,), "bid", QUICK, 0)
+def plan(data: Path) -> Plan:
+    return Plan("", str(data), "bid", ((0.5,),), "bid", QUICK, trials=2)
 
 
 @pytest.fixture(scope="module")
-def compared(maps: list[Path], usual: Trial) -> Comparison:
-    return compare_maps(
-        plan_comparison(usual, [str(m) for m in maps], [], 2), lambda done, total, measured: None
-    )
+def usual(maps: list[Path], data: Path) -> Trial:
+    return Trial(str(maps[0]), str(data), ("t_0000",), "bid", (0.5,), "bid", QUICK, 0)
+
+
+@pytest.fixture(scope="module")
+def compared(maps: list[Path], plan: Plan) -> Comparison:
+    return run_comparison(plan, maps)
 
 
 def result(times: float, trace: list[float], seconds: float = 1.0) -> TrialResult:
@@ -79,9 +84,9 @@ def test_every_map_is_tried_on_the_same_frames_from_the_same_starts(compared: Co
 
 
 def test_a_process_elsewhere_finds_what_this_one_finds(
-    compared: Comparison, maps: list[Path], usual: Trial
+    compared: Comparison, maps: list[Path], plan: Plan, data: Path
 ) -> None:
-    planned = plan_comparison(usual, [str(m) for m in maps], [], 2)
+    planned = plan_comparison(plan, [str(m) for m in maps], open_dataset(data))
     for trial, found in ((planned[0][0], compared.results[0][0]), (planned[1][1], compared.results[1][1])):
         again = run_trial(trial)
         assert replace(again, seconds=0.0, peak_memory_bytes=0) == replace(
@@ -117,17 +122,17 @@ def test_speed_is_that_of_the_trials_that_succeeded() -> None:
     assert success_of([lost], "10%").milliseconds is None
 
 
-def test_a_median_error_counts_lost_poses_as_worst(maps: list[Path]) -> None:
+def test_a_median_error_counts_lost_poses_as_worst() -> None:
     good, gone = result(0.1, [1.0, 0.1]), replace(result(0.1, [1.0, 0.1]), error=None)
-    assert map_row(
-        "a", str(maps[0]), [Measured(good, 1.0)] * 2 + [Measured(gone, 1.0)]
-    ).translation == pytest.approx(0.01)
-    assert map_row("a", str(maps[0]), [Measured(good, 1.0)] + [Measured(gone, 1.0)] * 2).translation is None
+    assert map_row("a", 0, [Measured(good, 1.0)] * 2 + [Measured(gone, 1.0)]).translation == pytest.approx(
+        0.01
+    )
+    assert map_row("a", 0, [Measured(good, 1.0)] + [Measured(gone, 1.0)] * 2).translation is None
 
 
-def test_without_a_start_there_is_no_share_of_its_error(maps: list[Path], tmp_path: Path) -> None:
+def test_without_a_start_there_is_no_share_of_its_error(tmp_path: Path) -> None:
     free = replace(result(1.0, [0.04, 0.01]), start_error=None)
-    row = map_row("short", str(maps[0]), [Measured(free, 1.0)])
+    row = map_row("short", 0, [Measured(free, 1.0)])
     assert row.success["10%"] is None
     absolute = row.success["5deg 0.05"]
     assert absolute is not None
@@ -148,15 +153,15 @@ def test_a_comparison_survives_json(compared: Comparison) -> None:
     assert from_plain(Comparison, json.loads(text), "compare.json") == compared
 
 
-def test_the_plan_is_the_protocols(usual: Trial) -> None:
-    planned = plan_comparison(usual, ["a", "b"], [], 4)
+def test_the_plan_is_the_protocols(plan: Plan, data: Path) -> None:
+    planned = plan_comparison(replace(plan, trials=4), ["a", "b"], open_dataset(data))
     assert [len(trials) for trials in planned] == [2] * 4
     assert all(a.map == "a" and b == replace(a, map="b") for a, b in planned)
     assert {a.frames for a, _ in planned[:3]} == {("t_0000",), ("t_0001",), ("t_0002",)}
     with pytest.raises(InputError, match="named twice"):
-        plan_comparison(usual, ["a", "./a"], [], 1)
-    with pytest.raises(InputError, match="size is"):
-        plan_comparison(replace(usual, size=(1.0, 2.0)), ["a"], [], 1)
+        run_comparison(plan, ["a", "./a"])
+    with pytest.raises(InputError, match="no maps"):
+        run_comparison(plan, [])
 
 
 def test_a_trial_that_cannot_be_is_told_in_one_line(maps: list[Path], usual: Trial) -> None:
@@ -220,7 +225,7 @@ def test_the_command_prints_json(maps: list[Path], data: Path, capsys: pytest.Ca
     ("words", "status", "expected"),
     [
         (["{map}"], 2, "1 folder given, expected"),
-        (["{map}", "{data}", "--trials", "0"], 2, "--trials is 0"),
+        (["{map}", "{data}", "--trials", "0"], 2, "trials is 0"),
         (["{map}", "{data}", "--frame", "r_77"], 1, "r_77"),
         (["{map}", "{data}", "--protocol", "bib"], 2, "did you mean 'bid'"),
         (["{map}", "{data}", "--size", "1:2"], 2, "size is 1:2"),

@@ -16,14 +16,15 @@ from scipy.stats import chi2
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.bench import InThisProcess, Plan, left_to_do, planned
+from bidnerf_core.evaluation.bench import Plan, left_to_do, planned
 from bidnerf_core.evaluation.fault_figure import draw_faults, fault_curves
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, faulty
 from bidnerf_core.evaluation.groups import grouped
 from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.results import ResultsFile, key_of, result_line
+from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trials import trial_views
+from bidnerf_core.evaluation.workers import InThisProcess
 from bidnerf_core.registry import registered
 from bidnerf_core.scenes.closed_form_data import closed_form_data
 
@@ -151,7 +152,7 @@ def test_the_figure_shows_success_acceptance_and_silent_errors(
     assert drawn.with_suffix(".png").stat().st_size > 5000
     assert draw_faults(grouped(results[:10]), tmp_path / "none") is None
     lines = tmp_path / "r.jsonl"
-    lines.write_bytes(b"".join(map(result_line, results)))
+    ResultTable(tuple(results)).save(lines)
     assert main(["report", str(lines), "--out", str(tmp_path / "report")]) == 0
     assert "Trials by fault of the images" in (tmp_path / "report" / "index.html").read_text()
 

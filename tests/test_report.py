@@ -20,7 +20,7 @@ from bidnerf_core.cli import main
 from bidnerf_core.evaluation.groups import grouped, situation_titles, situations
 from bidnerf_core.evaluation.plots import Figures
 from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
-from bidnerf_core.evaluation.results import result_line
+from bidnerf_core.evaluation.results import ResultTable
 from bidnerf_core.evaluation.summary import NEVER, compare_pair, median, pairwise_tests, steps_of, summarize
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.results.errors import success_rate
@@ -44,7 +44,7 @@ def result(seed: int, reached: int | None, size: float = 0.5, **settings: Any) -
 
 
 def write(path: Path, *results: TrialResult) -> Path:
-    path.write_bytes(b"".join(map(result_line, results)))
+    ResultTable(results).save(path)
     return path
 
 
@@ -172,7 +172,7 @@ def test_the_page_needs_nothing_beside_it(
         assert iio.imread(tmp_path / "out" / f"{name}.png").std() > 1
         assert (tmp_path / "out" / f"{name}.svg").stat().st_size > 2000
     out = capsys.readouterr().out
-    assert re.search(r"bid, all sizes *\n.*\n  bid, level none +12 +50 % +50 % +50 %", out)
+    assert re.search(r"bid, all sizes\n.*\n  bid, level none +12 +50 % \(25-75\) +50 % \(25-75\) +50 %", out)
 
 
 def test_a_report_of_one_hopeless_trial_without_a_start(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, TextIO
 
 from bidnerf_core.cli.interruptions import Interrupted, interruptions
-from bidnerf_core.errors import InputError, InputWarning, UsageError, printable, spelling_hint
+from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError, printable, spelling_hint
 
 COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
@@ -61,6 +61,8 @@ def _guarded(name: str, given: list[str]) -> int:
         return _failed(name, "interrupted", 128 + stopped.number)
     except KeyboardInterrupt:
         return _failed(name, "interrupted", INTERRUPTED)
+    except Cancelled as stopped:
+        return _failed(name, str(stopped), INTERRUPTED)
     except BrokenPipeError:
         raise
     except OSError as error:  # a full disk, a folder without write permission
@@ -103,7 +105,10 @@ def _warnings_as_lines(name: str) -> Iterator[None]:
         def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
             if issubclass(category, InputWarning):
                 _failed(name, str(message), DONE)
-            else:
+                return
+            from bidnerf_core.cli.output import PrintableStream  # here, since few commands warn
+
+            with contextlib.redirect_stderr(PrintableStream(sys.stderr)):
                 others(message, category, *place)
 
         warnings.simplefilter("always", InputWarning)

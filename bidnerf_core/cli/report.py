@@ -10,7 +10,7 @@ import tyro
 
 from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.options import option, parse
-from bidnerf_core.cli.output import console, print_table, show
+from bidnerf_core.cli.output import console, show
 from bidnerf_core.errors import InputError, UsageError
 
 if TYPE_CHECKING:  # the rest is imported when a report is made, since help pages do not need it
@@ -45,19 +45,18 @@ def report(
 
     Trials are compared by map, data, start, method and settings. A trial that several files hold counts once.
     """
-    from bidnerf_core.evaluation.groups import grouped
     from bidnerf_core.evaluation.page import UNFINISHED, page
     from bidnerf_core.evaluation.provenance import read_runs
-    from bidnerf_core.evaluation.results import read_results
+    from bidnerf_core.evaluation.results import ResultTable
     from bidnerf_core.io.files import write_file
     from bidnerf_core.results.plot_style import require_matplotlib
 
     if not results:
         raise UsageError("no file of results, expected at least one that 'bidnerf evaluate' wrote")
-    found = read_results(results)
-    if not found:
+    found = ResultTable.load(*results)
+    if not found.rows:
         raise InputError(f"{', '.join(map(str, results))}: no finished trial in it, nothing to report")
-    groups = grouped(found)
+    groups = found.groups
     chosen = _criterion(criterion, groups)
     _check_ours(out)
     require_matplotlib()
@@ -67,7 +66,8 @@ def report(
             write_file(out / "index.html", UNFINISHED.encode())
         text = page(title, groups, draw_figures(groups, out, chosen), runs, chosen)
         write_file(out / "index.html", text.encode())
-    _print(groups)
+    for line in str(found).split("\n"):
+        show(line)
     show(f"look at {out / 'index.html'}")
 
 
@@ -132,27 +132,3 @@ def draw_figures(groups: Sequence[Group], folder: Path, criterion: str) -> list[
             "Rotation error after each step: median and quartiles of all trials. The dashed line is 5 degrees.",
         ),
     ]  # fmt: skip
-
-
-def _print(groups: Sequence[Group]) -> None:
-    from rich.table import Table
-
-    from bidnerf_core.evaluation.groups import situation_titles
-    from bidnerf_core.evaluation.summary import summarize
-    from bidnerf_core.results.errors import CRITERIA
-
-    table = Table(box=None, pad_edge=False)
-    table.add_column("success by")
-    for column in ("n", *CRITERIA, "median error"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for situation, title in situation_titles([group.situation for group in groups]).items():
-        table.add_row(title)
-        for group in (g for g in groups if g.situation == situation):
-            s = summarize(group.results)
-            rates = [
-                "-" if found is None else f"{100 * found.rate.rate:.0f} %" for found in s.criteria.values()
-            ]
-            known = s.translation is not None and s.rotation_deg is not None
-            error = f"{s.translation:.3f} m {s.rotation_deg:6.2f} deg" if known else "-"
-            table.add_row(f"  {group.label}", str(s.trials), *rates, error)
-    print_table(table)

@@ -5,58 +5,48 @@ from __future__ import annotations
 import time
 from types import FrameType
 
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
 
 from bidnerf_core.cli.output import console, say
 from bidnerf_core.cli.progress import LINE_EVERY, StoppableBar
-from bidnerf_core.evaluation.summary import succeeded
-from bidnerf_core.evaluation.trial import TrialResult
+from bidnerf_core.progress import Progress
 
 
 class TrialProgress(StoppableBar):
-    """A progress bar for trials.
+    """A progress bar for trials, which is called with each ``Progress``.
 
-    As a context manager, it makes Ctrl-C wait for the running trials, and a second Ctrl-C stop them.
+    As a context manager, it makes Ctrl-C set ``stopping``, and a second Ctrl-C interrupt at once.
     """
 
-    def __init__(self, total: int, at_once: int) -> None:
-        self.total, self.count, self.right = total, 0, 0
+    def __init__(self) -> None:
         self.stopping = False
-        self._at_once = at_once
         self._began = self._spoke = time.monotonic()
-        self._bar = Progress(
+        self._bar = Bar(
             TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[numbers]}"),
             TimeElapsedColumn(), console=console, disable=not console.is_terminal,
         )  # fmt: skip
-        self._task = self._bar.add_task("", total=total, numbers="")
+        self._task = self._bar.add_task("", total=None, numbers="")
 
-    def done(self, result: TrialResult) -> None:
-        """Count one more finished trial."""
-        self.count += 1
-        self.right += succeeded(result)
-        numbers = f"{self.right} within 5 deg and 0.05 m, {duration_text(self._left())} left"
-        self._bar.update(self._task, completed=self.count, numbers=numbers)
+    def __call__(self, progress: Progress) -> None:
+        """Show how many trials are done. The time left is too low until every worker has finished a trial."""
         now = time.monotonic()
-        if not console.is_terminal and (self.count == self.total or now - self._spoke > LINE_EVERY):
+        left = (now - self._began) / progress.done * (progress.total - progress.done)
+        numbers = f"{progress.text}, {duration_text(left)} left"
+        self._bar.update(self._task, completed=progress.done, total=progress.total, numbers=numbers)
+        if not console.is_terminal and (progress.done == progress.total or now - self._spoke > LINE_EVERY):
             self._spoke = now
-            say(f"{self.count}/{self.total} trials, {numbers}")
+            say(f"{progress.done}/{progress.total} trials, {numbers}")
 
-    def _left(self) -> float:
-        """Return the seconds left at the mean rate so far, which is too low until every worker has finished a trial."""
-        each = (time.monotonic() - self._began) / self.count
-        return each * (self.total - self.count)
+    def cancelled(self) -> bool:
+        """Return whether Ctrl-C was pressed."""
+        return self.stopping
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self.stopping:
             raise KeyboardInterrupt
         self.stopping = True
-        console.print(f"waiting for {self._at_once} trials under way (Ctrl-C again: at once)", markup=False)
+        console.print("waiting for the trials under way (Ctrl-C again: at once)", markup=False)
 
 
 def duration_text(seconds: float) -> str:

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass
-from multiprocessing import connection, get_context, parent_process
 from typing import Any
-
-import torch
 
 from bidnerf_core.datasets import Dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import NO_FAULT, check_depth
-from bidnerf_core.evaluation.protocols import Size, find_protocol
+from bidnerf_core.evaluation.faults import NO_FAULT, check_depth, expand_faults
+from bidnerf_core.evaluation.protocols import MOST_TRIALS, Size, find_protocol
 from bidnerf_core.evaluation.results import ResultsFile, key_of
+from bidnerf_core.evaluation.summary import succeeded
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import (
+    Opened,
     input_digests,
     opened,
     opened_points,
@@ -32,8 +29,9 @@ from bidnerf_core.geometry.arcs import arc
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import find_method
 from bidnerf_core.localization.methods import RENAMED, require_use_of_depth
+from bidnerf_core.progress import Cancel, Progress, ProgressCallback
 from bidnerf_core.scenes.closed_form_data import ClosedFormData
-from bidnerf_core.settings import to_flat
+from bidnerf_core.settings import Range, WholeNumbers, to_flat
 
 CHANGED = {
     "views": "images, depth or cameras than {trial.data} has now",
@@ -41,13 +39,22 @@ CHANGED = {
     "surface": "surface than map {trial.map} has now, which was baked anew",
 }
 """The meaning of a change in each digest of a trial's input, by the digest's name."""
+LIMITS: dict[str, Range] = {
+    "trials": WholeNumbers(1, MOST_TRIALS),
+    "seed": WholeNumbers(0, 2**31 - 1),
+    "images": WholeNumbers(1, 1000),
+    "angle": Range(0.01, 360.0),
+}
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A set of trials to run. None selects the protocol's own sizes, number of trials and seed."""
+    """A set of trials to run. None selects the protocol's own sizes, number of trials and seed.
 
-    map: str
+    Raises ``InputError`` for an unknown protocol or fault, and for numbers that no map or dataset could make right.
+    """
+
+    map: str  # folder, demo:NAME, or a name for a map in memory
     data: str
     protocol: str = "bid"
     sizes: tuple[Size, ...] | None = None
@@ -64,19 +71,32 @@ class Plan:
     depth_points: str | None = None  # see Trial
     faults: tuple[str, ...] = (NO_FAULT,)  # see Trial; each is tried on the same frames from the same starts
 
+    def __post_init__(self) -> None:
+        protocol = find_protocol(self.protocol)
+        for size in self.sizes or ():
+            protocol.check_size(size)
+        for name, allowed in LIMITS.items():
+            value = getattr(self, name)
+            if value is not None and (value not in allowed or (name != "angle" and type(value) is not int)):
+                raise InputError(f"{name} is {value}, expected {allowed}")
+        twice = [name for name, count in Counter(self.frames or ()).items() if count > 1]
+        if twice:
+            raise InputError(f"frames names {twice[0]} more than once, expected each once")
+        object.__setattr__(self, "faults", expand_faults(self.faults) or (NO_FAULT,))
 
-def planned(plan: Plan) -> list[Trial]:
-    """Return all trials in the order of the results. Raises ``InputError`` for a plan that cannot be carried out."""
-    _, dataset = opened(plan.map, plan.data, plan.device)
+
+def planned(plan: Plan, dataset: Dataset | None = None) -> list[Trial]:
+    """Return all trials in the order of the results. Raises ``InputError`` for a plan that cannot be carried out.
+
+    ``dataset`` is the one that the plan names; by default it is opened, and the map with it.
+    """
+    dataset = dataset or opened(plan.map, plan.data, plan.device)[1]
     protocol = find_protocol(plan.protocol)
     parse_settings(plan.method, plan.config)
     names = dataset.frame_names(plan.split)
     rigs = _rigs(plan, dataset, names)
-    _check_points(plan, rigs)
     check_depth(plan.faults, plan.depth)
     sizes = protocol.sizes if plan.sizes is None else plan.sizes
-    for size in sizes:
-        protocol.check_size(size)
     if protocol.fixed and (plan.frames is not None or len(rigs) < len(names)):
         raise InputError(f"protocol {plan.protocol!r} has its own frames, expected one image and all frames")
     count = protocol.trials if plan.trials is None else plan.trials
@@ -109,12 +129,12 @@ def changed_settings(method: str, settings: Any) -> str:
     return json.dumps({k: v for k, v in given.items() if v != usual[k]}, sort_keys=True)
 
 
-def left_to_do(trials: Sequence[Trial], file: ResultsFile) -> list[Trial]:
-    """Return the trials whose results are not in the file.
+def left_to_do(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None = None) -> list[Trial]:
+    """Return the trials whose results are not in the file. ``scene`` is their map and data, by default those they name.
 
     Raises ``InputError`` where it holds a result from another training or surface of the map, other images or other settings.
     """
-    _check_same([trial for trial in trials if key_of(trial) in file.results], file)
+    _check_same([trial for trial in trials if key_of(trial) in file.results], file, scene)
     return [trial for trial in trials if key_of(trial) not in file.results]
 
 
@@ -136,22 +156,26 @@ def run_trials(
     file: ResultsFile,
     executor: Executor,
     at_once: int,
-    finished: Callable[[TrialResult], None] = lambda result: None,
-    stopping: Callable[[], bool] = lambda: False,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+    scene: Opened | None = None,
 ) -> None:
     """Run the trials whose results ``file`` does not hold, and store each result when it is done.
 
-    At most ``at_once`` trials are under way at once, so that a kill loses little. No trial begins once ``stopping``
+    At most ``at_once`` trials are under way at once, so that a kill loses little. No trial begins once ``cancel``
     returns True. A trial that fails ends the run with its error, after the results of the trials under way have been stored.
+    ``scene`` is the map and data of all trials, which an executor in this process can use; by default those they name.
     """
-    waiting, under_way = iter(left_to_do(trials, file)), set[Future[TrialResult]]()
+    todo = left_to_do(trials, file, scene)
+    waiting, under_way = iter(todo), set[Future[TrialResult]]()
     failed: BaseException | None = None
+    count = right = 0
     while True:
-        while len(under_way) < at_once and failed is None and not stopping():
+        while len(under_way) < at_once and failed is None and not (cancel and cancel()):
             trial = next(waiting, None)
             if trial is None:
                 break
-            under_way.add(executor.submit(run_in_worker, trial))
+            under_way.add(executor.submit(run_trial, trial, scene))
         if not under_way:
             break
         done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
@@ -161,7 +185,10 @@ def run_trials(
                 failed = failed or error
                 continue
             file.add(future.result())
-            finished(future.result())
+            count, right = count + 1, right + succeeded(future.result())
+            if progress is not None:
+                text = f"{right} within 5 deg and 0.05 m"
+                progress(Progress("trials", count, len(todo), "trials", text))
     if failed is not None:
         raise failed
 
@@ -173,53 +200,12 @@ def shard_of(trials: Sequence[Trial], number: int, shards: int) -> list[Trial]:
     return list(trials[number::shards])
 
 
-def run_in_worker(trial: Trial) -> TrialResult:
-    """Run a trial on one thread, in a process that runs nothing else."""
-    torch.set_num_threads(1)
-    return run_trial(trial)
-
-
-class InThisProcess(Executor):
-    """An executor that runs every call immediately, in this process."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-def local_processes(count: int) -> Executor:
-    """Return an executor of ``count`` processes of one thread each, which end when this process ends, for whatever reason."""
-    if count == 1:
-        return InThisProcess()
-    return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=prepare_worker)
-
-
-def prepare_worker() -> None:
-    """Set up a worker: it leaves Ctrl-C to its parent and exits when its parent is gone."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-    threading.Thread(target=_follow_parent, daemon=True).start()
-
-
-def _follow_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
-
-
-def _check_same(trials: Sequence[Trial], file: ResultsFile) -> None:
+def _check_same(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None) -> None:
     """Raise ``InputError`` where a result in ``file`` came from other weights, settings or input than its trial has now."""
     digests: dict[Any, dict[str, Any]] = {}
     for trial in trials:
         known = file.results[key_of(trial)]
-        stored, dataset = opened(trial.map, trial.data, trial.device)
+        stored, dataset = scene or opened(trial.map, trial.data, trial.device)
         advice = "name another --out, or remove the file to begin anew"
         if known.weights != stored.info.weights:
             raise InputError(
@@ -272,12 +258,12 @@ def _rigs(plan: Plan, dataset: Dataset, names: list[str]) -> list[tuple[str, ...
     return rigs
 
 
-def _check_points(plan: Plan, rigs: list[tuple[str, ...]]) -> None:
-    """Raise ``InputError`` if the method does not use depth points, or if the views of some frame observe none."""
-    points = opened_points(plan.depth_points, plan.map)
-    if points is None:
+def check_points(plan: Plan, trials: Sequence[Trial], scene: Opened) -> None:
+    """Raise ``InputError`` if the method does not use the plan's depth points, or if the views of some trial observe none."""
+    if plan.depth_points is None:
         return
     require_use_of_depth(plan.method)
+    points, rigs = opened_points(plan.depth_points, scene[0]), dict.fromkeys(t.frames for t in trials)
     blind = [rig[-1] for rig in rigs if not any(len(points.seen(name, plan.split)) for name in rig)]
     if blind:
         listed = ", ".join(blind[:4]) + (", ..." if len(blind) > 4 else "")

@@ -6,20 +6,28 @@ import statistics
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-from bidnerf_core.datasets import open_dataset
-from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.protocols import find_protocol
-from bidnerf_core.evaluation.summary import Success, summarize
+from torch import nn
+
+from bidnerf_core.datasets import Dataset
+from bidnerf_core.errors import amount, printable
+from bidnerf_core.evaluation.bench import Plan, planned
+from bidnerf_core.evaluation.json_lines import as_line
+from bidnerf_core.evaluation.results import aligned
+from bidnerf_core.evaluation.summary import ABSOLUTE, RELATIVE, Success, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.evaluation.trial_process import Measured, TrialProcess
+from bidnerf_core.evaluation.trials import Opened
+from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured
+from bidnerf_core.io.files import write_file
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.maps.description import DESCRIPTION, load_info
-from bidnerf_core.scenes.closed_form_data import closed_form_data, is_closed_form
-
-ProgressCallback: TypeAlias = Callable[[int, int, Measured], None]
-"""Called after each trial with the number of finished trials, the number of all, and the latest result."""
+from bidnerf_core.maps.map import Map
+from bidnerf_core.progress import Cancel, Progress, ProgressCallback, check_cancelled
+from bidnerf_core.results.errors import CRITERIA
+from bidnerf_core.scenes.closed_form_data import is_closed_form
 
 
 @dataclass(frozen=True)
@@ -55,51 +63,79 @@ class Comparison:
     rows: tuple[MapRow, ...]
     results: tuple[tuple[TrialResult, ...], ...] = ()  # by map, in the same order of starts
 
+    @property
+    def title(self) -> str:
+        """The setup in words."""
+        size = ":".join(f"{x:g}" for x in self.size)
+        trials = f"{self.trials} trials" if self.protocol == "none" else f"{self.trials} starts of"
+        start = "without a start" if self.protocol == "none" else f"{self.protocol} {size}".rstrip()
+        return f"{trials} {start} on {self.data}/{self.split}, method {self.method}"
 
-def plan_comparison(
-    usual: Trial, maps: Sequence[str], names: Sequence[str], count: int | None
-) -> list[list[Trial]]:
+    def __str__(self) -> str:
+        lines = [["", *(row.map for row in self.rows)]]
+        lines += [[name, *map(cell, self.rows)] for name, cell in LINES.items()]
+        usual = RELATIVE if self.rows[0].success[RELATIVE] else ABSOLUTE
+        note = (
+            f"success: number and Wilson's 95 % interval; to success: median of the trials that met {usual}"
+        )
+        return "\n".join([printable(self.title), aligned(lines), note])
+
+    def save(self, path: str | Path) -> None:
+        """Write the comparison with all results as JSON."""
+        write_file(Path(path), as_line(to_plain(self)))
+
+
+def plan_comparison(plan: Plan, maps: Sequence[str], dataset: Dataset) -> list[list[Trial]]:
     """Return, for each start, one trial per map, with the frames and seeds of the protocol.
 
-    ``usual`` defines everything but the map and the frame; ``names`` are the frames to choose from, empty for all frames of
-    the split. Raises ``InputError`` for a name or a number that cannot be used.
+    ``plan`` defines everything but the map. Raises ``InputError`` for a name or a number that cannot be used.
     """
-    if len({Path(m).resolve() for m in maps}) != len(maps):
-        raise InputError(f"maps: {', '.join(maps)}: one is named twice, expected different ones")
-    protocol = find_protocol(usual.protocol)
-    protocol.check_size(usual.size)
-    if protocol.fixed and names:
-        raise InputError(f"protocol {usual.protocol!r} has its own frames, expected no others to be named")
-    frames = _known(usual, names)
-    cases = protocol.cases(len(frames), protocol.trials if count is None else count, usual.seed)
-    return [
-        [replace(usual, map=m, frames=(frames[place],), seed=seed) for m in maps] for place, seed in cases
-    ]
+    return [[replace(trial, map=m) for m in maps] for trial in planned(plan, dataset)]
 
 
-def compare_maps(planned: Sequence[Sequence[Trial]], progress: ProgressCallback) -> Comparison:
-    """Run the planned trials: each map in its own process, and at each start one map after another.
+def compare_maps(
+    starts: Sequence[Sequence[Trial]],
+    labels: Sequence[str],
+    scenes: Sequence[Opened | None],
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> Comparison:
+    """Run the trials of each start, one map after another: a map without an entry in ``scenes`` in a process of its own.
 
-    Only one process works at a time, so that a change in the machine's load affects all maps alike.
+    Only one process works at a time, so that a change in the machine's load affects all maps alike. Raises ``Cancelled`` once
+    ``cancel`` returns True.
     """
-    maps = [trial.map for trial in planned[0]]
-    done: list[list[Measured]] = [[] for _ in maps]
+    done: list[list[Measured]] = [[] for _ in labels]
     with ExitStack() as stack:
-        processes = [stack.enter_context(TrialProcess()) for _ in maps]
-        for number, trials in enumerate(planned):
+        processes = [stack.enter_context(TrialProcess()) if scene is None else None for scene in scenes]
+        for number, trials in enumerate(starts):
             for place, (process, trial) in enumerate(zip(processes, trials, strict=True)):
-                done[place].append(process.run(trial))
-                progress(number * len(maps) + place + 1, len(planned) * len(maps), done[place][-1])
-    first, result = planned[0][0], done[0][0].result
+                check_cancelled(cancel, "comparison")
+                done[place].append(process.run(trial) if process else measured(trial, scenes[place]))
+                if progress is not None:
+                    count = number * len(labels) + place + 1
+                    text = _found(labels[place], done[place][-1].result)
+                    progress(Progress("comparison", count, len(starts) * len(labels), "trials", text))
+    first, result = starts[0][0], done[0][0].result
+    rows = [
+        map_row(label, map_bytes(trial.map if scene is None else scene[0]), column)
+        for label, trial, scene, column in zip(labels, starts[0], scenes, done, strict=True)
+    ]
     return Comparison(
-        Path(first.data).resolve().name, first.split, first.protocol, first.size, result.method, result.settings,
-        first.seed, len(planned), tuple(map(map_row, map_labels(maps), maps, done)),
-        tuple(tuple(m.result for m in column) for column in done),
+        first.portable.data, first.split, first.protocol, first.size, result.method, result.settings,
+        first.seed, len(starts), tuple(rows), tuple(tuple(m.result for m in column) for column in done),
     )  # fmt: skip
 
 
-def map_row(label: str, folder: str, measured: Sequence[Measured]) -> MapRow:
-    """Return the statistics of the trials on one map."""
+def _found(label: str, result: TrialResult) -> str:
+    """Return in words what a trial found."""
+    error = result.error
+    off = f"{error.translation:.3f} m, {error.rotation_deg:.2f} deg" if error else "not finite"
+    return f"{result.frame} in {label}: {off}, {amount(result.steps, 'step')}, {result.seconds:.1f} s"
+
+
+def map_row(label: str, size: int, measured: Sequence[Measured]) -> MapRow:
+    """Return the statistics of the trials on one map, which takes ``size`` bytes."""
     results = [m.result for m in measured]
     found = summarize(results)
     return MapRow(
@@ -114,7 +150,7 @@ def map_row(label: str, folder: str, measured: Sequence[Measured]) -> MapRow:
         ms_per_step=found.milliseconds_per_step,
         peak_memory_bytes=found.peak_memory_bytes,
         samples_per_ray=statistics.fmean(m.samples_per_ray for m in measured),
-        map_bytes=map_bytes(Path(folder)),
+        map_bytes=size,
     )
 
 
@@ -127,21 +163,48 @@ def map_labels(maps: Sequence[str]) -> list[str]:
     return ["/".join(p[-length:]) for p in parts]
 
 
-def map_bytes(folder: Path) -> int:
-    """Return the size of a map's description and weights, without the state that an interrupted training keeps."""
-    if is_closed_form(str(folder)):
+def map_bytes(stored: Map | str | Path) -> int:
+    """Return the size of a map's description and weights in a folder, or of the field's tensors in memory; 0 in closed form."""
+    if isinstance(stored, Map):
+        if not isinstance(stored.field, nn.Module):
+            return 0
+        return sum(t.numel() * t.element_size() for t in stored.field.state_dict().values())
+    if is_closed_form(str(stored)):
         return 0
+    folder = Path(stored)
     return sum((folder / name).stat().st_size for name in (DESCRIPTION, load_info(folder).weights))
 
 
-def _known(usual: Trial, names: Sequence[str]) -> list[str]:
-    """Return the frames to choose from. Raises ``InputError`` for one that the split does not have."""
-    data = usual.data
-    dataset = closed_form_data(data) if is_closed_form(data) else open_dataset(data)
-    known = dataset.frame_names(usual.split)
-    missing = [name for name in names if name not in known]
-    if missing:
-        raise InputError(
-            f"{data}: no frame {missing[0]!r} in split {usual.split!r}, expected names of its frames"
-        )
-    return list(names) or known
+def _rate(row: MapRow, criterion: str) -> str:
+    success = row.success[criterion]
+    if success is None:
+        return "-"
+    rate = success.rate
+    return f"{rate.successes}/{rate.trials} ({100 * rate.low:.0f}-{100 * rate.high:.0f} %)"
+
+
+def _usual(row: MapRow) -> Success:
+    """Return the success by the relative criterion, or by the absolute one where there was no start."""
+    success = row.success[RELATIVE] or row.success[ABSOLUTE]
+    assert success is not None  # the absolute criterion always applies
+    return success
+
+
+def _known(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+LINES: dict[str, Callable[[MapRow], str]] = {
+    "backend": lambda row: row.backend,
+    **{f"success {name}": partial(_rate, criterion=name) for name in CRITERIA},
+    "median error, m": lambda row: _known(row.translation, 4),
+    "median error, deg": lambda row: _known(row.rotation_deg, 2),
+    "steps": lambda row: f"{row.steps:g}",
+    "steps to success": lambda row: _known(_usual(row).steps, 0),
+    "ms a step": lambda row: f"{row.ms_per_step:.1f}",
+    "ms to success": lambda row: _known(_usual(row).milliseconds, 0),
+    "peak memory, MiB": lambda row: f"{row.peak_memory_bytes / 2**20:.0f}",
+    "samples a ray": lambda row: f"{row.samples_per_ray:.1f}",
+    "map, MiB": lambda row: f"{row.map_bytes / 2**20:.1f}",
+}
+"""The lines of a comparison as text, by name; each map has a column."""

@@ -1,16 +1,23 @@
-"""A file of results: one JSON line per trial, each on disk before its trial counts as done."""
+"""Results of trials: a table in memory, and a file of one JSON line per trial, each on disk before its trial counts as done."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeAlias
 
+from bidnerf_core.errors import printable
+from bidnerf_core.evaluation.groups import Condition, Group, Situation, grouped, situation_titles
 from bidnerf_core.evaluation.json_lines import JsonLinesFile, LineFormat, as_line
+from bidnerf_core.evaluation.summary import Success, Summary, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
+from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import from_plain, to_plain
+from bidnerf_core.results.errors import CRITERIA
 
 Key: TypeAlias = str
 """The identity of a trial, independent of where its folders are."""
@@ -18,14 +25,90 @@ Key: TypeAlias = str
 RESULT_LINES = LineFormat(b'{"T_world_camera": ', "lines as 'bidnerf evaluate' writes")
 
 
+@dataclass(frozen=True)
+class SummaryRow:
+    """The statistics of the trials of one condition in one situation, with the words that reports use for these."""
+
+    start: str  # title of the situation
+    label: str  # of the condition
+    situation: Situation
+    condition: Condition
+    statistics: Summary
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """The results of trials. ``str()`` of it is a table for people."""
+
+    rows: tuple[TrialResult, ...]
+
+    @cached_property
+    def groups(self) -> list[Group]:
+        """The results by situation (what was to be localized) and by condition (what localized it)."""
+        return grouped(self.rows)
+
+    @cached_property
+    def summary(self) -> tuple[SummaryRow, ...]:
+        """Success rates with Wilson's 95 % intervals, errors and cost of each group."""
+        titles = situation_titles([group.situation for group in self.groups])
+        return tuple(
+            SummaryRow(titles[g.situation], g.label, g.situation, g.condition, summarize(g.results))
+            for g in self.groups
+        )
+
+    def __str__(self) -> str:
+        lines = [["success by", "n", *CRITERIA, "median error"]]
+        start = None
+        for row in self.summary:
+            if row.start != start:
+                lines.append([row.start])
+                start = row.start
+            known = row.statistics
+            rates = [rate_text(success) for success in known.criteria.values()]
+            error = "-"
+            if known.translation is not None and known.rotation_deg is not None:
+                error = f"{known.translation:.3f} m {known.rotation_deg:6.2f} deg"
+            lines.append([f"  {row.label}", str(known.trials), *rates, error])
+        return aligned(lines)
+
+    def save(self, path: str | Path) -> None:
+        """Write the results as JSON lines, which ``bidnerf report`` reads; a file of that name is replaced as a whole."""
+        write_file(Path(path), b"".join(as_line(to_plain(row)) for row in self.rows))
+
+    @classmethod
+    def load(cls, *paths: str | Path) -> ResultTable:
+        """Return the results of files, as ``read_results`` does."""
+        return cls(tuple(read_results(map(Path, paths))))
+
+
+def rate_text(success: Success | None) -> str:
+    """Return the share of trials that met a criterion with its interval; a dash where the criterion does not apply."""
+    if success is None:
+        return "-"
+    rate = success.rate
+    return f"{100 * rate.rate:.0f} % ({100 * rate.low:.0f}-{100 * rate.high:.0f})"
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> str:
+    """Return lines of cells as text: the first column is flush left and the others are flush right.
+
+    A line of a single cell is a heading, which may be wider than its column. Characters that could control a terminal are
+    escaped.
+    """
+    cells = [[printable(cell) for cell in line] for line in lines]
+    columns = [[line[i] for line in cells if len(line) > max(i, 1)] for i in range(max(map(len, cells)))]
+    widths = [max(map(len, column)) for column in columns]
+    return "\n".join(
+        "  ".join(
+            [line[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(line[1:], widths[1:], strict=False))]
+        ).rstrip()
+        for line in cells
+    )
+
+
 def key_of(trial: Trial) -> Key:
     """Return a key that is equal for two trials if and only if they are the same trial, on any machine."""
     return json.dumps(to_plain(trial.portable), sort_keys=True)
-
-
-def result_line(result: TrialResult) -> bytes:
-    """Return the line of a results file that holds ``result``."""
-    return as_line(to_plain(result))
 
 
 def read_results(paths: Iterable[Path]) -> list[TrialResult]:
@@ -42,14 +125,19 @@ def read_results(paths: Iterable[Path]) -> list[TrialResult]:
 
 
 class ResultsFile:
-    """A file to which results are appended, locked by the process that has it open. Use it as a context manager."""
+    """A file to which results are appended, locked by the process that has it open. Use it as a context manager.
 
-    def __init__(self, path: Path) -> None:
+    Without a path, the results are kept in memory only.
+    """
+
+    def __init__(self, path: Path | None) -> None:
         self.path = path
         self.results: dict[Key, TrialResult] = {}
-        self._file = JsonLinesFile(path, RESULT_LINES)
+        self._file = None if path is None else JsonLinesFile(path, RESULT_LINES)
 
     def __enter__(self) -> ResultsFile:
+        if self._file is None:
+            return self
         try:
             for where, plain in self._file.open():
                 result = from_plain(TrialResult, plain, where)
@@ -63,15 +151,19 @@ class ResultsFile:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
     def add(self, result: TrialResult) -> None:
         """Append a result, which is on disk when this returns. Raises ``InputError`` where the file was removed."""
-        self._file.append(to_plain(result))
+        if self._file is not None:
+            self._file.append(to_plain(result))
         self.results[key_of(result.trial)] = result
 
     def put_in_order(self, trials: Sequence[Trial]) -> None:
         """Move the results of ``trials`` to the end of the file, in their order, in one atomic step."""
+        if self._file is None:
+            return
         self._file.check_there()
         wanted = [key_of(trial) for trial in trials]
         asked = set(wanted)

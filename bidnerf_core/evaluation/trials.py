@@ -1,6 +1,6 @@
 """Running one trial: localize a frame from a start with a method, and measure the result.
 
-``run_trial`` depends only on its argument and on the files that this names, so trials may run in any order, in any process
+``run_trial`` depends only on its arguments and on the files that these name, so trials may run in any order, in any process
 and on any machine; two runs of the same trial differ only in ``seconds`` and ``peak_memory_bytes``.
 """
 
@@ -12,7 +12,7 @@ import sys
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -35,19 +35,25 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import from_plain, parse_record, to_plain
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.maps.description import MapInfo, cameras_of, load_info
+from bidnerf_core.maps.description import MapInfo, cameras_of
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat
 
+Opened: TypeAlias = tuple[Map, Dataset]
+"""A map, and a dataset of the same scene."""
+
 STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def run_trial(trial: Trial) -> TrialResult:
-    """Run a trial. Raises ``InputError`` for an unknown name, and for a method that lacks an input it needs."""
+def run_trial(trial: Trial, scene: Opened | None = None) -> TrialResult:
+    """Run a trial on the map and the dataset ``scene``, by default those that the trial names.
+
+    Raises ``InputError`` for an unknown name, and for a method that lacks an input it needs.
+    """
     with one_thread():
-        stored, dataset = opened(trial.map, trial.data, trial.device)
+        stored, dataset = scene or opened(trial.map, trial.data, trial.device)
         views = trial_views(trial, dataset)
         truth, start = views[-1].T_ref_camera, start_of(trial, views, dataset)
         settings = parse_settings(trial.method, trial.config)
@@ -61,7 +67,7 @@ def _localized(
     trial: Trial, stored: Map, views: list[View], start: SE3 | None, settings: Any
 ) -> Localization:
     """Return the answer of the trial's method. This is the only place in this package that calls the localizer."""
-    points = opened_points(trial.depth_points, trial.map)
+    points = None if trial.depth_points is None else opened_points(trial.depth_points, stored)
     rays = None if points is None else points.rays(views, trial.split)
     localizer = Localizer(stored, trial.method, settings, warm_up=False)
     return localizer(views, start, rays, trial.seed)
@@ -99,24 +105,32 @@ def parse_settings(method: str, config: str) -> Any:
     )
 
 
-@lru_cache(maxsize=4)
-def opened(map_folder: str, data: str, device: str = "cpu") -> tuple[Map, Dataset]:
-    """Return the map and the dataset of two folders or closed-form scenes; each is read once per process."""
+def open_map(name: str, device: str = "cpu") -> Map:
+    """Return the map of a folder, or of a closed-form scene."""
     where = working_device(device)
-    stored = closed_form_map(map_folder) if is_closed_form(map_folder) else load_map(Path(map_folder), where)
-    if is_closed_form(data):
-        return stored, closed_form_data(data)
-    return stored, open_dataset(data, stored.bounds.background)
+    return closed_form_map(name) if is_closed_form(name) else load_map(Path(name), where)
+
+
+def open_data(name: str, stored: Map | None = None) -> Dataset:
+    """Return the dataset of a folder, or of a closed-form scene; a map gives the colour behind its images."""
+    if is_closed_form(name):
+        return closed_form_data(name)
+    return open_dataset(name, None if stored is None else stored.bounds.background)
 
 
 @lru_cache(maxsize=4)
-def opened_points(folder: str | None, map_folder: str) -> SparsePoints | None:
+def opened(map_name: str, data_name: str, device: str = "cpu") -> Opened:
+    """Return the map and the dataset of these names, which are read once per process."""
+    stored = open_map(map_name, device)
+    return stored, open_data(data_name, stored)
+
+
+@lru_cache(maxsize=4)
+def opened_points(folder: str, stored: Map) -> SparsePoints:
     """Return the points of the COLMAP model in ``folder``, scaled to the map by the poses of its training cameras."""
-    if folder is None:
-        return None
-    if is_closed_form(map_folder):
-        raise InputError(f"{map_folder}: was trained without cameras, which would give the scale of {folder}")
-    return SparsePoints(Path(folder), places_of(load_info(Path(map_folder))), SparseChoice())
+    if not stored.info.cameras:
+        raise InputError(f"{folder}: the map was trained without cameras, which would give its scale")
+    return SparsePoints(Path(folder), places_of(stored.info), SparseChoice())
 
 
 def places_of(info: MapInfo) -> list[tuple[str, SE3]]:

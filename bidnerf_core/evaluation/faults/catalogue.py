@@ -7,9 +7,9 @@ import math
 import torch
 
 from bidnerf_core.evaluation.faults import camera, colour, depth, scene, whole_image
-from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault, WholeNumbers
+from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.settings import Above, Range
+from bidnerf_core.settings import Above, Range, WholeNumbers
 
 FACTOR = Above(0.0, 100.0)
 LARGEST_SHIFT = 10_000.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,20 +15,10 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.registry import Plugins
-from bidnerf_core.settings import Range
+from bidnerf_core.settings import Range, WholeNumbers
 
 Change: TypeAlias = Callable[[Frame, float, Generator], Frame]
 """A function that returns the frame with a fault of the given size; all random choices are drawn from the generator."""
-
-
-class WholeNumbers(Range):
-    """The whole numbers from ``least`` to ``most``."""
-
-    def __contains__(self, value: object) -> bool:
-        return super().__contains__(value) and float(cast(float, value)).is_integer()
-
-    def __str__(self) -> str:
-        return f"a whole number, {super().__str__()}"
 
 
 SHARE = Range(0.0, 1.0)

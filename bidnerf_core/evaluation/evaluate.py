@@ -1,0 +1,309 @@
+"""Evaluation from Python: many localizations of one map as a table, and of several maps side by side."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from bidnerf_core.datasets import Dataset, ReadingProgress
+from bidnerf_core.datasets.dataset import positions
+from bidnerf_core.errors import Cancelled, InputError, amount
+from bidnerf_core.evaluation.bench import (
+    Plan,
+    changed_settings,
+    check_points,
+    left_to_do,
+    planned,
+    repeated_frames,
+    run_trials,
+    shard_of,
+)
+from bidnerf_core.evaluation.comparison import Comparison, compare_maps, map_labels, plan_comparison
+from bidnerf_core.evaluation.protocols import Size, find_protocol
+from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
+from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
+from bidnerf_core.evaluation.trial import Trial
+from bidnerf_core.evaluation.trials import Opened, open_data, open_map
+from bidnerf_core.evaluation.workers import workers_for
+from bidnerf_core.frames.frame import View
+from bidnerf_core.localization import settings_of
+from bidnerf_core.maps.description import load_info
+from bidnerf_core.maps.map import Map
+from bidnerf_core.progress import Cancel, ProgressCallback
+from bidnerf_core.scenes.closed_form_data import is_closed_form
+
+log = logging.getLogger("bidnerf")
+
+Scene: TypeAlias = Map | str | Path
+"""A map in memory, the folder of a map, or demo:NAME."""
+Data: TypeAlias = Dataset | Sequence[View] | str | Path
+"""A dataset in memory, posed images (T_world_camera), the folder of a dataset, or demo:NAME."""
+
+
+def evaluate(
+    scene: Scene,
+    data: Data,
+    *,
+    protocol: str = "none",
+    sizes: Sequence[float | Sequence[float]] | None = None,
+    method: str = "auto",
+    config: Any = None,
+    trials: int | None = None,
+    seed: int | None = None,
+    split: str = "test",
+    frames: Sequence[str] | None = None,
+    depth: bool = True,
+    faults: Sequence[str] = (),
+    device: str = "cpu",
+    workers: int | None = 1,
+    out: str | Path | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> ResultTable:
+    """Localize many frames of ``data`` in a map, from the starts of a protocol or from none, and return all results.
+
+    ``protocol`` chooses frames, seeds and starts; ``sizes`` are the errors of the start in its units, ``trials`` is the number
+    of trials of each size, and None stands for the protocol's own. ``config`` holds the method's settings: an instance of its
+    type, or a dictionary of those that differ from the defaults. ``faults`` are applied to the images, such as
+    ``"depth-scale:1.02"``. ``device`` is that of a map that is read from a folder.
+
+    ``out`` is a file of results: a trial that it holds is not run again, and each result is on disk before the next trial
+    begins, so that an evaluation that was interrupted or cancelled goes on with the same call. ``workers`` is the number of
+    processes (None: one a core); several need a map and data in folders, and a main module that can be imported. With one,
+    everything happens in the calling thread.
+
+    Raises ``InputError`` for an evaluation that cannot be carried out, and ``Cancelled`` once ``cancel`` returns True and the
+    trials under way have ended.
+    """
+    plan = Plan(
+        map=_name(scene), data=_name(data), protocol=protocol, sizes=_sizes(sizes), method=method,
+        config=_config(method, config), trials=trials, seed=seed, split=split,
+        frames=None if frames is None else tuple(frames), device=device, depth=depth, faults=tuple(faults),
+    )  # fmt: skip
+    in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
+    if in_memory and workers not in (1, None):
+        raise InputError(
+            f"workers is {workers}, expected 1: other processes read the map and the data from folders, and these are in memory"
+        )
+    opened = _opened(scene, data, device) if in_memory else None
+    return run_plan(
+        plan, opened, workers=1 if in_memory else workers, out=out, progress=progress, cancel=cancel
+    )
+
+
+def run_plan(
+    plan: Plan,
+    scene: Opened | None = None,
+    *,
+    shard: int = 0,
+    shards: int = 1,
+    workers: int | None = 1,
+    dask: str | None = None,
+    out: str | Path | None = None,
+    command: str | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> ResultTable:
+    """Run the trials of a plan, or one part of ``shards``, as ``evaluate`` does.
+
+    ``scene`` is the map and the dataset in memory, by default those that the plan names. ``dask`` is the address of a scheduler
+    whose workers run the trials, and ``command`` is recorded beside the results as what made them.
+    """
+    if dask is not None and workers not in (1, None):
+        raise InputError("workers and dask contradict each other: a cluster has its own workers")
+    opened = scene or _opened(plan.map, plan.data, plan.device)
+    every = planned(plan, opened[1])
+    check_points(plan, every, opened)
+    if repeated := repeated_frames(every):
+        log.info(repeated)
+    trials = shard_of(every, shard, shards)
+    with ResultsFile(None if out is None else Path(out)) as file:
+        todo = left_to_do(trials, file, opened)
+        _note_kept(trials, todo, file)
+        if todo:
+            on_cpu = plan.device == "cpu"
+            with workers_for(len(todo), on_cpu, workers, dask) as (executor, at_once, what):
+                if file.path is not None:
+                    note_run(file.path, provenance(command or script_command(), what))
+                here = opened if dask is None and at_once == 1 else None
+                try:
+                    run_trials(todo, file, executor, at_once, progress, cancel, here)
+                except BrokenProcessPool as error:
+                    raise InputError(
+                        f"a worker process ended by itself (is there enough memory for {at_once} of them?); "
+                        f"finished trials are kept{_where(file)}, the same command goes on"
+                    ) from error
+            _check_complete(trials, file)
+        file.put_in_order(trials)
+        return ResultTable(tuple(file.results[key_of(trial)] for trial in trials))
+
+
+def compare(
+    scenes: Sequence[Scene] | Mapping[str, Scene],
+    data: Data,
+    *,
+    protocol: str = "none",
+    size: float | Sequence[float] | None = None,
+    method: str = "auto",
+    config: Any = None,
+    trials: int | None = None,
+    seed: int | None = None,
+    split: str = "test",
+    frames: Sequence[str] | None = None,
+    depth: bool = True,
+    device: str = "cpu",
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> Comparison:
+    """Localize the same frames from the same starts in several maps, and return success and cost of each.
+
+    Arguments are as for ``evaluate``, with one size. ``scenes`` may be a dictionary, whose keys then name the maps. Maps in
+    folders are tried in a process each, of which the peak memory is measured; maps in memory, and all maps where the data is in
+    memory, are tried in this process. One trial runs at a time. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does.
+    """
+    plan = Plan(
+        map="", data=_name(data), protocol=protocol,
+        sizes=find_protocol(protocol).sizes[:1] if size is None else _sizes([size]), method=method,
+        config=_config(method, config), trials=trials, seed=seed, split=split,
+        frames=None if frames is None else tuple(frames), device=device, depth=depth,
+    )  # fmt: skip
+    return run_comparison(plan, scenes, data, progress=progress, cancel=cancel)
+
+
+def run_comparison(
+    plan: Plan,
+    scenes: Sequence[Scene] | Mapping[str, Scene],
+    data: Data | None = None,
+    *,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> Comparison:
+    """Run a plan of one size on each of several maps, as ``compare`` does; its own map is not used.
+
+    ``data`` are by default those that the plan names.
+    """
+    named = dict(scenes) if isinstance(scenes, Mapping) else _named(scenes)
+    if not named:
+        raise InputError("no maps to compare, expected at least one")
+    data = plan.data if data is None else data
+    opened = {
+        name: _opened(scene, data, plan.device) if isinstance(scene, Map) or not isinstance(data, str | Path) else None
+        for name, scene in named.items()
+    }  # fmt: skip
+    dataset = next((known[1] for known in opened.values() if known is not None), None) or _dataset(data)
+    places = [name if opened[name] is not None else str(scene) for name, scene in named.items()]
+    starts = plan_comparison(plan, places, dataset)
+    folders = [place for place, known in zip(places, opened.values(), strict=True) if known is None]
+    for folder in folders:
+        if not is_closed_form(folder):
+            load_info(Path(folder))
+    begins = "; a process for each begins" if folders else ""
+    log.info("%s in %s%s", amount(len(starts), "start"), amount(len(named), "map"), begins)
+    return compare_maps(starts, list(named), list(opened.values()), progress, cancel)
+
+
+@dataclass(frozen=True, eq=False)
+class _GivenViews:
+    """Posed images in memory as a ``Dataset`` whose every split holds all of them."""
+
+    given: tuple[View, ...]
+    path: Path = Path("views")
+    splits: tuple[str, ...] = ("test",)
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def frame_names(self, split: str) -> list[str]:
+        return [view.frame.name for view in self.given]
+
+    def views(
+        self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
+    ) -> list[View]:
+        known = self.frame_names(split)
+        asked = known if names is None else names
+        return [self.given[place] for place in positions(known, known, asked, "views")]
+
+
+def _note_kept(trials: Sequence[Trial], todo: Sequence[Trial], file: ResultsFile) -> None:
+    """Log how many trials are not run again, and how many results cannot be checked, because an earlier version wrote them."""
+    if len(todo) < len(trials):
+        log.info("%s: %d of %d trials are already there", file.path, len(trials) - len(todo), len(trials))
+    known = [file.results.get(key_of(trial)) for trial in trials]
+    count = sum(result is not None and result.inputs is None for result in known)
+    if count:
+        log.info(
+            "%s: %d results of an earlier version do not record their images and are kept unchecked", file.path, count
+        )  # fmt: skip
+
+
+def _check_complete(trials: Sequence[Trial], file: ResultsFile) -> None:
+    """Raise ``Cancelled`` where trials have no result, which happens only if they were not begun."""
+    left = sum(key_of(trial) not in file.results for trial in trials)
+    if left:
+        are = "is" if left == 1 else "are"
+        kept = (
+            "nothing is kept without a file of results" if file.path is None else "the same command goes on"
+        )
+        raise Cancelled(f"stopped; {amount(left, 'trial')} {are} left{_where(file)}, {kept}")
+
+
+def _where(file: ResultsFile) -> str:
+    return "" if file.path is None else f" in {file.path}"
+
+
+def _opened(scene: Scene, data: Data, device: str) -> Opened:
+    """Return the map and the dataset, each read from its folder unless it is in memory."""
+    stored = scene if isinstance(scene, Map) else open_map(str(scene), device)
+    return stored, _dataset(data, stored)
+
+
+def _dataset(data: Data, stored: Map | None = None) -> Dataset:
+    if isinstance(data, str | Path):
+        return open_data(str(data), stored)
+    if isinstance(data, Dataset):
+        return data
+    views = tuple(view for view in data if isinstance(view, View)) if isinstance(data, Sequence) else ()
+    if not views or len(views) < len(data):
+        raise InputError(f"data is a {type(data).__name__}, expected a folder, a dataset or a list of views")
+    return _GivenViews(views)
+
+
+def _name(value: Scene | Data) -> str:
+    """Return the name under which results know a map or a dataset: its folder, or the backend of a map in memory."""
+    if isinstance(value, Map):
+        return value.info.backend
+    if isinstance(value, str | Path):
+        return str(value)
+    return str(value.path) if isinstance(value, Dataset) else "views"
+
+
+def _named(scenes: Sequence[Scene]) -> dict[str, Scene]:
+    """Return the maps by the shortest names that distinguish them; maps in memory of one backend are numbered."""
+    folders = [str(scene) for scene in scenes if not isinstance(scene, Map)]
+    if len({Path(folder).resolve() for folder in folders}) != len(folders):
+        raise InputError(f"maps: {', '.join(folders)}: one is named twice, expected different ones")
+    labels = iter(map_labels(folders))
+    found: dict[str, Scene] = {}
+    for scene in scenes:
+        name = base = _name(scene) if isinstance(scene, Map) else next(labels)
+        number = 1
+        while name in found:
+            number += 1
+            name = f"{base} {number}"
+        found[name] = scene
+    return found
+
+
+def _sizes(given: Sequence[float | Sequence[float]] | None) -> tuple[Size, ...] | None:
+    if given is None:
+        return None
+    return tuple(tuple(map(float, size)) if isinstance(size, Sequence) else (float(size),) for size in given)
+
+
+def _config(method: str, config: Any) -> str:
+    """Return the JSON of the settings that differ from the method's defaults."""
+    if config is None or isinstance(config, Mapping):
+        config = settings_of(method, dict(config or {}))
+    return changed_settings(method, config)

@@ -1,0 +1,187 @@
+"""Evaluation from Python: in memory, from any thread, cancelled and resumed, and the same as from the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import bidnerf_core as bn
+import tiny
+from bidnerf_core.cli import main
+from bidnerf_core.datasets import open_dataset
+from bidnerf_core.evaluation.results import read_results
+from bidnerf_core.evaluation.trial import TrialResult
+from bidnerf_core.io.json import from_plain
+from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
+from tiny import backends_listed_once  # noqa: F401
+
+pytestmark = pytest.mark.usefixtures("backends_listed_once")
+QUICK: dict[str, Any] = {
+    "method": "bid",
+    "config": {"rays": 16, "max_steps": 2},
+    "protocol": "bid",
+    "sizes": [0.3],
+}
+WORDS = ["--method", "bid", "--rays", "16", "--max-steps", "2", "--size", "0.3", "--workers", "1"]
+BLOBS = "demo:blobs"
+
+
+def timeless(rows: Any) -> list[TrialResult]:
+    """The results without what two runs differ in."""
+    return [dataclasses.replace(row, seconds=0.0, peak_memory_bytes=0) for row in rows]
+
+
+def placeless(rows: Any) -> list[TrialResult]:
+    """The results without the names of their map and data too."""
+    return [
+        dataclasses.replace(row, trial=dataclasses.replace(row.trial, map="", data="")) for row in timeless(rows)
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("evaluate")
+    tiny.write_dataset(folder / "data")
+    assert main(["train", str(folder / "data"), "--out", str(folder / "map"), *tiny.options()]) == 0
+    return folder
+
+
+def test_a_table_has_what_the_command_writes(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, data = folder / "map", folder / "data"
+    words = ["evaluate", str(scene), str(data), "--out", str(tmp_path / "command.jsonl"), "--trials", "3"]
+    assert main([*words, *WORDS, "--fault", "none", "blur:1"]) == 0
+    expected = timeless(read_results([tmp_path / "command.jsonl"]))
+    given = {"trials": 3, "faults": ["none", "blur:1"], **QUICK}
+    capsys.readouterr()
+    table = bn.evaluate(scene, data, out=tmp_path / "python.jsonl", **given)
+    assert capsys.readouterr() == ("", "")
+    assert timeless(table.rows) == expected == timeless(read_results([tmp_path / "python.jsonl"]))
+    loaded, dataset = bn.load_map(scene), open_dataset(data)
+    in_memory = bn.evaluate(loaded, dataset, **given)
+    assert placeless(in_memory.rows) == placeless(table.rows)
+    assert [row.trial.map for row in in_memory.rows] == [loaded.info.backend] * 6
+    assert placeless(bn.evaluate(loaded, dataset.views("test"), **given).rows) == placeless(table.rows)
+
+
+def test_a_table_is_summed_up_saved_and_loaded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = bn.evaluate(BLOBS, BLOBS, trials=4, **QUICK)
+    (row,) = table.summary
+    found = row.statistics.criteria["5deg 0.05"]
+    assert found is not None
+    assert (row.start, row.label, found.rate.trials) == ("bid 0.3", "bid", 4)
+    assert 0 <= found.rate.low <= found.rate.rate <= found.rate.high <= 1
+    assert "5deg 0.05" in str(table)
+    assert "bid 0.3" in str(table)
+    table.save(tmp_path / "r.jsonl")
+    again = bn.ResultTable.load(tmp_path / "r.jsonl")
+    assert (again, str(again)) == (table, str(table))
+    assert main(["report", str(tmp_path / "r.jsonl"), "--out", str(tmp_path / "report")]) == 0
+    assert str(table) in capsys.readouterr().out
+
+
+def test_the_folder_is_read_anew_at_each_call(folder: Path, tmp_path: Path) -> None:
+    """A map that was trained again under the same name is not mistaken for the one before."""
+    scene = tmp_path / "map"
+    for steps in (4, 8):
+        words = ["train", str(folder / "data"), "--out", str(scene), "--overwrite", *tiny.options(steps)]
+        assert main(words) == 0
+        (row,) = bn.evaluate(scene, folder / "data", trials=1, **QUICK).rows
+        assert row.weights == bn.load_map(scene).info.weights
+
+
+def test_any_thread_evaluates_and_leaves_no_trace() -> None:
+    expected = timeless(bn.evaluate(BLOBS, BLOBS, trials=2, **QUICK).rows)
+    handler, threads = signal.getsignal(signal.SIGINT), torch.get_num_threads()
+    found: dict[int, Any] = {}
+
+    def work(number: int) -> None:
+        scene, data = closed_form_map(BLOBS), closed_form_data(BLOBS)
+        found[number] = placeless(bn.evaluate(scene, data, trials=2, **QUICK).rows)
+
+    others = [threading.Thread(target=work, args=(number,)) for number in range(2)]
+    for other in others:
+        other.start()
+    for other in others:
+        other.join()
+    assert found[0] == found[1] == placeless(expected)
+    assert (signal.getsignal(signal.SIGINT), torch.get_num_threads()) == (handler, threads)
+
+
+def test_a_cancelled_evaluation_goes_on(tmp_path: Path) -> None:
+    out, stop = tmp_path / "r.jsonl", threading.Event()
+    seen: list[bn.Progress] = []
+
+    def stop_at_two(progress: bn.Progress) -> None:
+        seen.append(progress)
+        if progress.done == 2:
+            stop.set()
+
+    with pytest.raises(bn.Cancelled, match=r"3 trials are left in .*, the same command goes on"):
+        bn.evaluate(BLOBS, BLOBS, trials=5, out=out, progress=stop_at_two, cancel=stop.is_set, **QUICK)
+    assert [(p.stage, p.done, p.total, p.unit) for p in seen] == [("trials", n, 5, "trials") for n in (1, 2)]
+    before = out.read_bytes()
+    assert len(read_results([out])) == 2
+    table = bn.evaluate(BLOBS, BLOBS, trials=5, out=out, **QUICK)
+    assert out.read_bytes().startswith(before)
+    assert timeless(table.rows) == timeless(bn.evaluate(BLOBS, BLOBS, trials=5, **QUICK).rows)
+    with pytest.raises(bn.Cancelled, match="nothing is kept"):
+        bn.evaluate(BLOBS, BLOBS, trials=1, cancel=lambda: True, **QUICK)
+
+
+def test_an_error_of_the_callback_is_the_callers_and_its_trial_is_kept(tmp_path: Path) -> None:
+    def fail(progress: bn.Progress) -> None:
+        raise LookupError(str(progress))
+
+    with pytest.raises(LookupError, match=r"trials: 1/3 trials, \d within"):
+        bn.evaluate(BLOBS, BLOBS, trials=3, out=tmp_path / "r.jsonl", progress=fail, **QUICK)
+    assert len(read_results([tmp_path / "r.jsonl"])) == 1
+
+
+def test_what_cannot_be_evaluated_is_refused() -> None:
+    scene = closed_form_map(BLOBS)
+    wrong: dict[str, dict[str, Any]] = {
+        "workers is 2, expected 1": {"workers": 2},
+        "trials is 0, expected a whole number, 1 to": {"trials": 0},
+        "trials is 2.5": {"trials": 2.5},
+        "seed is -1": {"seed": -1},
+        "size is 0.3:1, expected e_t": {"sizes": [(0.3, 1.0)]},
+        "did you mean 'rays'": {"config": {"ray": 3}},
+        "names 0001 more than once": {"frames": ["0001", "0001"]},
+        "no fault 'blurr'": {"faults": ["blurr:1"]},
+        "data is a int": {"data": 3},
+        "data is a list": {"data": [1]},
+    }
+    for said, change in wrong.items():
+        given = {"scene": scene, "data": BLOBS, "trials": 1, **QUICK, **change}
+        with pytest.raises(bn.InputError, match=said):
+            bn.evaluate(**given)
+
+
+def test_maps_in_memory_and_in_folders_are_compared(folder: Path, tmp_path: Path) -> None:
+    given = {"trials": 2, "method": "bid", "config": QUICK["config"], "protocol": "bid", "size": 0.3}
+    scene, data = bn.load_map(folder / "map"), folder / "data"
+    seen: list[str] = []
+    found = bn.compare([scene, folder / "map", scene], data, progress=lambda p: seen.append(str(p)), **given)
+    assert [row.map for row in found.rows] == ["tiny", "map", "tiny 2"] or len(
+        {r.map for r in found.rows}
+    ) == 3
+    assert len(seen) == 6
+    first, other, third = map(placeless, found.results)
+    assert first == other == third
+    assert found.rows[0].map_bytes > 0
+    named = bn.compare({"mine": scene}, open_dataset(data), **given)
+    assert [row.map for row in named.rows] == ["mine"]
+    assert "mine" in str(named)
+    named.save(tmp_path / "c.json")
+    assert from_plain(bn.Comparison, json.loads((tmp_path / "c.json").read_text()), "c") == named
+    with pytest.raises(bn.Cancelled):
+        bn.compare([scene], data, cancel=lambda: True, **given)
