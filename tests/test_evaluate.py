@@ -20,9 +20,7 @@ from bidnerf_core.evaluation.results import read_results
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.io.json import from_plain
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
-from tiny import backends_listed_once  # noqa: F401
 
-pytestmark = pytest.mark.usefixtures("backends_listed_once")
 QUICK: dict[str, Any] = {
     "method": "bid",
     "config": {"rays": 16, "max_steps": 2},
