@@ -22,7 +22,7 @@ from bidnerf_core.captures.photos import (
 from bidnerf_core.captures.relocated_photos import Relocation, image_motion, relocated, suspects
 from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.features import Features
 from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, LandmarkConfig, TrackedViews
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.landmarks import HeldOutTrial
@@ -39,7 +39,7 @@ CLIPPED = 0.25
 def surveyed(
     tracked: TrackedViews,
     views: Sequence[View],
-    features: Features = SIFT,
+    features: Features | None = None,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     trial: HeldOutTrial = NOT_TRIED,
 ) -> CaptureReport:
@@ -55,7 +55,9 @@ def surveyed(
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, count, group)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
-    posed |= dict.fromkeys(doubtful) | relocated(tracked, views, doubtful, features, config)
+    posed |= dict.fromkeys(doubtful) | relocated(
+        tracked, views, doubtful, features or tracked.detector, config
+    )
     exposure = exposures(views, seen, measures.brightness, near)
     problems = _problems(measures, exposure, near, group, posed)
     sharpness = above_neighbours(measures.sharpness, near)

@@ -14,7 +14,7 @@ from bidnerf_core.captures.links import groups, linked
 from bidnerf_core.captures.pose_refinement import AdjustedPoses, adjusted_poses
 from bidnerf_core.captures.relocated_photos import Relocation, relocated, suspects
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.features import Features
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews
 
 INCONSISTENT = 0.25
@@ -38,7 +38,7 @@ def training_poses(
     tracked: TrackedViews,
     views: Sequence[View],
     least: float = INCONSISTENT,
-    features: Features = SIFT,
+    features: Features | None = None,
     config: LandmarkConfig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TrainingPoses:
@@ -49,7 +49,7 @@ def training_poses(
     """
     config = LandmarkConfig() if config is None else config
     given = tracked.T_world_camera
-    wrong = _wrongly_posed(tracked, views, features, config)
+    wrong = _wrongly_posed(tracked, views, features or tracked.detector, config)
     if wrong:
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
         for number, found in wrong.items():

@@ -21,7 +21,7 @@ from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.features import USUAL_FEATURES, Features
 from bidnerf_core.mapping.landmark_building import (
     DEFAULT_LANDMARKS,
     LandmarkConfig,
@@ -53,19 +53,19 @@ class _Answer:
 
 def build_tried_landmarks(
     views: Sequence[View],
-    features: Features = SIFT,
+    features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
     """Build landmarks as ``mapping.landmark_building.build_landmarks`` does, and try them: see ``tried_landmarks``."""
-    return tried_landmarks(tracked_views(views, features, config, progress), views, features, config, report)
+    return tried_landmarks(tracked_views(views, features, config, progress), views, None, config, report)
 
 
 def tried_landmarks(
     tracked: TrackedViews,
     views: Sequence[View],
-    features: Features = SIFT,
+    features: Features | None = None,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
@@ -77,7 +77,7 @@ def tried_landmarks(
     """
     landmarks = tracked.landmarks(config, report)
     held_out = _held_out(len(views))
-    answers = _answers(tracked, views, held_out, features, config)
+    answers = _answers(tracked, views, held_out, features or tracked.detector, config)
     landmarks = replace(landmarks, trial=_trial(answers, len(held_out)))
     if len(answers) < ENOUGH_ANSWERS:
         return landmarks

@@ -17,6 +17,7 @@ from bidnerf_core.errors import Cancelled, InputError, InputWarning, UsageError,
 COMMANDS = {
     "demo": "train a closed-form scene, localize unseen frames in it, draw the result",
     "backends": "list the installed kinds of field",
+    "plugins": "list all that is registered by name: backends, readers, methods and others",
     "train": "make a map from a dataset",
     "bake": "add to a map what localization without a start needs, as train does",
     "info": "describe a map",

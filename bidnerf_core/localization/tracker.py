@@ -48,7 +48,7 @@ from bidnerf_core.localization.tracking.relocalization import (
 from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.features import Sift, grey_image
+from bidnerf_core.mapping.features import grey_image, strongest
 
 START = 0.03, 0.1
 """Standard deviations of a start whose uncertainty is not given: share of the scene's extent, and radians."""
@@ -78,7 +78,8 @@ class Tracker:
         scene = map_with_distances(localizer)
         self._by_landmarks: ByLandmarks | None = None
         if localizer.matches_landmarks and localizer.matcher is not None:
-            detector = LandmarkDetector(localizer.matcher.landmarks, Sift(count=config.keypoints))
+            features = strongest(localizer.matcher.features, config.keypoints)
+            detector = LandmarkDetector(localizer.matcher.landmarks, features)
             self._by_landmarks = ByLandmarks(scene, detector, config, localizer.depth_sensor)
         self._odometry = Odometry(config.points, localizer.depth_sensor.noise)
 

@@ -5,8 +5,9 @@ Any detector that turns an image into ``Keypoints``, a learned one included, can
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Protocol, runtime_checkable
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from bidnerf_core.registry import Plugins, interface_defects
 from bidnerf_core.settings import Range, Settings
 
 NORM = 512.0
@@ -47,6 +49,15 @@ class Features(Protocol):
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints: ...
 
 
+@runtime_checkable
+class LimitedFeatures(Features, Protocol):
+    """An optional part of ``Features``: a detector that is faster where fewer keypoints are wanted."""
+
+    def at_most(self, count: int) -> Features:
+        """Return the detector with another largest number of keypoints."""
+        ...
+
+
 @dataclass(frozen=True)
 class Sift(Settings):
     """SIFT (Lowe 2004) by OpenCV, with the root normalisation of Arandjelovic and Zisserman 2012."""
@@ -58,6 +69,9 @@ class Sift(Settings):
     # Pixels along the longer side above which an image is reduced first: a phone's twelve megapixels hold no more
     # keypoints of the sizes that maps are made of, and take half a minute.
     largest: Annotated[int, Range(16, 10**5)] = 800
+
+    def at_most(self, count: int) -> Sift:
+        return replace(self, count=count)
 
     def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
         # The precise upscaling maps index x to 2 x: without it all keypoints of the first octave are a quarter of a
@@ -78,6 +92,36 @@ class Sift(Settings):
 
 SIFT = Sift()
 """SIFT (Lowe 2004) by OpenCV, with root normalisation."""
+
+
+def _defects(features: Any) -> Iterator[str]:
+    yield from interface_defects(features, (), {"__call__": ("rgb",)})
+
+
+USUAL_FEATURES = "sift"
+"""The name of the detector that is used where none is named."""
+FEATURES: Plugins[Features] = Plugins("features", _defects, first=(USUAL_FEATURES,))
+"""The detectors by name."""
+
+
+def find_features(name: str, wanted_by: str = "") -> Features:
+    """Return a detector by name. Raises ``PluginError``, an ``InputError``, for an unknown name and a broken plugin."""
+    return FEATURES.load(name, wanted_by)
+
+
+@dataclass(frozen=True)
+class _Strongest:
+    features: Features
+    count: int
+
+    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+        found = self.features(rgb)
+        return found[torch.arange(min(self.count, len(found)))]
+
+
+def strongest(features: Features, count: int) -> Features:
+    """Return a detector that finds at most ``count`` keypoints, the strongest."""
+    return features.at_most(count) if isinstance(features, LimitedFeatures) else _Strongest(features, count)
 
 
 def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:

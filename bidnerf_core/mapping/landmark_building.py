@@ -16,7 +16,7 @@ from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import SeenLandmarks, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.features import USUAL_FEATURES, Features, Sift, find_features
 from bidnerf_core.mapping.keypoint_depth import keypoint_depth_noise, measured_depth, placed
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks, seen_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
@@ -59,7 +59,7 @@ DEFAULT_LANDMARKS = LandmarkConfig()
 
 def build_landmarks(
     views: Sequence[View],
-    features: Features = SIFT,
+    features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
@@ -78,6 +78,12 @@ class TrackedViews:
 
     observations: TrackedKeypoints
     depth: Float[Tensor, "k"]  # metres, of all keypoints by number; 0 where none was measured
+    features: str | Features = USUAL_FEATURES  # what detected the keypoints: by name, if it is registered
+
+    @property
+    def detector(self) -> Features:
+        """What detected the keypoints."""
+        return find_features(self.features) if isinstance(self.features, str) else self.features
 
     def landmarks(
         self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None
@@ -90,7 +96,9 @@ class TrackedViews:
                 f"no landmark found in {images} images: expected texture that several images show from different places"
             )
         moving = float((self.motion != 0).any(1).double().mean())
-        return replace(_bounded(found, config.most, report), moving=moving)
+        name = self.features if isinstance(self.features, str) else ""
+        name = USUAL_FEATURES if isinstance(self.features, Sift) else name
+        return replace(_bounded(found, config.most, report), moving=moving, features=name)
 
     def seen(self, config: LandmarkConfig) -> list[SeenLandmarks]:
         """Return the triangulated landmarks that each image shows; training uses their depth where none was measured."""
@@ -151,18 +159,23 @@ class TrackedViews:
 
 def tracked_views(
     views: Sequence[View],
-    features: Features = SIFT,
+    features: str | Features = USUAL_FEATURES,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TrackedViews:
-    """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks."""
+    """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
+
+    ``features`` is the name of a detector, which is stored with the landmarks and finds them in queries, or a detector itself.
+    Raises ``InputError`` if there are no views and for an unknown name.
+    """
+    detector = find_features(features) if isinstance(features, str) else features
     if not views:
         raise InputError("nothing to build landmarks from: expected at least one view")
     pairs = _pairs([view.T_ref_camera for view in views], config)
     counter = _Counter(progress, len(views) + len(pairs))
-    images = counter.over(_mapped(lambda view: _detected(view, features), views))
+    images = counter.over(_mapped(lambda view: _detected(view, detector), views))
     depth = [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
-    return TrackedViews(_joined(images, pairs, counter), torch.cat(depth))
+    return TrackedViews(_joined(images, pairs, counter), torch.cat(depth), features)
 
 
 def _pairs(poses: Sequence[SE3], config: LandmarkConfig) -> list[list[int]]:

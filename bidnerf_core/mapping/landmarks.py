@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.devices import moved, working_device
+from bidnerf_core.mapping.features import USUAL_FEATURES
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class LandmarkMap:
         0.0  # share of the map's images whose cameras moved while rows were exposed, see ``rolling_shutter``
     )
     cameras: tuple[Intrinsics, ...] = ()  # of the images, where known
+    features: str = USUAL_FEATURES  # the name of the detector whose keypoints they are; "" where it has none
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -13,6 +13,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import from_plain, read_json
+from bidnerf_core.mapping.features import USUAL_FEATURES
 
 FORMAT = "bidnerf map"
 VERSION = 1
@@ -42,6 +43,7 @@ class MapInfo:
     surface: str | None = None  # baked from these weights
     landmarks: str | None = None
     landmark_source: LandmarkSource | None = None  # the images they were built from, where that is recorded
+    landmark_features: str = USUAL_FEATURES  # name of the detector whose keypoints they are
     capture: str | None = None  # record of the photos that gave the landmarks
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))

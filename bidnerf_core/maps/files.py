@@ -72,10 +72,15 @@ def save_landmarks(
     """Add landmarks to map ``of``, replacing earlier ones, and the error with which the field renders its training images.
 
     ``source`` is the kind of images that the landmarks were built from. Raises ``InputError`` where another training has
-    replaced that map meanwhile.
+    replaced that map meanwhile, and where the detector of the landmarks has no name by which a query could find it.
     """
+    if not landmarks.features:
+        raise InputError(f"{folder}: landmarks of a detector without a name; expected one that is registered")
     content = tensors_to_bytes(landmark_tensors(landmarks))
-    return _save_part(folder, of, "landmarks", content, colour_noise=colour_noise, landmark_source=source)
+    return _save_part(
+        folder, of, "landmarks", content, colour_noise=colour_noise, landmark_source=source,
+        landmark_features=landmarks.features,
+    )  # fmt: skip
 
 
 def save_capture(folder: Path, of: MapInfo, capture: CaptureReport) -> MapInfo:

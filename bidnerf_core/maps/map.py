@@ -71,7 +71,8 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     cast(nn.Module, field).load_state_dict(tensors)
     cast(nn.Module, field).requires_grad_(False).eval()
     if landmarks is not None:
-        landmarks = replace(landmarks, cameras=tuple(camera.intrinsics for camera in info.cameras))
+        cameras = tuple(camera.intrinsics for camera in info.cameras)
+        landmarks = replace(landmarks, cameras=cameras, features=info.landmark_features)
     return Map(info, field, surface, landmarks).to(device)
 
 

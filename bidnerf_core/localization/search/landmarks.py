@@ -24,7 +24,7 @@ from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.localization.search.twins import twin_of
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
-from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.features import Features
 
 STRONGEST = 700
 """Number of keypoints, the strongest of an image, that are matched first; all are matched only if these do not suffice."""
@@ -43,7 +43,7 @@ not to contradict it.
 def propose(
     matcher: LandmarkMatcher,
     views: Sequence[View],
-    features: Features = SIFT,
+    features: Features | None = None,
     seed: int = 0,
     prior: CalibrationPrior | None = None,
     evidence: CameraEvidence = NO_EVIDENCE,
@@ -53,7 +53,7 @@ def propose(
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
     ``prior``: how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal length
-    is approximate. One correction is estimated for all views; those of different cameras are taken as given. ``evidence``: what
+    is approximate. ``features`` finds the keypoints, by default the detector of the map. One correction is estimated for all views; those of different cameras are taken as given. ``evidence``: what
     else is known about the camera. ``seek_twin``: whether to look for another place that the images may show. ``moving``:
     whether to estimate how the camera moved while the rows of its image were exposed, where that is evident.
     Raises ``InputError`` if there is no view.
@@ -62,7 +62,9 @@ def propose(
         raise InputError("nothing to localize: expected at least one view")
     prior = _calibration_prior(views) if prior is None else prior
     clock = Stopwatch()
-    query = LandmarkQuery(query_images(views, features), matcher.landmarks, prior, evidence, moving)
+    query = LandmarkQuery(
+        query_images(views, features or matcher.features), matcher.landmarks, prior, evidence, moving
+    )
     clock.lap("descriptors")
     matches, first = _first_pose(query, matcher, seed, clock)
     if first is None:
@@ -95,7 +97,7 @@ def confirm(
     matcher: LandmarkMatcher,
     views: Sequence[View],
     T_world_camera: SE3,
-    features: Features = SIFT,
+    features: Features | None = None,
     seek_twin: bool = False,
 ) -> Confirmation:
     """Match the landmarks near their projections at a pose of the last of ``views``, and refine it.
@@ -103,7 +105,9 @@ def confirm(
     ``seek_twin`` is as in ``propose``.
     """
     clock = Stopwatch()
-    query = LandmarkQuery(query_images(views, features), matcher.landmarks, _calibration_prior(views))
+    query = LandmarkQuery(
+        query_images(views, features or matcher.features), matcher.landmarks, _calibration_prior(views)
+    )
     clock.lap("descriptors")
     visible, matches, chance = visible_and_matching(query, T_world_camera)
     answer = confirmed(query, T_world_camera)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.devices import moved
-from bidnerf_core.mapping.features import squared_distances
+from bidnerf_core.mapping.features import Features, find_features, squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 
 EXHAUSTIVE = 4_000
@@ -44,6 +44,11 @@ class LandmarkMatcher:
         self._cells: _Cells | None = None
         if len(landmarks) > EXHAUSTIVE:
             self._cells = _Cells(landmarks.descriptors, seed)
+
+    @property
+    def features(self) -> Features:
+        """The detector whose keypoints the landmarks are. Raises ``PluginError``, an ``InputError``, where it is not installed."""
+        return find_features(self.landmarks.features, "the detector of the map's landmarks")
 
     def nearest(
         self, descriptors: UInt8[Tensor, "q d"], count: int

@@ -16,7 +16,7 @@ from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.calibration import FIXED
-from bidnerf_core.mapping.features import SIFT, Features
+from bidnerf_core.mapping.features import Features
 
 KEYPOINTS = 700
 """Number of keypoints, the strongest of a mirrored image, that are matched."""
@@ -53,11 +53,13 @@ class MirrorEvidence:
 
 
 def mirror_evidence(
-    matcher: LandmarkMatcher, views: Sequence[View], features: Features = SIFT, seed: int = 0
+    matcher: LandmarkMatcher, views: Sequence[View], features: Features | None = None, seed: int = 0
 ) -> MirrorEvidence:
     """Match the mirror image of the last of ``views``, which no pose explains unless the view itself is mirrored."""
     frame = mirror_image(views[-1].frame)
-    query = LandmarkQuery(query_images([View(frame, SE3.identity())], features), matcher.landmarks, FIXED)
+    query = LandmarkQuery(
+        query_images([View(frame, SE3.identity())], features or matcher.features), matcher.landmarks, FIXED
+    )
     matches = unguided_matches(query.images, matcher, KEYPOINTS)
     found = sample_consensus(query.observed(matches), matches.view, query.threshold, seed)
     agreeing = 0 if found is None else int(found.inliers.sum())
