@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ BOUNDS = demo_object().bounds
 @pytest.fixture(scope="module")
 def landmarks() -> LandmarkMap:
     points = Points(count=60, noise=0.2)
-    return build_landmarks(ring(points, 5), points)
+    return replace(build_landmarks(ring(points, 5), points), features="points")
 
 
 def saved(folder: Path, seed: int = 0) -> MapInfo:
@@ -53,6 +54,13 @@ def assert_equal(found: LandmarkMap | None, expected: LandmarkMap) -> None:
     for name, value in others.items():
         assert parts[name].dtype == value.dtype
         assert torch.equal(parts[name], value), name
+
+
+def test_landmarks_of_a_detector_without_a_name_are_not_stored(
+    tmp_path: Path, landmarks: LandmarkMap
+) -> None:
+    with pytest.raises(InputError, match="a detector without a name"):
+        save_landmarks(tmp_path, saved(tmp_path), replace(landmarks, features=""))
 
 
 def test_landmarks_come_back_as_they_were(landmarks: LandmarkMap, tmp_path: Path) -> None:
