@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bidnerf_core.evaluation.faults import FAULTS
+from bidnerf_core.registry import list_plugins
 
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "benchmarks" / "results"
@@ -298,7 +299,8 @@ def _fault_order(item: tuple[str, Any]) -> tuple[object, ...]:
 def catalogue(_: Records) -> str:
     """All faults that ``evaluate --fault`` knows."""
     rows = []
-    for name, fault in FAULTS.items():
+    for name in (info.name for info in list_plugins("faults") if info.is_bundled):
+        fault = FAULTS[name]
         neutral = "-" if fault.neutral is None else f"{fault.neutral:g}"
         unit = "" if fault.is_switch else fault.unit
         sizes = "" if fault.is_switch else ", ".join(f"{size:g}" for size in fault.sizes)

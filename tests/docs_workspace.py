@@ -34,7 +34,7 @@ EQUIVALENT_MM = 41  # on 35 mm film, about the focal length of that camera
 
 
 def fill(folder: Path) -> None:
-    """Write DATA, MAP, MAP2, photo.jpg, depth.png, photos/, camera.json, pose.json and RESULTS.jsonl into ``folder``."""
+    """Write DATA, SCAN, MAP, MAP2, photo.jpg, depth.png, photos/, camera.json and pose.json into ``folder``."""
     train, test = tiny.views(8), named(tiny.views(3, seed=1))
     write_transforms(folder / "DATA", {"train": train, "test": test}, tiny.BACKGROUND)
     write_map(folder / "MAP", train)
@@ -43,11 +43,22 @@ def fill(folder: Path) -> None:
     write_depth(folder / "depth.png", test[0])
     for number, view in enumerate(test[:2]):
         write_photo(folder / "photos" / f"{number}.jpg", view)
+    write_scan(folder / "SCAN", test)
     pose = test[0].T_ref_camera.matrix().tolist()
     (folder / "pose.json").write_text(json.dumps({"T_world_camera": pose, "outcome": Outcome.CONVERGED}))
     camera = PHOTO_CAMERA
     intrinsics = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": 24, "h": 24}
     (folder / "camera.json").write_text(json.dumps(intrinsics))
+
+
+def write_scan(folder: Path, views: list[View]) -> None:
+    """Write photos with a table of world-to-camera poses, the format of the documentation's example of a reader."""
+    rows = []
+    for view in views:
+        write_photo(folder / f"{view.frame.name}.jpg", view)
+        numbers = view.T_ref_camera.inverse().matrix()[:3].flatten().tolist()
+        rows.append(",".join([f"{view.frame.name}.jpg", *map(repr, numbers)]))
+    (folder / "poses.csv").write_text("\n".join(rows) + "\n")
 
 
 def named(views: list[View]) -> list[View]:
