@@ -78,3 +78,13 @@ def bidnerf(capsys: pytest.CaptureFixture[str]) -> Run:
         return CommandResult(status, printed.out, printed.err)
 
     return run
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Switch off the tests' own check of annotations, as it is for users."""
+    import jaxtyping
+
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

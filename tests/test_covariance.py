@@ -135,3 +135,14 @@ def test_the_deviation_of_a_position_is_that_of_its_least_certain_direction() ->
     for unknown in (math.inf, math.nan):
         covariance[0, 0] = unknown
         assert position_deviation(covariance) == math.inf
+
+
+def test_slopes_that_overflow_determine_no_pose() -> None:
+    """A field of absurd weights must give an answer without a covariance, not an error of linear algebra."""
+    scores = torch.randn((2, 40, 6), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    hessian = scores.mT @ scores
+    expected = sandwich_covariance(scores, hessian)
+    hessian[0, 2, 3] = torch.nan
+    found = sandwich_covariance(scores, hessian)
+    assert bool(found[0].isinf().all())
+    assert torch.equal(found[1], expected[1])

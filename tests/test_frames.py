@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 
@@ -31,3 +35,48 @@ def test_depth_counts_where_something_was_measured() -> None:
 def test_an_image_of_other_than_three_channels_is_told(channels: int) -> None:
     with pytest.raises(InputError, match=r"frame f: rgb has shape .*, expected \(height, width, 3\)"):
         Frame("f", torch.zeros(6, 8, channels), CAMERA)
+
+
+LENS = Intrinsics(20, 20, 12, 8, 24, 16)
+GOOD = {"rgb": torch.rand(16, 24, 3), "depth": torch.rand(16, 24), "alpha": torch.rand(16, 24)}
+NO_VALUES = torch.zeros(16, 24, 3)
+WRONG = [
+    ({"intrinsics": None}, "intrinsics is a NoneType"),
+    ({"intrinsics": {"fx": 1}}, "intrinsics is a dict"),
+    ({"intrinsics": replace(LENS, distortion=(-1e6,) * 14)}, "maps no ray to some of its pixels"),
+    ({"rgb": None}, "rgb is a NoneType"),
+    ({"rgb": NO_VALUES.numpy()}, "rgb is a ndarray, expected a tensor; Frame.from_numpy"),
+    ({"rgb": NO_VALUES.index_fill(0, torch.tensor([3]), torch.nan)}, "rgb has values that are NaN"),
+    ({"rgb": NO_VALUES.index_fill(2, torch.tensor([1]), torch.inf)}, "rgb has values that are NaN or inf"),
+    ({"rgb": NO_VALUES.byte()}, "rgb is of uint8, expected floats"),
+    ({"rgb": NO_VALUES.bool()}, "rgb is of bool"),
+    ({"rgb": NO_VALUES.long()}, "rgb is of int64"),
+    ({"rgb": NO_VALUES.to(torch.complex64)}, "rgb is of complex64"),
+    ({"rgb": NO_VALUES.to_sparse()}, "rgb is a sparse tensor"),
+    ({"rgb": NO_VALUES.to("meta")}, "has no values"),
+    ({"rgb": NO_VALUES.clone().requires_grad_()}, "rgb requires a gradient"),
+    ({"rgb": NO_VALUES[..., 0]}, "rgb has shape"),
+    ({"depth": torch.zeros(16, 24, 1)}, "depth has shape"),
+    ({"depth": np.zeros((16, 24))}, "depth is a ndarray"),
+    ({"depth": torch.full((16, 24), torch.nan)}, "depth has values that are NaN"),
+    ({"alpha": torch.zeros(24)}, "alpha has shape"),
+    ({"hidden": [False]}, "hidden is a list"),
+    ({"hidden": "all"}, "hidden is a str"),
+    ({"hidden": torch.zeros(16, 24, 1, dtype=torch.bool)}, "hidden has shape"),
+    ({"hidden": torch.zeros(16, 24)}, "expected booleans"),
+]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(("changed", "said"), WRONG, ids=range(len(WRONG)))
+def test_what_is_no_frame_is_refused_where_it_is_made(changed: dict[str, Any], said: str) -> None:
+    """Otherwise it would fail somewhere in a localization, with another error at each place."""
+    parts: dict[str, Any] = {"name": "a", "intrinsics": LENS} | GOOD
+    Frame(**parts)
+    with pytest.raises(InputError, match=f"^frame a: .*{said}"):
+        Frame(**parts | changed)
+
+
+def test_real_lenses_have_rays() -> None:
+    for distortion in ((-0.3, 0.1, 0.0, 0.0), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)):
+        assert Frame("a", GOOD["rgb"], replace(LENS, distortion=distortion)).intrinsics.distortion

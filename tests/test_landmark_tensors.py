@@ -8,6 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from bidnerf_core.errors import InputError
+from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
@@ -44,6 +46,8 @@ def test_no_landmarks_at_all_are_a_map(landmarks: LandmarkMap) -> None:
         ("descriptors", lambda v: v.float(), "descriptors is torch.float32"),
         ("directions", lambda v: 2 * v, "unit length"),
         ("cones", lambda v: v + 4, "cones is"),
+        ("positions", lambda v: torch.full_like(v, 3e38), "positions is 3e\\+38"),
+        ("deviations", lambda v: torch.full_like(v, 3e38), "deviations is 3e\\+38"),
         ("sizes", lambda v: -1 - v, "sizes is"),
         ("views", lambda v: v - v, "views is"),
         ("noise", torch.zeros_like, "noise is 0"),
@@ -74,3 +78,12 @@ def test_correlation_grows_with_the_square_root_of_the_matches_where_the_usual_n
     known = replace(unknown, usual_matches=400.0)
     assert [known.correlation_of(n) for n in (0, 25, 100, 400, 1600)] == [1, 5, 9, 17, 33]
     assert replace(known, correlation=1.0).correlation_of(25) == 1
+
+
+@pytest.mark.parametrize("channels", [1, 7, 129, 4096])
+def test_descriptors_of_another_detector_are_named_when_they_meet(
+    landmarks: LandmarkMap, channels: int
+) -> None:
+    other = replace(landmarks, descriptors=torch.zeros((len(landmarks), channels), dtype=torch.uint8))
+    with pytest.raises(InputError, match=f"descriptors of {channels} channels, those of the image"):
+        LandmarkMatcher(other).nearest(landmarks.descriptors, 2)

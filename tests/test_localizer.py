@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -21,6 +20,7 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames.pixels import depth_rays_of
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import METHODS, AutoConfig, pose_from_matrix, settings_of
+from bidnerf_core.localization.tracking.clock import Clock
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from bidnerf_hashgrid import backend as hashgrid
@@ -94,14 +94,6 @@ def test_depth_rays_are_of_the_last_camera() -> None:
     with_rays, without = poses(bare, depth_rays=rays), poses(bare)
     assert torch.equal(with_rays[0], without[0])
     assert not torch.equal(with_rays[-1], without[-1])
-
-
-@pytest.fixture
-def unchecked() -> Iterator[None]:
-    """Switch off the tests' own check of annotations, as it is for users."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 COLUMNS = START.matrix().T
@@ -253,3 +245,33 @@ def test_a_matrix_with_rounded_numbers_becomes_a_rigid_transform() -> None:
 def test_the_name_of_what_is_wrong_opens_the_message() -> None:
     with pytest.raises(InputError, match=r"^pose.json has shape"):
         pose_from_matrix(torch.eye(3), "pose.json")
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("seed", [math.nan, -1, 2**70, "x", None, 1.5, True])
+def test_a_seed_is_a_whole_number(seed: Any) -> None:
+    with pytest.raises(InputError, match=r"^seed is .*, expected a whole number from 0"):
+        poses(FRAME, seed=seed)
+    assert torch.equal(poses(FRAME, seed=np.int64(3)), poses(FRAME, seed=3))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_start_is_one_pose_whose_gradient_plays_no_part() -> None:
+    expected, matrix = poses(FRAME, start=START), START.matrix()
+    learned = SE3(START.rotation.clone().requires_grad_(), START.translation.clone().requires_grad_())
+    for start in (learned, matrix.clone().requires_grad_()):
+        torch.testing.assert_close(poses(FRAME, start=start), expected, rtol=0, atol=1e-9)
+    for start in (
+        SE3(torch.eye(2), torch.zeros(2)),
+        SE3(torch.eye(3), torch.zeros(4)),
+        SE3(torch.eye(3), torch.zeros(())),
+    ):
+        with pytest.raises(InputError, match=r"^start has a rotation and a translation of shapes"):
+            poses(FRAME, start=start)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("time", ["5", 10**400, math.inf, True, [1.0]])
+def test_the_time_of_a_frame_is_a_number(time: Any) -> None:
+    with pytest.raises(InputError, match=r"^time of the frame is .*, expected seconds or None"):
+        Clock(0.0, 0.1).step(time)

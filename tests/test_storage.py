@@ -6,6 +6,7 @@ import errno
 import functools
 import itertools
 import json
+import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -418,3 +419,15 @@ def test_bounds_beyond_single_precision_are_refused(far: float, tmp_path: Path) 
     (tmp_path / "map.json").write_text(json.dumps(described))
     with pytest.raises(InputError, match=r"bounds: .* m is too large, expected at most 1e\+15 m"):
         load_info(tmp_path)
+
+
+@pytest.mark.parametrize("value", [-1e30, 3e38, math.nan, -math.inf])
+def test_weights_that_no_training_gives_are_refused(tmp_path: Path, value: float) -> None:
+    saved = save_map(tmp_path, info(step=5), state(5))
+    tensors = state(5).field
+    name = next(key for key, held in tensors.items() if held.is_floating_point())
+    write_file(
+        tmp_path / saved.weights, tensors_to_bytes(tensors | {name: torch.full_like(tensors[name], value)})
+    )
+    with pytest.raises(InputError, match="expected trained weights"):
+        load_map(tmp_path)

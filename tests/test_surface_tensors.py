@@ -40,6 +40,12 @@ def nan(value: Tensor) -> Tensor:
     ("name", "change", "said"),
     [
         ("positions", nan, "positions holds NaN"),
+        ("positions", lambda v: 1e30 * v, "positions is"),
+        ("rgb", lambda v: v + 1e30, "rgb is"),
+        ("rgb", lambda v: v - 2, "rgb is"),
+        ("rgb_gradient", lambda v: v + 1e30, "rgb_gradient is"),
+        ("normals", lambda v: 1e30 * v, "unit length"),
+        ("normals", torch.zeros_like, "unit length"),
         ("cell", nan, "cell holds NaN"),
         ("cell", torch.zeros_like, "cell is 0"),
         ("rgb", lambda v: v[1:], "equally many"),

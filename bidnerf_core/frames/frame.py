@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +34,8 @@ class Frame:
 
     name: str
     # rgb is in [0, 1], already over the background where there was an alpha channel; alpha is 1 where the scene covers
-    # the pixel and 0 where the background shows. rgb has 3 channels, and all have the size of the camera's image, which is
-    # checked here.
+    # the pixel and 0 where the background shows. All are dense tensors of the size of the camera's image, of finite
+    # floats, which is checked here.
     rgb: Float[Tensor, "h w channels"]
     intrinsics: Intrinsics
     depth: Float[Tensor, "dh dw"] | None = None
@@ -55,23 +57,18 @@ class Frame:
     """
 
     def __post_init__(self) -> None:
-        if self.rgb.ndim != 3 or self.rgb.shape[-1] != 3:
-            raise InputError(
-                f"frame {self.name}: rgb has shape {tuple(self.rgb.shape)}, expected (height, width, 3); "
-                "Frame.from_numpy takes grey and RGBA"
-            )
-        expected = (self.intrinsics.height, self.intrinsics.width)
-        for what, image in (
-            ("rgb", self.rgb),
-            ("depth", self.depth),
-            ("alpha", self.alpha),
-            ("hidden", self.hidden),
+        where, camera = f"frame {self.name}", self.intrinsics
+        if not isinstance(camera, Intrinsics):
+            raise InputError(f"{where}: intrinsics is a {type(camera).__name__}, expected Intrinsics")
+        _require_rays(where, camera)
+        for what, image, channels in (
+            ("rgb", self.rgb, 3),
+            ("depth", self.depth, None),
+            ("alpha", self.alpha, None),
+            ("hidden", self.hidden, None),
         ):
-            if image is not None and tuple(image.shape[:2]) != expected:
-                found = f"{image.shape[1]}x{image.shape[0]}"
-                raise InputError(
-                    f"frame {self.name}: {what} is {found}, its camera expects {expected[1]}x{expected[0]}"
-                )
+            if image is not None or what == "rgb":
+                _check_image(where, what, image, camera, channels)
         if self.hidden is not None:
             self._hide(self.hidden)
 
@@ -212,6 +209,47 @@ class Frame:
     def has_dense_depth(self) -> bool:
         """Whether depth was measured at more than a few points."""
         return self.depth is not None and float((self.depth > 0).float().mean()) >= SPARSE
+
+
+def _check_image(where: str, what: str, image: object, camera: Intrinsics, channels: int | None) -> None:
+    """Raise ``InputError`` for anything but a tensor of the camera's size, of finite floats unless it is ``hidden``."""
+    if not isinstance(image, Tensor):
+        raise InputError(
+            f"{where}: {what} is a {type(image).__name__}, expected a tensor; Frame.from_numpy takes arrays"
+        )
+    found, size = tuple(image.shape), (camera.height, camera.width)
+    if len(found) != (2 if channels is None else 3) or found[2:] != (() if channels is None else (channels,)):
+        expected = "(height, width)" if channels is None else f"(height, width, {channels})"
+        hint = "; Frame.from_numpy takes grey and RGBA" if what == "rgb" else ""
+        raise InputError(f"{where}: {what} has shape {found}, expected {expected}{hint}")
+    if found[:2] != size:
+        raise InputError(f"{where}: {what} is {found[1]}x{found[0]}, its camera expects {size[1]}x{size[0]}")
+    if image.layout != torch.strided or image.is_meta:
+        raise InputError(f"{where}: {what} is a sparse tensor or has no values, expected a dense one")
+    if what == "hidden":
+        return
+    if not image.is_floating_point():
+        scale = "floats in [0, 1]; Frame.from_numpy takes bytes" if what == "rgb" else "floats"
+        raise InputError(f"{where}: {what} is of {str(image.dtype).removeprefix('torch.')}, expected {scale}")
+    if image.requires_grad:
+        raise InputError(f"{where}: {what} requires a gradient, expected measured values; detach() them")
+    # The sum is cheaper than a mask; on an accelerator, waiting for it would delay each frame.
+    if image.device.type == "cpu" and not math.isfinite(image.sum()) and not bool(image.isfinite().all()):
+        raise InputError(f"{where}: {what} has values that are NaN or infinite, expected finite numbers")
+
+
+def _require_rays(where: str, camera: Intrinsics) -> None:
+    if camera.distortion and not _has_rays(replace(camera, distortion=tuple(camera.distortion))):
+        raise InputError(
+            f"{where}: distortion is {camera.distortion}, which maps no ray to some of its pixels; expected a real lens's"
+        )
+
+
+@lru_cache(maxsize=64)
+def _has_rays(camera: Intrinsics) -> bool:
+    """Return whether the corners, the middles of the sides and the centre of the image have rays."""
+    u, v = torch.linspace(0, camera.width, 3), torch.linspace(0, camera.height, 3)
+    return bool(camera.unproject(torch.cartesian_prod(u.double(), v.double())).isfinite().all())
 
 
 def _mask(alpha: np.ndarray | Tensor, size: tuple[int, int], where: str) -> Float[Tensor, "h w"]:

@@ -37,11 +37,14 @@ def sandwich_covariance(
         return torch.full_like(hessian, torch.inf)
     unit = hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
     scaled = unit[..., None] * hessian * unit[..., None, :]
-    values, axes = torch.linalg.eigh(scaled)
+    finite = scaled.isfinite().all(-1).all(-1)  # slopes of a field may overflow, and eigh would fail on those
+    values, axes = torch.linalg.eigh(
+        torch.where(finite[:, None, None], scaled, torch.eye(6, dtype=scaled.dtype, device=scaled.device))
+    )
     inverse = axes @ torch.diag_embed(1 / values.clamp(min=1e-300)) @ axes.mT
     inverse = unit[..., None] * inverse * unit[..., None, :]
     found = inverse @ (scores.mT @ scores) @ inverse * (used / (used - 6))
-    sound = (values[..., 0] > 1e-10) & found.isfinite().all(-1).all(-1)
+    sound = finite & (values[..., 0] > 1e-10) & found.isfinite().all(-1).all(-1)
     return torch.where(sound[:, None, None], (found + found.mT) / 2, torch.inf)
 
 

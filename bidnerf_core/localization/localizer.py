@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
+from bidnerf_core.io.json import LARGEST_INTEGER
 from bidnerf_core.localization.by_colour import ByColourConfig
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only
 from bidnerf_core.localization.methods import USUAL_METHOD, Method, find_method, require_use_of_depth
@@ -85,7 +87,7 @@ class Localizer:
         problem = rig(
             self.map, _views(query), None if start is None else start_pose(start), depth_rays, self.matcher
         )
-        found = self._method.solve(problem, self.config, seed)
+        found = self._method.solve(problem, self.config, _checked_seed(seed))
         return found if self.map.has_distances else direction_only(found)
 
     @property
@@ -151,6 +153,12 @@ def _checked_config(method: Method, name: str, config: Any, preset: str | None) 
     return config
 
 
+def _checked_seed(seed: Any) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= LARGEST_INTEGER:
+        raise InputError(f"seed is {seed!r}, expected a whole number from 0 to 2**63 - 1")
+    return int(seed)
+
+
 def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
     if isinstance(query, Frame):
         return [View(query, SE3.identity())]
@@ -174,9 +182,17 @@ def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
 def start_pose(start: Start) -> SE3:
     """Return a start given in any form as a rigid transform; float64."""
     if isinstance(start, SE3):
-        if start.translation.ndim > 1:
-            raise InputError(f"start holds {len(start.translation)} poses, expected one")
-        return start.to("cpu", torch.float64)
+        found, count = start.translation.shape, start.translation.numel() // 3
+        if len(found) > 1 and found[-1] == 3:
+            raise InputError(f"start holds {count} poses, expected one")
+        if found != (3,) or start.rotation.shape != (3, 3):
+            shapes = f"{tuple(start.rotation.shape)} and {tuple(found)}"
+            raise InputError(
+                f"start has a rotation and a translation of shapes {shapes}, expected (3, 3) and (3)"
+            )
+        return SE3(start.rotation.detach(), start.translation.detach()).to("cpu", torch.float64)
+    if isinstance(start, torch.Tensor):
+        start = start.detach().cpu()
     try:
         matrix = torch.as_tensor(np.asarray(start, dtype=np.float64))
     except (TypeError, ValueError, OverflowError) as error:

@@ -9,7 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bidnerf_core.fields.contract import LARGEST_LENGTH
 from bidnerf_core.mapping.landmarks import PER_LANDMARK, HeldOutTrial, LandmarkMap
+from bidnerf_core.mapping.tensors import check_kinds, check_range, check_unit_length
 
 LANDMARK_KINDS = {
     "positions": ((-1, 3), torch.float32),
@@ -50,15 +52,7 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """
     present = LANDMARK_KINDS | {name: kind for name, kind in LATER_KINDS.items() if name in tensors}
-    for name, (shape, kind) in present.items():
-        value = tensors[name]
-        fits = value.dim() == len(shape) and all(
-            a in (-1, b) for a, b in zip(shape, value.shape, strict=True)
-        )
-        if not fits or value.dtype != kind:
-            raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, expected {kind} {list(shape)}")
-        if value.is_floating_point() and not bool(value.isfinite().all()):
-            raise ValueError(f"{name} holds NaN or infinity")
+    check_kinds(tensors, present)
     _check_contents(tensors)
     parts: dict[str, Any] = {name: tensors[name] for name in present}
     for name in {"noise", "correlation", "usual_matches", "moving"} & present.keys():
@@ -88,20 +82,12 @@ def _check_contents(tensors: dict[str, Tensor]) -> None:
         raise ValueError(
             f"calibration_scatter is {tensors['calibration_scatter'].tolist()}, expected positive"
         )
-    for name, least, most in (
-        ("deviations", 0.0, math.inf),
-        ("sizes", 0.0, math.inf),
-        ("cones", 0.0, math.pi + 1e-6),
-        ("views", 1, 2**31),
-    ):
-        value = tensors[name]
-        if count and not (float(value.min()) >= least and float(value.max()) <= most):
-            raise ValueError(
-                f"{name} is {float(value.min())} to {float(value.max())}, expected {least} to {most}"
-            )
+    check_range(tensors, "positions", -LARGEST_LENGTH, LARGEST_LENGTH)
+    check_range(tensors, "deviations", 0.0, LARGEST_LENGTH)
+    check_range(tensors, "sizes", 0.0, LARGEST_LENGTH)
+    check_range(tensors, "cones", 0.0, math.pi + 1e-6)
+    check_range(tensors, "views", 1, 2**31)
+    check_unit_length(tensors, "directions")
     covariance = tensors["pose_covariance"]
     if float((covariance - covariance.mT).abs().max()) > 0 or float(torch.linalg.eigvalsh(covariance)[0]) < 0:
         raise ValueError("pose_covariance is not symmetric and positive semidefinite")
-    length = torch.linalg.vector_norm(tensors["directions"], dim=-1)
-    if count and float((length - 1).abs().max()) > 1e-3:
-        raise ValueError("directions are not of unit length")

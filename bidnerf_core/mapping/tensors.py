@@ -5,14 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from bidnerf_core.fields.contract import LARGEST_LENGTH
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.images import COLOUR_ROUNDING
 from bidnerf_core.mapping.surface_map import SurfaceMap
 from bidnerf_core.mapping.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
 from bidnerf_core.mapping.surfels import Surfels
 
 Kinds = dict[str, tuple[tuple[int, ...], torch.dtype]]
 """Shape (-1: any length) and dtype of named tensors."""
+STEEPEST = 1000.0
+"""Limit of the slope of a surfel's colour, in full scales per cell of the grid."""
 SURFACE_KINDS: Kinds = {
     "positions": ((-1, 3), torch.float32),
     "normals": ((-1, 3), torch.float32),
@@ -53,13 +57,18 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """
     dense = "nearest" in tensors
-    _check_kinds(tensors, SURFACE_KINDS | (DENSE_KINDS if dense else INDEX_KINDS))
+    check_kinds(tensors, SURFACE_KINDS | (DENSE_KINDS if dense else INDEX_KINDS))
     count = len(tensors["positions"])
     if any(len(tensors[name]) != count for name in ("normals", "rgb", "rgb_gradient")) or not count:
         raise ValueError("expected equally many positions, normals and colours of surfels, and at least one")
     _check_surfels_exist(tensors, "nearest" if dense else "entries", count)
     if not float(tensors["cell"]) > 0:
         raise ValueError(f"cell is {float(tensors['cell'])}, expected a length")
+    check_range(tensors, "positions", -LARGEST_LENGTH, LARGEST_LENGTH)
+    check_range(tensors, "rgb", -COLOUR_ROUNDING, 1 + COLOUR_ROUNDING)
+    steepest = STEEPEST / float(tensors["cell"])
+    check_range(tensors, "rgb_gradient", -steepest, steepest)
+    check_unit_length(tensors, "normals")
     if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
         raise ValueError("no keyframe, or one that is not rigid")
     surfels = Surfels(*(tensors[name] for name in ("positions", "normals", "rgb", "rgb_gradient")))
@@ -67,7 +76,8 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
     return SurfaceMap(surfels, index, tensors["keyframes"])
 
 
-def _check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
+def check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
+    """Raise ``KeyError`` for a missing tensor, ``ValueError`` for one of another shape or dtype, and for NaN and infinity."""
     for name, (shape, kind) in kinds.items():
         value = tensors[name]
         fits = len(shape) == value.dim() and all(
@@ -77,6 +87,22 @@ def _check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
             raise ValueError(f"{name} is {value.dtype} {list(value.shape)}, expected {kind} {list(shape)}")
         if value.is_floating_point() and not bool(value.isfinite().all()):
             raise ValueError(f"{name} holds NaN or infinity")
+
+
+def check_range(tensors: dict[str, Tensor], name: str, least: float, most: float) -> None:
+    """Raise ``ValueError`` for values outside ``least`` to ``most``, from which later computations would overflow."""
+    value = tensors[name]
+    if value.numel() and not (float(value.min()) >= least and float(value.max()) <= most):
+        raise ValueError(
+            f"{name} is {float(value.min()):g} to {float(value.max()):g}, expected {least:g} to {most:g}"
+        )
+
+
+def check_unit_length(tensors: dict[str, Tensor], name: str) -> None:
+    """Raise ``ValueError`` for vectors that are not of unit length up to rounding."""
+    length = torch.linalg.vector_norm(tensors[name], dim=-1)
+    if length.numel() and float((length - 1).abs().max()) > 1e-3:
+        raise ValueError(f"{name} are not of unit length")
 
 
 def _check_surfels_exist(tensors: dict[str, Tensor], name: str, count: int) -> None:

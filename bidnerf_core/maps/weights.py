@@ -11,6 +11,9 @@ from bidnerf_core.backend import UpgradingField
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField
 
+LARGEST_WEIGHT = 1e9
+"""Limit of a field's parameters, whose products would overflow in float32; trained ones stay far below it."""
+
 
 def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
     """Return a field's tensors from a file, upgraded where an earlier version stored them, after checking them.
@@ -34,8 +37,10 @@ def checked_weights(field: RadianceField, tensors: dict[str, Tensor], path: Path
     if surplus:
         raise InputError(f"{path}: tensor {surplus[0]!r} is not part of the field that map.json describes")
     for name, _ in module.named_parameters():
-        if name in tensors and not bool(tensors[name].isfinite().all()):
-            raise InputError(f"{path}: tensor {name!r} holds NaN or infinity, expected finite numbers")
+        if name in tensors and not bool((tensors[name].abs() <= LARGEST_WEIGHT).all()):
+            raise InputError(
+                f"{path}: tensor {name!r} holds NaN, infinity or numbers above {LARGEST_WEIGHT:g}, expected trained weights"
+            )
     for name, _ in module.named_buffers():
         if name in tensors and bool(tensors[name].isnan().any()):
             raise InputError(f"{path}: tensor {name!r} holds NaN, expected numbers")

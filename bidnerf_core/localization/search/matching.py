@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.devices import moved
+from bidnerf_core.errors import InputError
 from bidnerf_core.mapping.features import Features, find_features, squared_distances
 from bidnerf_core.mapping.landmarks import LandmarkMap
 
@@ -57,6 +58,12 @@ class LandmarkMatcher:
 
         If there are fewer landmarks, the remaining distances are infinite and the indices 0. Both are on the CPU.
         """
+        channels = self._descriptors.shape[1]
+        if descriptors.shape[1] != channels:
+            raise InputError(
+                f"the map's landmarks have descriptors of {channels} channels, those of the image {descriptors.shape[1]}; "
+                "expected the detector with which the map was baked, or bake it anew"
+            )
         there = descriptors.to(self._descriptors.device)
         if self._cells is not None and len(descriptors) * len(self.landmarks) > COMPARISONS:
             return moved(self._cells.nearest(there, count), "cpu")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from numbers import Real
+from typing import Any
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.io.json import LARGEST_NUMBER
 
 
 @dataclass(frozen=True)
@@ -16,16 +18,18 @@ class Clock:
     interval: float  # seconds
     stamped: bool = True  # whether the last frame had a time stamp
 
-    def step(self, time: float | None) -> tuple[Clock, float]:
+    def step(self, time: Any) -> tuple[Clock, float]:
         """Return the clock at the next frame, and the seconds since the last one: negative if it came out of order.
 
-        Raises ``InputError`` for a time that is not finite.
+        ``time`` is in seconds, or None. Raises ``InputError`` for anything else, and for a time that is not finite.
         """
         if time is None:
             now = None if self.now is None else self.now + self.interval
             return Clock(now, self.interval, stamped=False), self.interval
-        if not math.isfinite(time):
-            raise InputError(f"time of the frame is {time}, expected seconds or None")
+        is_number = isinstance(time, Real) and not isinstance(time, bool)
+        if not is_number or not abs(time) <= LARGEST_NUMBER:
+            raise InputError(f"time of the frame is {str(time)[:40]!r}, expected seconds or None")
+        time = float(time)
         if self.now is None:
             return Clock(time, self.interval), self.interval
         seconds = time - self.now
