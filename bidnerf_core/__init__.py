@@ -56,8 +56,14 @@ if TYPE_CHECKING:
     from bidnerf_core.localization import TrackerConfig as TrackerConfig
     from bidnerf_core.localization import settings_of as settings_of
     from bidnerf_core.localization.corrector import Corrector as Corrector
+    from bidnerf_core.mapping import BakeConfig as BakeConfig
     from bidnerf_core.maps.map import Map as Map
     from bidnerf_core.maps.map import load_map as load_map
+    from bidnerf_core.maps.rendering import RenderingScores as RenderingScores
+    from bidnerf_core.maps.rendering import rendering_scores as rendering_scores
+    from bidnerf_core.maps.summary import MapSummary as MapSummary
+    from bidnerf_core.maps.training import resume as resume
+    from bidnerf_core.maps.training import train as train
     from bidnerf_core.progress import Progress as Progress
     from bidnerf_core.progress import ProgressCallback as ProgressCallback
     from bidnerf_core.registry import list_plugins as list_plugins
@@ -74,6 +80,7 @@ if TYPE_CHECKING:
 
 HOMES = {
     "AutoConfig": "localization",
+    "BakeConfig": "mapping",
     "Cancelled": "errors",
     "Comparison": "evaluation.comparison",
     "Corrector": "localization.corrector",
@@ -87,6 +94,7 @@ HOMES = {
     "Localization": "localization",
     "Localizer": "localization",
     "Map": "maps.map",
+    "MapSummary": "maps.summary",
     "Observations": "fields.observations",
     "Outcome": "localization",
     "PoseError": "results.errors",
@@ -98,6 +106,7 @@ HOMES = {
     "RaySamples": "fields.contract",
     "Rays": "fields.contract",
     "ResultTable": "evaluation.results",
+    "RenderingScores": "maps.rendering",
     "SE3": "geometry.se3",
     "SceneBounds": "fields.contract",
     "TrackedPath": "results.tracked_path",
@@ -120,8 +129,11 @@ HOMES = {
     "read_pose": "results.pose_files",
     "render": "fields.rendering",
     "render_image": "fields.rendering",
+    "rendering_scores": "maps.rendering",
+    "resume": "maps.training",
     "settings_of": "localization",
     "track": "results.tracked_path",
+    "train": "maps.training",
     "write_poses": "results.pose_files",
     "write_transforms": "datasets",
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -98,6 +99,9 @@ class Seeded(Protocol):
 Config = TypeVar("Config", bound=Seeded)
 Field = TypeVar("Field", bound=nn.Module)
 
+_seeding = Lock()
+"""Held while torch's global generator has another seed: fields may be built in several threads."""
+
 
 @dataclass(frozen=True)
 class RecipeBackend(Generic[Config, Field]):
@@ -113,7 +117,7 @@ class RecipeBackend(Generic[Config, Field]):
         return self.config_type() if self.quick is None else self.quick
 
     def build(self, config: Config, bounds: SceneBounds) -> Field:
-        with torch.random.fork_rng(devices=[]):
+        with _seeding, torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             return self.field_type(config, bounds)
 

@@ -48,3 +48,11 @@ def counter(
         check_cancelled(cancel, stage)
 
     return count
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration in words, such as 50 s, 12 min or 3 h 5 min."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"

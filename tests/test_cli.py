@@ -25,10 +25,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
-from bidnerf_core.backend import load_backend
-from bidnerf_core.cli import COMMANDS, main, progress
+from bidnerf_core.cli import COMMANDS, main
+from bidnerf_core.cli.progress import Display
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
+from bidnerf_core.maps.checkpoints import Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.map import load_map
 from bidnerf_core.registry import list_plugins
@@ -74,14 +75,14 @@ def interrupted(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def stop_at(patch: pytest.MonkeyPatch, number: int) -> None:
     """Ctrl-C during that step of the next training."""
-    told = progress.StoredTraining.step
+    told = Checkpoints.step
 
-    def step(self: progress.StoredTraining, now: Any) -> None:
+    def step(self: Checkpoints, now: Any) -> None:
         if now.step == number:
             signal.raise_signal(signal.SIGINT)
         told(self, now)
 
-    patch.setattr(progress.StoredTraining, "step", step)
+    patch.setattr(Checkpoints, "step", step)
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
@@ -101,11 +102,13 @@ def assert_refused(outcome: CommandResult, status: int, *fragments: str) -> None
 
 @pytest.mark.parametrize(("samples", "shown"), [(math.nan, ""), (31.5, "  31.5 samples a ray")])
 def test_a_line_of_progress_leaves_out_what_the_recipe_does_not_tell(
-    samples: float, shown: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    samples: float, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     info = MapInfo("fog", {}, demo_object().bounds, 0, complete=False)
-    progress.StoredTraining(tmp_path, info, None, 5, 60.0).step(Progress(5, 5, 0.25, 6.0, samples))
-    assert capsys.readouterr().err == f"step 5/5  loss 0.25000  PSNR 6.00 dB{shown}  0 s left\n"
+    with Display() as display:
+        Checkpoints(info, progress=display).step(Progress(5, 5, 0.25, 6.0, samples))
+    line = f"training: 5/5 steps, loss 0.25000  PSNR 6.00 dB{shown}, 0 s left\n"
+    assert capsys.readouterr().err == line
 
 
 # Datasets that cannot be used.
@@ -433,7 +436,10 @@ def test_what_cannot_be_resumed_is_told_in_a_line(
     assert_refused(bidnerf(*resume, interrupted, "--steps", "99"), 2, "begun with steps 12, got 99")
     assert_refused(bidnerf(*resume, interrupted, "--overwrite"), 2, "expected one of them")
     assert_refused(
-        bidnerf(*resume, interrupted, "--background", "black"), 2, "begun over background", "'black'"
+        bidnerf(*resume, interrupted, "--background", "black"),
+        2,
+        "begun over background",
+        "got (0.0, 0.0, 0.0)",
     )
     assert contents(interrupted) == before
     (interrupted / str(load_info(interrupted).training)).write_bytes(b"junk")
@@ -501,7 +507,7 @@ def test_a_gpu_without_memory_left_is_said_in_a_line(
     def no_memory(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nSee the notes")
 
-    monkeypatch.setattr("bidnerf_core.cli.train.build_field", no_memory)
+    monkeypatch.setattr("bidnerf_core.maps.training.build_field", no_memory)
     trained = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options(2))
     assert trained.status == 1
     assert trained.err.splitlines()[-1].startswith(
@@ -922,7 +928,7 @@ def test_render_writes_the_images_that_were_agreed_on(bidnerf: Run, shared: Path
 def test_progress_goes_to_stderr(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     trained = bidnerf("train", shared / "data", "--out", tmp_path / "map", *tiny.options(2))
     assert (trained.status, trained.out) == (0, "")
-    assert "step 2/2" in trained.err
+    assert "training: 2/2 steps, loss " in trained.err
 
 
 # Help.
@@ -1010,12 +1016,10 @@ def test_a_training_resumes_over_the_background_that_it_began_with(
 def test_ctrl_c_before_anything_is_made_leaves_nothing(
     bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bidnerf_core.cli import train
-
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "read_views", interrupt)
+    monkeypatch.setattr("bidnerf_core.maps.training.read_views", interrupt)
     outcome = bidnerf("train", shared / "data", "--out", tmp_path / "map")
     assert (outcome.status, outcome.err) == (130, "bidnerf train: interrupted\n")
     assert list(tmp_path.iterdir()) == []
@@ -1097,7 +1101,7 @@ def test_ctrl_c_saves_and_resuming_loses_nothing(
     info = load_info(out)
     assert (process.returncode, said) == (130, "")
     assert complaints.splitlines()[-2:] == [
-        f"{out}: saved after step {info.step}; the same with --resume goes on from there",
+        f"{out}: saved after step {info.step}; resuming it (--resume) goes on from there",
         "bidnerf train: interrupted",
     ]
     assert 0 < info.step < LONG

@@ -14,14 +14,18 @@ import pytest
 import torch
 
 import tiny
+from bidnerf_core import train
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.captures import training_views
 from bidnerf_core.captures.report import CaptureReport, CoverageRecord
-from bidnerf_core.cli import bake as module
-from bidnerf_core.cli import main, train, training_views
+from bidnerf_core.cli import bake as command
+from bidnerf_core.cli import main
 from bidnerf_core.cli.output import read_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames.frame import View
+from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
+from bidnerf_core.maps import baking
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.files import save_capture
 from bidnerf_core.maps.map import Map, load_map
@@ -100,7 +104,7 @@ def _ball(monkeypatch: pytest.MonkeyPatch) -> None:
     def ball(folder: Path, *place: str, **options: bool) -> Map:
         return replace(load_map(folder, *place, **options), field=HomogeneousBall(0.5, 300.0))
 
-    monkeypatch.setattr(module, "load_map", ball)
+    monkeypatch.setattr(command, "load_map", ball)
 
 
 @pytest.mark.usefixtures("_ball")
@@ -147,7 +151,7 @@ def test_a_damaged_surface_is_baked_anew(shared: Path, folder: Path, bidnerf: Ru
 def test_training_bakes_unless_told_otherwise(
     shared: Path, tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bidnerf_core.cli.train.BakeConfig", lambda: module.BakeConfig(cells=20_000))
+    monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(cells=20_000))
     train = ["train", shared / "data", *tiny.options(2)]
     assert train.pop() == "--no-bake"
     status, out, err = bidnerf(*train, "--out", tmp_path / "map")
@@ -161,7 +165,7 @@ def test_a_map_without_a_surface_to_bake_is_a_map(
     tmp_path: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tiny.write_dataset(tmp_path / "data", depth=False)
-    monkeypatch.setattr("bidnerf_core.cli.train.BakeConfig", lambda: module.BakeConfig(rays=1000, cells=1000))
+    monkeypatch.setattr("bidnerf_core.maps.training.USUAL_BAKE", BakeConfig(rays=1000, cells=1000))
     train = ["train", tmp_path / "data", *tiny.options(1)[:-1]]
     status, _, err = bidnerf(*train, "--out", tmp_path / "map")
     assert status == 0
@@ -196,7 +200,7 @@ def test_how_well_a_field_renders_is_measured_on_photos_alone(
 ) -> None:
     """Against images that it renders itself any field is perfect."""
     photos = read_views(open_dataset(shared / "data", tiny.BACKGROUND), "train")
-    monkeypatch.setattr(module, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
+    monkeypatch.setattr(baking, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
     bidnerf("bake", folder, *COARSE)
     assert load_map(folder).landmarks is not None
     assert load_map(folder).colour_noise is None
@@ -213,8 +217,9 @@ def test_how_well_a_field_renders_is_measured_on_photos_alone(
 def with_photo_landmarks(shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The map with landmarks of its photos. Its surface is left alone, and what it renders is like photos."""
     photos = read_views(open_dataset(shared / "data", tiny.BACKGROUND), "train")
-    monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
-    monkeypatch.setattr(module, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
+    monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
+    monkeypatch.setattr(Map, "_with_surface", lambda scene, surface: scene)
+    monkeypatch.setattr(baking, "rendered_views", lambda *_: photos[:12])  # sharp enough for landmarks
     assert bidnerf("bake", folder, "--data", shared / "data").status == 0
     assert load_info(folder).landmark_source == "photos"
     return folder
@@ -250,9 +255,7 @@ def test_damaged_landmarks_of_photos_are_replaced(with_photo_landmarks: Path, bi
     assert load_map(with_photo_landmarks).landmarks is not None
 
 
-def test_landmarks_of_photos_are_built_once_for_training_and_baking(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without depth or silhouettes, training takes distances from landmarks, and the map keeps those landmarks."""
     monkeypatch.setattr(tiny, "CAMERA", Intrinsics(85.0, 85.0, 32.0, 32.0, 64, 64))
     photos = [replace(v, frame=replace(v.frame, depth=None, alpha=None)) for v in tiny.views(24)]
@@ -266,13 +269,13 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(
         seen.append(sum(len(v.landmarks.distance) for v in views if v.landmarks is not None))
         hashgrid.train(field, views, *rest)
 
-    for part in (module, training_views):
+    for part in (baking, training_views):
         monkeypatch.setattr(part, "tracked_views", tracked)
-    monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
+    monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
+    monkeypatch.setattr(Map, "_with_surface", lambda scene, surface: scene)
     watched = SimpleNamespace(summary="", config_type=HashGridConfig, build=hashgrid.build, train=trained)
-    config = tiny.config(4)
-    train.train_map(watched, "hashgrid", photos, config, tmp_path, "photos", tiny.BACKGROUND)  # type: ignore[arg-type]
-    stored = load_map(tmp_path)
+    monkeypatch.setattr("bidnerf_core.maps.training.load_backend", lambda name: watched)
+    stored = train(photos, config=tiny.config(4), background=tiny.BACKGROUND)
     assert built == [24]
     assert seen[0] > 100
     assert stored.landmarks is not None
@@ -290,7 +293,8 @@ def test_images_with_silhouettes_are_trained_on_without_landmarks() -> None:
 def test_photos_leave_a_record_that_info_shows_and_draws(
     shared: Path, folder: Path, bidnerf: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_bake_surface", lambda *_: None)
+    monkeypatch.setattr("bidnerf_core.maps.map.bake_surface", lambda *_: None)
+    monkeypatch.setattr(Map, "_with_surface", lambda scene, surface: scene)
     assert json.loads(bidnerf("info", folder, "--json")[1])["capture"] is None
     status, _, err = bidnerf("info", folder, "--draw", folder / "capture.png")
     assert (status, err.count("\n")) == (1, 1)
@@ -319,7 +323,7 @@ def test_a_damaged_record_of_photos_is_named_in_a_line(folder: Path, content: st
     assert (status, err.count("\n")) == (1, 1)
     assert file.name in err
     file.unlink()
-    assert "missing" in bidnerf("info", folder).err
+    assert "no such file" in bidnerf("info", folder).err
 
 
 def test_photos_of_another_scene_are_not_baked_into_a_map(
@@ -332,16 +336,18 @@ def test_photos_of_another_scene_are_not_baked_into_a_map(
             frame["transform_matrix"][0][3] += 0.01 * (1 + number)
         file.write_text(json.dumps(described))
     never_baked = ["bake", shutil.copytree(folder, tmp_path / "fresh"), "--data", tmp_path / "other", *COARSE]
-    monkeypatch.setattr(module, "colour_noise", lambda *_: 0.31)
+    monkeypatch.setattr("bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.31)
     assert bidnerf(*never_baked).status == 1
-    monkeypatch.setattr(module, "colour_noise", lambda *_: 0.1)
+    monkeypatch.setattr(baking, "colour_noise", lambda *_: 0.1)
     assert bidnerf("bake", folder, "--data", shared / "data", *COARSE).status == 0
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
-    monkeypatch.setattr(module, "colour_noise", lambda *_: 0.31)
+    monkeypatch.setattr("bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.31)
     status, _, err = bidnerf("bake", folder, "--data", tmp_path / "other", *COARSE)
     assert (status, err.count("\n")) == (1, 1)
     assert "differ from the photos" in err
     assert "by 31%" in err
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
-    monkeypatch.setattr(module, "colour_noise", lambda *_: 0.15)  # new photos of the same scene
+    monkeypatch.setattr(
+        "bidnerf_core.maps.same_scene.colour_noise", lambda *_: 0.15
+    )  # new photos of the same scene
     assert bidnerf("bake", folder, "--data", tmp_path / "other", *COARSE).status == 0

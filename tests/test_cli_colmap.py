@@ -15,8 +15,8 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.groups import grouped
 from bidnerf_core.evaluation.results import read_results
 from bidnerf_core.maps.description import load_info
-from bidnerf_core.training import Progress
 from commands import CommandResult, Run
+from test_cli import stop_at
 
 QUICK = ["--method", "bid", "--perturb", "0.1", "5", "--max-steps", "3", "--rays", "64", "--json"]
 
@@ -71,21 +71,13 @@ def test_images_with_depth_of_their_own_keep_it(bidnerf: Run, shared: Path, tmp_
 def test_a_training_is_resumed_with_the_depth_that_it_began_with(
     bidnerf: Run, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bidnerf_core.cli import progress
-
-    real = progress.StoredTraining.step
-
-    def stop(self: progress.StoredTraining, done: Progress) -> None:
-        real(self, done)
-        self.stopping = done.step >= 5
-
-    monkeypatch.setattr(progress.StoredTraining, "step", stop)
+    stop_at(monkeypatch, 5)
     train = ["train", shared / "data", "--out", tmp_path / "map", *tiny.options()]
     points = ["--depth-points", shared / "sparse"]
     assert bidnerf(*train, *points).status == 130
     monkeypatch.undo()
     refused = bidnerf(*train, "--resume")
-    assert_refused(refused, 2, "--resume keeps --depth-points", "got 0")
+    assert_refused(refused, 2, "resuming keeps the points (--depth-points)", "got 0")
     assert bidnerf(*train, *points, "--resume").status == 0
 
 

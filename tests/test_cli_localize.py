@@ -18,12 +18,12 @@ import torch
 
 import tiny
 from bidnerf_core.cli import main
-from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.help_page import without_expert_settings
 from bidnerf_core.cli.options import parse
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.datasets.queries import Photos, Query
 from bidnerf_core.errors import printable
+from bidnerf_core.io.folders import output_folder
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.settings import EXPERT, Settings
 from commands import Run

@@ -13,9 +13,9 @@ import torch
 
 import tiny
 from bidnerf_core import SE3, View
+from bidnerf_core.captures import training_views
 from bidnerf_core.captures.cameras import PoseConsistency, as_given, stored_cameras
 from bidnerf_core.captures.training_poses import TrainingPoses
-from bidnerf_core.cli import training_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
@@ -160,17 +160,16 @@ def test_a_training_checks_axes_and_units_of_depth(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("ratio", [1000.0, 0.001, 0.3048])
 def test_depth_in_another_unit_is_refused(ratio: float) -> None:
     with pytest.raises(InputError, match=r"times as long as the poses .*depth_unit_scale_factor"):
-        training_views._check_depth_unit(measured(ratio))
+        training_views.check_depth_unit(measured(ratio))
 
 
 @pytest.mark.parametrize(("ratio", "said"), [(1.08, True), (0.94, True), (1.02, False)])
 def test_a_scale_of_depth_that_is_a_few_percent_off_is_told(
-    ratio: float, said: bool, capsys: pytest.CaptureFixture[str]
+    ratio: float, said: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    training_views._check_depth_unit(measured(ratio))
-    assert (
-        "times as long as the poses and the photos say; training takes both" in capsys.readouterr().err
-    ) == said
+    caplog.set_level("INFO", "bidnerf")
+    training_views.check_depth_unit(measured(ratio))
+    assert ("times as long as the poses and the photos say; training takes both" in caplog.text) == said
 
 
 @pytest.mark.data

@@ -46,7 +46,7 @@ class StoredGround(MapWithLandmarks):
 def stored(monkeypatch: pytest.MonkeyPatch) -> None:
     known = textured_map(surface=True)
     ground = StoredGround(known.field, known.bounds, known.landmarks, known.surface)
-    monkeypatch.setattr(track_module, "opened_map", lambda folder: ground)
+    monkeypatch.setattr(track_module, "load_map", lambda folder: ground)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_frames_that_trained_the_map_are_counted(
     )  # fmt: skip
     track = ("track", "MAP", data, "--out", tmp_path / "path.txt")
     assert "training" not in bidnerf(*track).out
-    monkeypatch.setattr(track_module, "opened_map", lambda folder: ground)
+    monkeypatch.setattr(track_module, "load_map", lambda folder: ground)
     assert "2 frames; errors of frames that trained the map are no test" in bidnerf(*track).out
 
 
@@ -95,7 +95,7 @@ def test_images_without_a_focal_length_begin_with_the_camera_of_the_map(
     assert known.landmarks is not None
     landmarks = replace(known.landmarks, cameras=(CAMERA,))
     ground = StoredGround(known.field, known.bounds, landmarks, known.surface)
-    monkeypatch.setattr(track_module, "opened_map", lambda folder: ground)
+    monkeypatch.setattr(track_module, "load_map", lambda folder: ground)
     images.mkdir()
     for number, (_, frame, _) in enumerate(flight()[:3]):
         iio.imwrite(images / f"{number}.png", (255 * frame.rgb).round().byte().numpy())

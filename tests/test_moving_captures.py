@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3, View
 from bidnerf_core.camera.rolling_shutter import STILL
+from bidnerf_core.captures import training_views
 from bidnerf_core.captures.cameras import (
     PoseRefinement,
     at_stored_poses,
@@ -23,7 +24,6 @@ from bidnerf_core.captures.cameras import (
 from bidnerf_core.captures.shutter_evidence import common_motion
 from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
 from bidnerf_core.captures.trial import tried_landmarks
-from bidnerf_core.cli import training_views
 from bidnerf_core.fields.rendering import render, render_image
 from bidnerf_core.frames.pixels import all_pixels, observe
 from bidnerf_core.localization.search.evident_motion import (

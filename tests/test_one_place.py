@@ -9,13 +9,11 @@ import pytest
 import torch
 
 import tiny
-from bidnerf_core import SE3, InputError, Localizer, Outcome, Tracker, View, load_map
+from bidnerf_core import SE3, InputError, Localizer, Outcome, Tracker, View, load_map, train
 from bidnerf_core.captures.coverage import shows_distances
-from bidnerf_core.cli.train import train_map
 from bidnerf_core.localization.direction_only import direction_only
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
 from bidnerf_core.maps.description import load_info
-from bidnerf_hashgrid import backend as hashgrid
 from landmark_scene import Points, looking_in, ring
 from textured_field import MapWithLandmarks, textured_map, unseen
 
@@ -89,7 +87,8 @@ def test_there_is_no_tracking_without_distances() -> None:
         Tracker(Localizer(WithoutDistances(scene.field, scene.bounds, scene.landmarks)))
 
 
-def test_training_goes_on_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_goes_on_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "bidnerf")
     pose = tiny.views(1)[0].T_ref_camera
     photos = [
         View(
@@ -98,13 +97,12 @@ def test_training_goes_on_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixt
         )
         for i, v in enumerate(tiny.views(3))
     ]
-    train_map(hashgrid, "hashgrid", photos, tiny.config(2), tmp_path, "photos", tiny.BACKGROUND, baked=False)
-    assert capsys.readouterr().err.count("from one place and show no distances") == 1
-    assert not load_info(tmp_path).distances
-    assert not load_map(tmp_path).has_distances
+    train(photos, out=tmp_path / "still", config=tiny.config(2), background=tiny.BACKGROUND, bake=False)
+    assert caplog.text.count("from one place and show no distances") == 1
+    assert not load_info(tmp_path / "still").distances
+    assert not load_map(tmp_path / "still").has_distances
     moved = [
         replace(v, T_ref_camera=SE3(v.T_ref_camera.rotation, v.T_ref_camera.translation + i))
         for i, v in enumerate(photos)
     ]
-    train_map(hashgrid, "hashgrid", moved, tiny.config(2), tmp_path, "photos", tiny.BACKGROUND, baked=False)
-    assert load_map(tmp_path).has_distances
+    assert train(moved, config=tiny.config(2), background=tiny.BACKGROUND, bake=False).has_distances

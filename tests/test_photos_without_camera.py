@@ -34,7 +34,7 @@ def stored(monkeypatch: pytest.MonkeyPatch, landmarks: LandmarkMap | None) -> No
     """Let the command load the textured ground with these landmarks, whatever the folder."""
     known, info = textured_map(surface=True), MapInfo("ground", {}, BOUNDS, 1, True, "data", weights="ground")
     ground = Map(info, known.field, known.surface, landmarks)
-    monkeypatch.setattr(localize_module, "opened_map", lambda folder: ground)
+    monkeypatch.setattr(localize_module, "load_map", lambda folder: ground)
 
 
 def landmarks_of(*cameras: Intrinsics) -> LandmarkMap:

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import tyro
 
 from bidnerf_core.cli.evaluate import read_sizes
-from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.options import Flag, Names, option, parse, wrong_usage
 from bidnerf_core.cli.output import print_json, say, show
@@ -19,6 +18,7 @@ from bidnerf_core.evaluation.comparison import Comparison
 from bidnerf_core.evaluation.comparison_figure import comparison_figure
 from bidnerf_core.evaluation.evaluate import run_comparison
 from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol
+from bidnerf_core.io.folders import output_folder
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import METHODS
 from bidnerf_core.progress import Progress

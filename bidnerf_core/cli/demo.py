@@ -15,25 +15,24 @@ from rich.table import Table
 
 from bidnerf_core.backend import Backend, load_backend, quick_config
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.options import DEFAULT_BACKEND, LARGEST_SEED, Flag, option, parse, require
 from bidnerf_core.cli.output import console, print_table, say, show
-from bidnerf_core.cli.progress import timed
-from bidnerf_core.cli.train import train_map
+from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c, timed
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.evaluation.figures import convergence_plot, save_gif
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
+from bidnerf_core.io.folders import output_folder
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.maps.map import Map
+from bidnerf_core.maps.training import train
 from bidnerf_core.results.errors import PoseError, pose_error
 from bidnerf_core.results.overlays import Painter
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
-from bidnerf_core.training import TrainingStopped
 
 PHOTO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
 TRAINING_VIEWS, RADIUS = 60, 3.5
@@ -99,12 +98,15 @@ def _demonstrated(
         config = config if steps is None else dataclasses.replace(config, steps=steps)
     except TypeError as error:
         raise UsageError(f"backend {backend!r} has no setting 'steps', expected one that has") from error
-    with timed(f"trained on {len(seen)} views of the closed-form scene, and baked"):
-        try:
-            train_map(chosen, backend, seen, config, out / "map", scene.name, scene.bounds.background)
-        except TrainingStopped as stopped:
-            raise KeyboardInterrupt from stopped
-    stored = load_map(out / "map")
+    with (
+        timed(f"trained on {len(seen)} views of the closed-form scene, and baked"),
+        stopped_by_ctrl_c() as cancel,
+        Display() as progress,
+    ):
+        stored = train(
+            seen, backend, out / "map", config, background=scene.bounds.background, overwrite=True,
+            progress=progress, cancel=cancel,
+        )  # fmt: skip
     auto, bid = Localizer(stored), Localizer(stored, "bid", settings_of("bid", DESCENT))
     trials = []
     for number, view in enumerate(unseen):

@@ -1,67 +1,10 @@
-"""Folders that commands write into."""
+"""Checks of the places that commands write to."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import FileInUse, is_temporary, locked, temporary
-
-
-@contextlib.contextmanager
-def output_folder(out: Path, overwrite: bool) -> Iterator[None]:
-    """Create a folder, and check before hours of work that it can be written and that no other process writes into it.
-
-    A folder that is not empty is rejected unless ``overwrite`` is set. If the work fails before anything is in the folder, the
-    folder is removed again, with the parents that were created for it. Raises ``InputError``.
-    """
-    _check_free(out, overwrite)
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        _make_writable(out)
-        with locked(out):
-            _check_free(out, overwrite)  # another process may have finished meanwhile
-            yield
-    except FileInUse:  # the folder belongs to the other process
-        raise
-    except BaseException:
-        with contextlib.suppress(OSError):  # not empty, or never made
-            for folder in made:
-                folder.rmdir()
-        raise
-
-
-def _check_free(out: Path, overwrite: bool) -> None:
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file, expected the name of a folder")
-    if out.is_dir() and not overwrite and not all(map(_is_leftover, out.iterdir())):
-        from bidnerf_core.cli.opened_map import unfinished
-
-        what = unfinished(out) or "exists already and is not empty"
-        raise InputError(f"{out}: {what}; name another --out or pass --overwrite")
-
-
-def _is_leftover(file: Path) -> bool:
-    """Return whether the file was left behind by a process that was killed before the map was complete."""
-    from bidnerf_core.maps.description import DESCRIPTION
-    from bidnerf_core.maps.files import OURS
-
-    of_map = OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
-    return of_map or is_temporary(file.name)
-
-
-def _make_writable(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = temporary(out / "writable")
-        probe.write_bytes(b"")
-        probe.unlink()
-    except OSError as error:
-        raise InputError(
-            f"{out}: cannot be written ({error.strerror}), expected a folder that can be made and written"
-        ) from error
 
 
 def check_pose_file(out: Path) -> None:

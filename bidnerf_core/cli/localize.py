@@ -21,7 +21,6 @@ from bidnerf_core.cli.camera_options import (
 from bidnerf_core.cli.folders import check_pose_file, make_folder
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.method_options import Preset, chosen_settings
-from bidnerf_core.cli.opened_map import opened_map
 from bidnerf_core.cli.options import LARGEST_SEED, Flag, MapFolder, Names, option, parse, require
 from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.cli.progress import counted
@@ -41,7 +40,7 @@ from bidnerf_core.localization.methods import (
     require_use_of_depth,
 )
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.maps.map import Map
+from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
 from bidnerf_core.results.errors import PoseError, pose_error, standard_deviations
 from bidnerf_core.results.overlays import overlay
@@ -145,7 +144,7 @@ def run(arguments: list[str]) -> None:
             check_pose_file(out)
         if draw is not None:
             make_folder(draw)
-        stored = opened_map(map)
+        stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
         photos = replace(photos, assumed=_assumed_cameras(stored.landmarks, method, config))
         source = open_queries(query, photos, frames, stored.bounds.background, points)

@@ -10,21 +10,19 @@ from typing import Annotated
 import imageio.v3 as iio
 import numpy as np
 import torch
-from kornia.metrics import psnr
 from rich.text import Text
 
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
-from bidnerf_core.cli.folders import output_folder
-from bidnerf_core.cli.opened_map import opened_map
 from bidnerf_core.cli.options import DataFolder, Flag, MapFolder, Names, option, parse
 from bidnerf_core.cli.output import console, read_views, say, show
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError, printable
-from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
-from bidnerf_core.fields.rendering import RenderedImage, render_image
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.fields.rendering import RenderedImage
+from bidnerf_core.frames.frame import View
 from bidnerf_core.io.files import write_file
-from bidnerf_core.maps.map import Map
+from bidnerf_core.io.folders import output_folder
+from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.maps.rendering import RenderingScores, rendering_scores
 
 DEEPEST = 65.535  # metres that a 16-bit image of millimetres can hold
 
@@ -52,21 +50,13 @@ def _render(
     and prints PSNR and depth error against the dataset's images.
     """
     with output_folder(out, overwrite):
-        stored = opened_map(map)
-        field = stored.field if level is None else _level(stored, level, map)
+        scene = load_map(map)
         names = [name for group in frame for name in group]
         registration = depth_registration(register_depth)
-        dataset = open_dataset(data, stored.bounds.background, camera=camera, register_depth=registration)
+        dataset = open_dataset(data, scene.bounds.background, camera=camera, register_depth=registration)
         views = read_views(dataset, split, names or None)
         _check_file_names([view.frame.name for view in views])
-        _render_views(field, stored.bounds, views, out)
-
-
-def _level(stored: Map, number: int, folder: Path) -> RadianceField:
-    offered = levels(stored.field)
-    if not 0 <= number < len(offered):
-        raise InputError(f"{folder}: no level {number}, expected 0 to {len(offered) - 1}")
-    return offered[number]
+        _render_views(scene, level, views, out)
 
 
 def _check_file_names(names: Sequence[str]) -> None:
@@ -78,21 +68,19 @@ def _check_file_names(names: Sequence[str]) -> None:
         )
 
 
-def _render_views(field: RadianceField, bounds: SceneBounds, views: Sequence[View], out: Path) -> None:
-    rows = []
+def _render_views(scene: Map, level: int | None, views: Sequence[View], out: Path) -> None:
+    scores = []
     with console.status("") as status:
         for number, view in enumerate(views):
             status.update(Text(printable(f"rendering {number + 1}/{len(views)}: {view.frame.name}")))
-            image = render_image(field, view.frame.intrinsics, view.T_ref_camera, bounds, motion=view.motion)
+            image = scene.render(view, level)
             write_images(out, view.frame.name, image)
-            rows.append((view.frame.name, *_scores(image, view.frame)))
-            show(f"{rows[-1][0]}  PSNR {rows[-1][1]:.2f} dB  depth error {_metres(rows[-1][2])} m")
-    errors = torch.cat([row[3] for row in rows])
-    median = float(errors.median()) if len(errors) else None
-    quality = statistics.fmean(row[1] for row in rows)
-    show(
-        f"mean of {len(rows)}: PSNR {quality:.2f} dB; median depth error over all pixels {_metres(median)} m"
-    )
+            scores.append(rendering_scores(image, view.frame))
+            show(f"{view.frame.name}  {scores[-1]}")
+    errors = torch.cat([score.depth_errors for score in scores])
+    mean = RenderingScores(statistics.fmean(score.psnr for score in scores), errors)
+    error = "-" if mean.depth_error is None else f"{mean.depth_error:.4f}"
+    show(f"mean of {len(scores)}: PSNR {mean.psnr:.2f} dB; median depth error over all pixels {error} m")
 
 
 def write_images(out: Path, name: str, image: RenderedImage) -> None:
@@ -106,16 +94,3 @@ def write_images(out: Path, name: str, image: RenderedImage) -> None:
 
 def _as_png(pixels: np.ndarray) -> bytes:
     return bytes(iio.imwrite("<bytes>", pixels, extension=".png"))
-
-
-def _scores(image: RenderedImage, frame: Frame) -> tuple[float, float | None, torch.Tensor]:
-    """Return the PSNR, the median absolute depth error (None without measured depth), and the depth errors themselves."""
-    quality = float(psnr(image.rgb, frame.rgb, 1.0))
-    if frame.depth is None or not frame.has_depth:
-        return quality, None, torch.zeros(0)
-    errors = (image.depth - frame.depth).abs()[frame.depth > 0]
-    return quality, float(errors.median()), errors
-
-
-def _metres(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"

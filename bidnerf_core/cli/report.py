@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from bidnerf_core.cli.folders import output_folder
 from bidnerf_core.cli.options import option, parse
 from bidnerf_core.cli.output import console, show
 from bidnerf_core.errors import InputError, UsageError
+from bidnerf_core.io.folders import output_folder
 
 if TYPE_CHECKING:  # the rest is imported when a report is made, since help pages do not need it
     from bidnerf_core.evaluation.groups import Group

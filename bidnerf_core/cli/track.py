@@ -23,7 +23,6 @@ from bidnerf_core.cli.camera_options import (
 )
 from bidnerf_core.cli.folders import check_pose_file
 from bidnerf_core.cli.interruptions import uninterrupted
-from bidnerf_core.cli.opened_map import opened_map
 from bidnerf_core.cli.options import Flag, MapFolder, option, parse, require
 from bidnerf_core.cli.output import print_json, print_table, say
 from bidnerf_core.cli.progress import counted
@@ -34,7 +33,7 @@ from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError, UsageError, amount
 from bidnerf_core.localization import Localizer, Tracker, TrackerConfig, settings_of
 from bidnerf_core.localization.methods import USUAL_METHOD
-from bidnerf_core.maps.map import Map
+from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results import tracked_path as library
 from bidnerf_core.results.plot_style import require_matplotlib
 from bidnerf_core.results.pose_files import read_pose
@@ -114,7 +113,7 @@ def run(arguments: list[str]) -> None:
             None if start is None else read_pose(start),
             settings_of(USUAL_METHOD, {"depth_sensor": depth_sensor}),
         )
-        stored = opened_map(map)
+        stored = load_map(map)
         assumed = () if stored.landmarks is None else stored.landmarks.cameras
         path, began = TrackedPath.of(stored), clocks.perf_counter()
         localizer = Localizer(stored, config=settings)

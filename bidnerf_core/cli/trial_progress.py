@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from types import FrameType
 
@@ -9,11 +10,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 
 from bidnerf_core.cli.output import console, say
-from bidnerf_core.cli.progress import LINE_EVERY, StoppableBar
-from bidnerf_core.progress import Progress
+from bidnerf_core.cli.progress import LINE_EVERY
+from bidnerf_core.progress import Progress, duration_text
 
 
-class TrialProgress(StoppableBar):
+class TrialProgress:
     """A progress bar for trials, which is called with each ``Progress``.
 
     As a context manager, it makes Ctrl-C set ``stopping``, and a second Ctrl-C interrupt at once.
@@ -27,6 +28,15 @@ class TrialProgress(StoppableBar):
             TimeElapsedColumn(), console=console, disable=not console.is_terminal,
         )  # fmt: skip
         self._task = self._bar.add_task("", total=None, numbers="")
+
+    def __enter__(self) -> TrialProgress:
+        self._previous = signal.signal(signal.SIGINT, self._interrupt)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+        signal.signal(signal.SIGINT, self._previous)
 
     def __call__(self, progress: Progress) -> None:
         """Show how many trials are done. The time left is too low until every worker has finished a trial."""
@@ -47,11 +57,3 @@ class TrialProgress(StoppableBar):
             raise KeyboardInterrupt
         self.stopping = True
         console.print("waiting for the trials under way (Ctrl-C again: at once)", markup=False)
-
-
-def duration_text(seconds: float) -> str:
-    """Return a duration in words, such as 50 s, 12 min or 3 h 5 min."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"

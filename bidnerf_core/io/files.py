@@ -115,7 +115,7 @@ def locked(path: Path) -> Iterator[None]:
     try:
         if not take_lock(number):
             raise FileInUse(
-                f"{path}: another bidnerf writes into it, expected another --out, or to wait for its end"
+                f"{path}: another bidnerf writes into it, expected another place, or to wait for its end"
             )
         yield
     finally:

@@ -50,6 +50,13 @@ class MapInfo:
     format: str = FORMAT
     version: int = VERSION
 
+    @property
+    def interruption(self) -> str | None:
+        """A clause on the training that stopped, where it is not complete."""
+        if self.complete:
+            return None
+        return f"its training stopped at step {self.step}; 'bidnerf train' with --resume goes on with it"
+
 
 def cameras_of(info: MapInfo) -> list[tuple[Intrinsics, SE3]]:
     """Return the cameras of the training images with their ``T_world_camera`` (float64)."""

@@ -11,8 +11,10 @@ import json
 import os
 import re
 import secrets
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from safetensors.torch import save as tensors_to_bytes
 
@@ -20,15 +22,18 @@ from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.io.files import write_file
+from bidnerf_core.io.folders import output_folder
 from bidnerf_core.io.json import from_plain, read_json, to_plain
 from bidnerf_core.io.tensors import load_part, packed, read_tensors
 from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
+from bidnerf_core.mapping.features import USUAL_FEATURES
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, LandmarkSource, MapInfo, load_info
 from bidnerf_core.maps.weights import checked_weights
 from bidnerf_core.training import TrainingState
 
+PART_NAMES = ("weights", "training", "surface", "landmarks", "capture")
 PARTS = (
     r"((weights|training|surface|landmarks)-\d{8,}-[0-9a-f]{8}\.safetensors|capture-\d{8,}-[0-9a-f]{8}\.json)"
 )
@@ -37,20 +42,34 @@ OURS = re.compile(rf"{PARTS}|\.({PARTS}|map\.json)\.[0-9a-f]{{8}}")
 """Names of the files that saving may leave behind; other files in the folder are never removed."""
 
 
-def save_map(folder: Path, info: MapInfo, state: TrainingState) -> MapInfo:
-    """Write a map, and remove the files of an earlier one once the new one is completely written."""
-    name = f"{state.step:08d}-{secrets.token_hex(4)}.safetensors"
-    training = None if info.complete else f"training-{name}"
-    info = replace(
-        info, weights=f"weights-{name}", training=training, surface=None, landmarks=None, landmark_source=None,
-        capture=None, colour_noise=None,
-    )  # fmt: skip
-    description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
+def save_map(
+    folder: Path, info: MapInfo, state: TrainingState, surface: SurfaceMap | None = None,
+    landmarks: LandmarkMap | None = None, capture: CaptureReport | None = None,
+) -> MapInfo:  # fmt: skip
+    """Write a map, and remove the files of an earlier one once the new one is completely written.
+
+    Parts that are not given, such as a surface that was baked from earlier weights, are dropped from the description.
+    """
+    parts: dict[str, Callable[[], bytes]] = {"weights": lambda: tensors_to_bytes(packed(state.field))}
+    if not info.complete:
+        parts["training"] = lambda: tensors_to_bytes(packed(state.optimizer))
+    if surface is not None:
+        parts["surface"] = lambda: tensors_to_bytes(surface_tensors(surface))
+    if landmarks is not None:
+        _check_features(landmarks, folder)
+        parts["landmarks"] = lambda: tensors_to_bytes(landmark_tensors(landmarks))
+    else:
+        info = replace(info, landmark_source=None, landmark_features=USUAL_FEATURES, colour_noise=None)
+    if capture is not None:
+        parts["capture"] = lambda: _json(capture)
+    names = {part: _file_name(part, state.step) for part in parts}
+    named: dict[str, Any] = dict.fromkeys(PART_NAMES) | names
+    info = replace(info, **named)
+    description = _json(info)
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        write_file(folder / info.weights, tensors_to_bytes(packed(state.field)))
-        if info.training is not None:
-            write_file(folder / info.training, tensors_to_bytes(packed(state.optimizer)))
+        for part, content in parts.items():
+            write_file(folder / names[part], content())
         write_file(folder / DESCRIPTION, description)
     finally:
         _sweep(folder)
@@ -74,8 +93,7 @@ def save_landmarks(
     ``source`` is the kind of images that the landmarks were built from. Raises ``InputError`` where another training has
     replaced that map meanwhile, and where the detector of the landmarks has no name by which a query could find it.
     """
-    if not landmarks.features:
-        raise InputError(f"{folder}: landmarks of a detector without a name; expected one that is registered")
+    _check_features(landmarks, folder)
     content = tensors_to_bytes(landmark_tensors(landmarks))
     return _save_part(
         folder, of, "landmarks", content, colour_noise=colour_noise, landmark_source=source,
@@ -88,24 +106,21 @@ def save_capture(folder: Path, of: MapInfo, capture: CaptureReport) -> MapInfo:
 
     Raises ``InputError`` where another training has replaced that map meanwhile.
     """
-    content = json.dumps(to_plain(capture), indent=1, allow_nan=False).encode()
-    return _save_part(folder, of, "capture", content, "json")
+    return _save_part(folder, of, "capture", _json(capture))
 
 
-def _save_part(
-    folder: Path,
-    of: MapInfo,
-    part: str,
-    content: bytes,
-    ending: str = "safetensors",
-    **facts: float | str | None,
-) -> MapInfo:
+def _check_features(landmarks: LandmarkMap, folder: Path) -> None:
+    if not landmarks.features:
+        raise InputError(f"{folder}: landmarks of a detector without a name; expected one that is registered")
+
+
+def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: float | str | None) -> MapInfo:
     """Add a file to a map under the name of a part of its description."""
     if load_info(folder).weights != of.weights:
         raise InputError(f"{folder}: was trained anew while its {part} was made; bake it again")
-    name = f"{part}-{of.step:08d}-{secrets.token_hex(4)}.{ending}"
+    name = _file_name(part, of.step)
     info = replace(load_info(folder), **{part: name}, **facts)  # type: ignore[arg-type]
-    description = json.dumps(to_plain(info), indent=1, allow_nan=False).encode()
+    description = _json(info)
     try:
         write_file(folder / name, content)
         write_file(folder / DESCRIPTION, description)
@@ -139,12 +154,43 @@ def load_capture(path: Path) -> CaptureReport:
     return from_plain(CaptureReport, read_json(path, expected), str(path))
 
 
+@contextlib.contextmanager
+def map_folder(out: Path, overwrite: bool) -> Iterator[None]:
+    """Prepare a folder for a map, and hold its lock: see ``output_folder``."""
+    with output_folder(out, overwrite, _is_leftover, _described):
+        yield
+
+
+def _is_leftover(file: Path) -> bool:
+    """Return whether the file was left behind by a process that was killed before the map was complete."""
+    return OURS.fullmatch(file.name) is not None and not (file.parent / DESCRIPTION).exists()
+
+
+def _described(folder: Path) -> str | None:
+    """Return what a folder holds, if it is a map whose training was interrupted."""
+    try:
+        stopped = load_info(folder).interruption
+    except InputError:
+        return None
+    return None if stopped is None else f"holds a map, and {stopped}"
+
+
+def _file_name(part: str, step: int) -> str:
+    """Return a new name for a file of a map; ``OURS`` recognises it."""
+    ending = "json" if part == "capture" else "safetensors"
+    return f"{part}-{step:08d}-{secrets.token_hex(4)}.{ending}"
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(to_plain(value), indent=1, allow_nan=False).encode()
+
+
 def _sweep(folder: Path) -> None:
     """Remove the files of earlier and of interrupted saves that ``map.json`` does not name."""
     exists = os.path.lexists(folder / DESCRIPTION)
     try:
         found = read_json(folder / DESCRIPTION, "the description of a map") if exists else {}
-        kept = {found.get(name) for name in ("weights", "training", "surface", "landmarks", "capture")}
+        kept = {found.get(name) for name in PART_NAMES}
     except (InputError, AttributeError):  # damaged: which files are in use is unknown
         return
     for file in list(folder.iterdir()):

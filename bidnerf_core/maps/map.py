@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,29 +13,59 @@ import torch
 from torch import Tensor, nn
 
 from bidnerf_core.backend import Backend, load_backend
+from bidnerf_core.captures.cameras import at_stored_poses
+from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
+from bidnerf_core.fields.rendering import RenderedImage, render_image
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.files import locked
 from bidnerf_core.io.json import from_plain
 from bidnerf_core.io.tensors import read_tensors
 from bidnerf_core.localization.problem import on_device
-from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping import BakeConfig, SurfaceMap
+from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, MapInfo, load_info
-from bidnerf_core.maps.files import load_landmarks, load_surface
+from bidnerf_core.maps.files import (
+    load_capture,
+    load_landmarks,
+    load_state,
+    load_surface,
+    map_folder,
+    save_capture,
+    save_landmarks,
+    save_map,
+    save_surface,
+)
+from bidnerf_core.maps.same_scene import check_same_scene
+from bidnerf_core.maps.summary import MapSummary, summarized
+from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.maps.weights import checked_weights
+from bidnerf_core.progress import Cancel, ProgressCallback
+from bidnerf_core.training import TrainingState
+
+log = logging.getLogger("bidnerf")
 
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """A stored map, ready for use: its field is frozen (no parameter requires a gradient)."""
+    """A map, ready for use: its field is frozen (no parameter requires a gradient).
+
+    A map that was loaded or trained into a folder remembers it, and baking stores new parts there.
+    """
 
     info: MapInfo
     field: RadianceField
     surface: SurfaceMap | None = None  # None where it was not baked
     landmarks: LandmarkMap | None = None  # None where none were built
+    folder: Path | None = None  # None for a map in memory
+    record: CaptureReport | None = None  # of the photos, for a map in memory; see ``capture``
 
     @property
     def bounds(self) -> SceneBounds:
+        """The scene's box, range of distances and background."""
         return self.info.bounds
 
     @property
@@ -45,12 +78,143 @@ class Map:
         """Root mean square error of the field's colours (in [0, 1]) on its own training images."""
         return self.info.colour_noise
 
+    @cached_property
+    def capture(self) -> CaptureReport | None:
+        """The record of the photos that gave the landmarks, read when it is first used; None where there is none.
+
+        Raises ``InputError`` where its file is damaged.
+        """
+        if self.record is not None or self.folder is None or self.info.capture is None:
+            return self.record
+        return load_capture(self.folder / self.info.capture)
+
+    @property
+    def _name(self) -> str:
+        return str(self.folder or self.info.data or "map in memory")
+
     def to(self, device: torch.device | str) -> Map:
         """Return the map with its field, surface and landmarks on ``device``; what is not there yet is copied.
 
-        Of all computations with landmarks, only descriptors are compared there, see ``LandmarkMap.to``.
+        Of all computations with landmarks, only descriptors are compared there, see ``LandmarkMap.to``. Raises ``InputError``
+        for a device that does not work here.
         """
         return on_device(self, device)
+
+    def describe(self) -> MapSummary:
+        """Return the facts about the map; ``str()`` of them is a description for people."""
+        return summarized(self.info, self.field, self.surface, self.landmarks, self.capture, self.folder)
+
+    def render(self, view: View, level: int | None = None) -> RenderedImage:
+        """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with camera and pose of ``view``.
+
+        ``level`` is the level of detail, 0 the coarsest; None is the field itself. Raises ``InputError`` for a level that the
+        field does not have.
+        """
+        field = self.field
+        if level is not None:
+            offered = levels(field)
+            if not 0 <= level < len(offered):
+                raise InputError(f"{self._name}: no level {level}, expected 0 to {len(offered) - 1}")
+            field = offered[level]
+        return render_image(field, view.frame.intrinsics, view.T_ref_camera, self.bounds, motion=view.motion)
+
+    def bake(
+        self,
+        data: Images | None = None,
+        split: str = "train",
+        config: BakeConfig | None = None,
+        *,
+        rendered_landmarks: bool = False,
+        progress: ProgressCallback | None = None,
+        cancel: Cancel | None = None,
+    ) -> Map:
+        """Return the map with a new surface and new landmarks, which are stored with it if it has a folder.
+
+        For the surface, views with measured depth replace rendered ones; landmarks are built from all views of ``data``
+        (those of ``split``, where it is a dataset or the path to one). Without data, landmarks are built from images that the
+        field renders, unless the map has landmarks of photos: these are kept unless ``rendered_landmarks`` is set. Raises
+        ``InputError`` where the data is not usable or shows another scene, where nothing can be baked, and where another
+        program writes into the folder; raises ``Cancelled`` once ``cancel`` returns True. Parts that are finished then stay.
+        """
+        if rendered_landmarks and data is not None:
+            raise InputError("rendered_landmarks takes no photos, but data gives some; expected one of them")
+        with contextlib.nullcontext() if self.folder is None else locked(self.folder):
+            views = list[View]()
+            if data is not None:
+                found = read_views(data, split, self._background(data), progress=progress, cancel=cancel)
+                views = at_stored_poses(found.views, self.info.cameras)
+                check_same_scene(self.info, self.field, views, self._name)
+            settings = BakeConfig() if config is None else config
+            return self.with_baked_parts(views, settings, rendered_landmarks, None, progress, cancel)
+
+    def _background(self, data: Images) -> tuple[float, float, float] | None:
+        return self.bounds.background if isinstance(data, str | Path) else None
+
+    def with_baked_parts(
+        self, views: list[View], config: BakeConfig, rendered_landmarks: bool = False,
+        tracked: TrackedViews | None = None, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+    ) -> Map:  # fmt: skip
+        """Bake as ``bake`` does, with views at the map's poses, while the caller holds the lock of the folder.
+
+        ``tracked`` holds the views' keypoints if they were tracked already.
+        """
+        surface = bake_surface(self.info, self.field, views, config, self._name, progress, cancel)
+        scene = self._with_surface(surface)
+        if not views and not rendered_landmarks and (kept := self._photo_landmarks()) is not None:
+            log.info(
+                f"{self._name}: the landmarks of its photos are kept; --rendered-landmarks replaces them"
+            )
+            return replace(scene, landmarks=kept)
+        found = bake_landmarks(self.info, self.field, views, self._name, tracked, progress, cancel)
+        return scene._with_landmarks(found)
+
+    def _photo_landmarks(self) -> LandmarkMap | None:
+        """Return the landmarks that were built from photos, unless their file is damaged."""
+        if self.info.landmark_source == "rendered images":
+            return None
+        if self.landmarks is not None or self.folder is None or self.info.landmarks is None:
+            return self.landmarks
+        try:
+            return _with_cameras(load_landmarks(self.folder / self.info.landmarks), self.info)
+        except InputError as error:
+            log.info(str(error))
+            return None
+
+    def _with_surface(self, surface: SurfaceMap) -> Map:
+        info = self.info if self.folder is None else save_surface(self.folder, self.info, surface)
+        return replace(self, info=info, surface=surface)
+
+    def _with_landmarks(self, found: BakedLandmarks) -> Map:
+        info, landmarks = self.info, self.landmarks
+        if found.landmarks is not None:
+            info = replace(
+                info, colour_noise=found.colour_noise, landmark_source=found.source,
+                landmark_features=found.landmarks.features,
+            )  # fmt: skip
+            landmarks = _with_cameras(found.landmarks, info)
+            if self.folder is not None:
+                info = save_landmarks(self.folder, self.info, landmarks, found.colour_noise, found.source)
+        if found.capture is not None and self.folder is not None:
+            info = save_capture(self.folder, info, found.capture)
+        return replace(self, info=info, landmarks=landmarks, record=found.capture or self.record)
+
+    def save(self, folder: str | Path, overwrite: bool = False) -> Map:
+        """Write the whole map into a folder, and return it with that folder.
+
+        Raises ``InputError`` where the folder cannot be written, where it is not empty and ``overwrite`` is not set, and where
+        the field is not that of a backend.
+        """
+        if not isinstance(self.field, nn.Module):
+            found = type(self.field).__name__
+            raise InputError(f"{folder}: the map's field is a {found}, expected an nn.Module of a backend")
+        state = TrainingState(self.info.step, self.field.state_dict(), {})
+        if not self.info.complete and self.folder is not None:
+            state = load_state(self.folder, self.info, self.field)
+        folder = Path(folder)
+        here = self.to("cpu")
+        with map_folder(folder, overwrite):
+            info = save_map(folder, self.info, state, here.surface, here.landmarks, self.capture)
+        return replace(self, info=info, folder=folder, record=self.capture)
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
@@ -61,19 +225,37 @@ def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool
     """
     folder = Path(folder)
     info, tensors, surface, landmarks = _read(folder, baked)
-    backend, where = load_backend(info.backend, str(folder)), str(folder / DESCRIPTION)
+    if info.interruption is not None:
+        log.info(f"{folder}: {info.interruption}")
+    field = frozen_field(info, tensors, folder)
+    if landmarks is not None:
+        landmarks = _with_cameras(landmarks, info)
+    return Map(info, field, surface, landmarks, folder).to(device)
+
+
+def frozen_field(info: MapInfo, tensors: dict[str, Tensor], folder: Path | None = None) -> RadianceField:
+    """Return the field that ``info`` describes with the weights ``tensors``; no parameter requires a gradient.
+
+    Errors name the files of ``folder``. Raises ``InputError`` where the backend or the weights do not fit.
+    """
+    where = str(DESCRIPTION if folder is None else folder / DESCRIPTION)
+    backend = load_backend(info.backend, "" if folder is None else str(folder))
+    path = Path(info.weights) if folder is None else folder / info.weights
     outline = _outline(backend, info, where)
     if outline is not None:  # before memory is allocated for a field, of whatever size map.json describes
-        tensors = checked_weights(outline, tensors, folder / info.weights)
+        tensors = checked_weights(outline, tensors, path)
     field, _ = build_field(backend, info, where)
     if outline is None:
-        tensors = checked_weights(field, tensors, folder / info.weights)
+        tensors = checked_weights(field, tensors, path)
     cast(nn.Module, field).load_state_dict(tensors)
     cast(nn.Module, field).requires_grad_(False).eval()
-    if landmarks is not None:
-        cameras = tuple(camera.intrinsics for camera in info.cameras)
-        landmarks = replace(landmarks, cameras=cameras, features=info.landmark_features)
-    return Map(info, field, surface, landmarks).to(device)
+    return field
+
+
+def _with_cameras(landmarks: LandmarkMap, info: MapInfo) -> LandmarkMap:
+    """Return the landmarks with what the description of a map says about the images that they were built from."""
+    cameras = tuple(camera.intrinsics for camera in info.cameras)
+    return replace(landmarks, cameras=cameras, features=info.landmark_features)
 
 
 def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceField, Any]:

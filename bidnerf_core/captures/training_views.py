@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -17,13 +18,14 @@ from bidnerf_core.captures.coverage import shows_distances
 from bidnerf_core.captures.pose_conventions import other_convention
 from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.carving import has_outline
-from bidnerf_core.cli.output import say
-from bidnerf_core.cli.progress import counted
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping.keypoint_depth import depth_ratio
 from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedViews, tracked_views
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
+from bidnerf_core.progress import Cancel, ProgressCallback, counter
+
+log = logging.getLogger("bidnerf")
 
 RefinementChoice = Literal["auto", "always", "never"]
 """When to refine the given poses: ``auto`` refines them if they are inconsistent."""
@@ -40,23 +42,29 @@ class TrainingViews:
     """Views prepared for training, and what is known about their poses."""
 
     views: list[View]
-    tracked: TrackedViews | None  # their keypoints, from which ``bake_map`` builds landmarks
+    tracked: TrackedViews | None  # their keypoints, from which baking builds landmarks
     cameras: tuple[StoredCamera, ...]
     refinement: PoseRefinement | None = None  # None where nothing is known about the given poses
     distances: bool = True  # whether the views determine distances
 
 
-def prepared(views: Sequence[View], refinement: RefinementChoice = "auto") -> TrainingViews:
-    """Refine the poses of the views if requested, and find the landmarks that they show."""
+def prepared(
+    views: Sequence[View], refinement: RefinementChoice = "auto",
+    progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+) -> TrainingViews:  # fmt: skip
+    """Refine the poses of the views if requested, and find the landmarks that they show.
+
+    Raises ``InputError`` where poses or depth are plainly in another convention or unit.
+    """
     if refinement == "never":
-        tracked, seeing = located(views)
+        tracked, seeing = located(views, progress, cancel)
         return TrainingViews(
             seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
         )
-    tracked = _tracked(views)
-    with counted("poses", "image pairs") as report:
-        least = 0.0 if refinement == "always" else INCONSISTENT
-        found = training_poses(tracked, views, least, progress=report)
+    tracked = _tracked(views, progress, cancel)
+    least = 0.0 if refinement == "always" else INCONSISTENT
+    report = counter("poses", "image pairs", progress, cancel)
+    found = training_poses(tracked, views, least, progress=report)
     poses, motion = found.tracked.T_world_camera, found.tracked.motion
     moved = [replace(view, T_ref_camera=poses[i]) for i, view in enumerate(views)]
     if bool(motion.any()):
@@ -70,25 +78,27 @@ def prepared(views: Sequence[View], refinement: RefinementChoice = "auto") -> Tr
         before, after = found.consistency.noise_before, found.consistency.noise_after
         summary = PoseRefinement(before, after, found.refined, names)
     if summary is None and (refinement == "always" or len(views) >= ENOUGH_IMAGES):
-        say(
+        log.info(
             f"the poses are kept: to refine them takes {ENOUGH_IMAGES} images or more that show {LEAST_VISIBLE_POINTS}"
             " triangulated points each; if these images overlap, check the order and the axes of their poses"
         )
     for line in [] if summary is None else pose_sentences(cameras, summary):
-        say(line)
+        log.info(line)
     seeing, distances = _with_landmarks(moved, found.tracked), shows_distances(views, tracked)
     return TrainingViews(seeing, found.tracked, cameras, summary, distances)
 
 
-def located(views: Sequence[View]) -> tuple[TrackedViews | None, list[View]]:
+def located(
+    views: Sequence[View], progress: ProgressCallback | None = None, cancel: Cancel | None = None
+) -> tuple[TrackedViews | None, list[View]]:
     """Track the keypoints of the views, unless all have dense depth or a silhouette.
 
-    Return the tracks, from which ``bake_map`` builds the map's landmarks, and the views with the landmarks that each shows;
+    Return the tracks, from which baking builds the map's landmarks, and the views with the landmarks that each shows;
     from these training takes distances.
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
-    tracked = _tracked(views)
+    tracked = _tracked(views, progress, cancel)
     return tracked, _with_landmarks(views, tracked)
 
 
@@ -97,17 +107,17 @@ def _lacks_distances(view: View) -> bool:
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
-def _tracked(views: Sequence[View]) -> TrackedViews:
+def _tracked(views: Sequence[View], progress: ProgressCallback | None, cancel: Cancel | None) -> TrackedViews:
     """Track the keypoints of the views. Raises ``InputError`` where poses or depth are plainly in another convention or unit."""
-    with counted("landmarks", "steps") as report:
-        tracked = tracked_views(views, progress=report)
+    tracked = tracked_views(views, progress=counter("landmarks", "steps", progress, cancel))
     if (other := other_convention(tracked.observations.images)) is not None:
         raise InputError(other.sentence)
-    _check_depth_unit(tracked)
+    check_depth_unit(tracked)
     return tracked
 
 
-def _check_depth_unit(tracked: TrackedViews) -> None:
+def check_depth_unit(tracked: TrackedViews) -> None:
+    """Raise ``InputError`` where measured depth is in another unit than the poses; log a scale that is a few percent off."""
     seen, points = tracked.triangulated(DEFAULT_LANDMARKS)
     ratio = depth_ratio(seen.sightings, points, tracked.depth[seen.number])
     if ratio is None or abs(ratio - 1) < UNUSUAL_RATIO:
@@ -118,7 +128,7 @@ def _check_depth_unit(tracked: TrackedViews) -> None:
             f"{remark}; expected depth and poses in the same unit: check the unit of the depth images"
             " (depth_unit_scale_factor in a transforms.json) and the scale of the poses"
         )
-    say(f"{remark}; training takes both as they are")
+    log.info(f"{remark}; training takes both as they are")
 
 
 def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
@@ -127,5 +137,5 @@ def _with_landmarks(views: Sequence[View], tracked: TrackedViews) -> list[View]:
         return list(views)
     seen = tracked.seen(DEFAULT_LANDMARKS)
     count = sum(len(part.distance) for part in seen)
-    say(f"{count} sightings of landmarks in {len(views)} views")
+    log.info(f"{count} sightings of landmarks in {len(views)} views")
     return [replace(view, landmarks=part) for view, part in zip(views, seen, strict=True)]

@@ -1,0 +1,60 @@
+"""Folders that results are written into."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from bidnerf_core.errors import InputError
+from bidnerf_core.io.files import FileInUse, is_temporary, locked, temporary
+
+
+@contextlib.contextmanager
+def output_folder(
+    out: Path,
+    overwrite: bool,
+    is_leftover: Callable[[Path], bool] = lambda file: False,
+    described: Callable[[Path], str | None] = lambda folder: None,
+) -> Iterator[None]:
+    """Create a folder, and check before hours of work that it can be written and that nobody else writes into it.
+
+    A folder that is not empty is rejected unless ``overwrite`` is set; temporary files, and those that ``is_leftover``
+    recognises, do not count. ``described`` returns what a folder holds, for the message. If the work fails before anything is
+    in the folder, the folder is removed again, with the parents that were created for it. Raises ``InputError``.
+    """
+
+    def check() -> None:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"{out}: is a file, expected the name of a folder")
+        files = out.iterdir() if out.is_dir() and not overwrite else ()
+        if not all(is_temporary(file.name) or is_leftover(file) for file in files):
+            what = described(out) or "exists already and is not empty"
+            raise InputError(f"{out}: {what}; name another folder, or overwrite it (--overwrite)")
+
+    check()
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        _make_writable(out)
+        with locked(out):
+            check()  # another process may have finished meanwhile
+            yield
+    except FileInUse:  # the folder belongs to the other process
+        raise
+    except BaseException:
+        with contextlib.suppress(OSError):  # not empty, or never made
+            for folder in made:
+                folder.rmdir()
+        raise
+
+
+def _make_writable(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = temporary(out / "writable")
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror}), expected a folder that can be made and written"
+        ) from error

@@ -1,0 +1,114 @@
+"""Baking: the surface and the landmarks of a map, and the record of its photos."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from bidnerf_core.captures.advice import summary
+from bidnerf_core.captures.report import CaptureReport
+from bidnerf_core.captures.survey import surveyed
+from bidnerf_core.captures.trial import tried_landmarks
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.frames.frame import View
+from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
+from bidnerf_core.mapping.keyframes import colour_noise, rendered_views
+from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
+from bidnerf_core.mapping.landmarks import HeldOutTrial, LandmarkMap
+from bidnerf_core.mapping.pose_scatter import update_scatter
+from bidnerf_core.maps.description import LandmarkSource, MapInfo, cameras_of
+from bidnerf_core.progress import Cancel, ProgressCallback, counter
+
+log = logging.getLogger("bidnerf")
+
+
+@dataclass(frozen=True, eq=False)
+class BakedLandmarks:
+    """Landmarks, and what was learnt while they were built."""
+
+    landmarks: LandmarkMap | None  # None where the images show too little texture
+    source: LandmarkSource
+    colour_noise: (
+        float | None
+    )  # root mean square error of rendered colours on photos; None if it was not measured
+    capture: CaptureReport | None  # record of the photos; None for rendered images
+
+
+def bake_surface(
+    info: MapInfo, field: RadianceField, views: Sequence[View], config: BakeConfig, where: str,
+    progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+) -> SurfaceMap:  # fmt: skip
+    """Return the surface of a map from the measured depth of ``views`` or, without such, from depth that ``field`` renders.
+
+    Depth is rendered from the map's cameras, or from those of the views where the map has none. Raises ``InputError`` where
+    there is neither, and where images do not agree on a surface. ``where`` begins what is logged.
+    """
+    began = time.monotonic()
+    cameras = cameras_of(info) or [(view.frame.intrinsics, view.T_ref_camera) for view in views]
+    if not cameras:
+        raise InputError(
+            f"{where}: holds no cameras to render it from; give a dataset of its views by --data"
+        )
+    measured = [view for view in views if view.frame.has_depth]
+    if any(view.frame.has_dense_depth for view in measured):
+        cameras = []
+    else:
+        measured = []  # a few points do not make a surface
+    surface = bake(
+        field, info.bounds, cameras, measured, config, counter("baking", "views", progress, cancel)
+    )
+    source = f"{len(measured)} measured" if measured else f"{len(cameras)} rendered"
+    log.info(
+        f"{where}: surface of {len(surface.surfels)} surfels from {source} views, {time.monotonic() - began:.1f} s"
+    )
+    size = f"{surface.stored_cells} cells with a side of {surface.cell:.3g}, {surface.mebibytes:.1f} MiB"
+    log.info(f"{where}: the surface is indexed by {size}")
+    return surface
+
+
+def bake_landmarks(
+    info: MapInfo, field: RadianceField, views: Sequence[View], where: str, tracked: TrackedViews | None = None,
+    progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+) -> BakedLandmarks:  # fmt: skip
+    """Build landmarks from ``views`` or, without any, from images that ``field`` renders at the map's cameras.
+
+    ``tracked`` holds the views' keypoints if they were tracked already. A scene without texture has no landmarks;
+    localization then relies on the surface alone. ``where`` begins what is logged.
+    """
+    began = time.monotonic()
+    source: LandmarkSource = "photos" if views else "rendered images"
+    # Only photos show how well the field renders; against its own images it has no error.
+    noise = colour_noise(field, info.bounds, views) if views else info.colour_noise
+    images = views or rendered_views(field, info.bounds, cameras_of(info))
+    report = counter("landmarks", "steps", progress, cancel)
+    tracked = tracked_views(images, progress=report) if tracked is None else tracked
+    if views and not info.distances:
+        tracked = tracked.at_distance(info.bounds.side / 2)  # the directions are still informative
+    trial, landmarks = HeldOutTrial(), None
+    try:
+        landmarks = _tried(info, tracked, images, log.info)
+    except InputError as error:
+        log.info(f"{where}: no landmarks: {error}")
+    else:
+        trial = landmarks.trial
+        log.info(
+            f"{where}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(images)} {source},"
+            f" {time.monotonic() - began:.1f} s"
+        )
+    capture = surveyed(tracked, views, trial=trial) if views else None
+    for line in [] if capture is None else summary(capture):
+        log.info(line)
+    return BakedLandmarks(landmarks, source, noise, capture)
+
+
+def _tried(
+    info: MapInfo, tracked: TrackedViews, views: Sequence[View], report: Callable[[str], None]
+) -> LandmarkMap:
+    landmarks = tried_landmarks(tracked, views, report=report)
+    # New poses are compared with others from the source of the given ones. If training kept those, except for some wrong
+    # ones, their errors are negligible.
+    by_source = update_scatter([camera.update for camera in info.cameras])
+    return replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)

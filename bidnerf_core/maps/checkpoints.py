@@ -1,0 +1,69 @@
+"""The state of a training that makes a map: its progress, its checkpoints on disk, and requests to stop it."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from torch import nn
+
+from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.maps.files import save_map
+from bidnerf_core.progress import Cancel, Progress, ProgressCallback
+from bidnerf_core.training import Progress as TrainingStep
+from bidnerf_core.training import TrainingState
+
+CHECKPOINT_SECONDS = 60.0
+
+
+class Checkpoints:
+    """The ``Report`` of a training. Its states are saved to ``folder``, unless that is None; ``info`` describes the last one.
+
+    ``state`` is the one to resume from, and ``seconds`` the time between checkpoints.
+    """
+
+    def __init__(
+        self, info: MapInfo, folder: Path | None = None, state: TrainingState | None = None,
+        seconds: float = CHECKPOINT_SECONDS, progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+    ) -> None:  # fmt: skip
+        self.info, self.folder = info, folder
+        self._state, self._seconds = state, seconds
+        self._progress, self._cancel = progress, cancel
+        self._step = self._total = info.step
+        self._earlier, self._began = info.seconds, time.monotonic()
+        self._saved = self._began
+
+    @property
+    def stopping(self) -> bool:
+        return self._cancel is not None and self._cancel()
+
+    def resume(self) -> TrainingState | None:
+        return self._state
+
+    def step(self, progress: TrainingStep) -> None:
+        self._state = None  # free it: it is as large as the field and its optimizer
+        self._step, self._total = progress.step, progress.total
+        if self._progress is None:
+            return
+        figures = f"loss {progress.loss:.5f}  PSNR {progress.psnr:.2f} dB"
+        if not math.isnan(progress.samples_per_ray):  # not every recipe reports it
+            figures += f"  {progress.samples_per_ray:.1f} samples a ray"
+        self._progress(Progress("training", progress.step, progress.total, "steps", figures))
+
+    def due(self, step: int) -> bool:
+        return step == self._total or time.monotonic() - self._saved > self._seconds
+
+    def save(self, state: TrainingState) -> None:
+        seconds = self._earlier + time.monotonic() - self._began
+        info = replace(self.info, step=state.step, complete=state.step >= self._total, seconds=seconds)
+        self.info = info if self.folder is None else save_map(self.folder, info, state)
+        self._saved = time.monotonic()
+
+    def finish(self, field: RadianceField) -> None:
+        """Save once more if the backend ended without reporting its last step."""
+        if not self.info.complete and isinstance(field, nn.Module):
+            self._total = self._step
+            self.save(TrainingState(self._step, field.state_dict(), {}))

@@ -1,0 +1,38 @@
+"""How well a rendered image fits a photographed one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from kornia.metrics import psnr
+from torch import Tensor
+
+from bidnerf_core.fields.rendering import RenderedImage
+from bidnerf_core.frames.frame import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class RenderingScores:
+    """The quality of a rendered image, by comparison with the photo from the same pose."""
+
+    psnr: float  # dB
+    depth_errors: Float[Tensor, "n"]  # metres: absolute errors of planar z, at the pixels with measured depth
+
+    @property
+    def depth_error(self) -> float | None:
+        """The median absolute depth error (metres); None without measured depth."""
+        return float(self.depth_errors.median()) if len(self.depth_errors) else None
+
+    def __str__(self) -> str:
+        error = "-" if self.depth_error is None else f"{self.depth_error:.4f}"
+        return f"PSNR {self.psnr:.2f} dB  depth error {error} m"
+
+
+def rendering_scores(image: RenderedImage, frame: Frame) -> RenderingScores:
+    """Compare a rendered image with the colours and the measured depth of the frame from the same pose."""
+    errors = torch.zeros(0)
+    if frame.depth is not None and frame.has_depth:
+        errors = (image.depth - frame.depth).abs()[frame.depth > 0]
+    return RenderingScores(float(psnr(image.rgb, frame.rgb, 1.0)), errors)

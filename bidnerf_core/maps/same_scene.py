@@ -1,0 +1,33 @@
+"""Whether photos show the scene of a map, so that they may be baked into it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from bidnerf_core.captures.cameras import stored_cameras
+from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.frames.frame import View
+from bidnerf_core.mapping.keyframes import colour_noise
+from bidnerf_core.maps.description import MapInfo
+
+UNLIKE, UNLIKE_ITS_OWN, UNLIKE_ANY = 0.2, 2.0, 0.3
+"""Least difference (RMS) between rendered and photographed colours in another scene: as such, and as a multiple of that between
+the field and the photos that the map was made of; and where the latter is not known, as in a map that was never baked."""
+
+
+def check_same_scene(info: MapInfo, field: RadianceField, views: Sequence[View], where: str) -> None:
+    """Raise ``InputError`` for photos of another scene: none of those that the map was made of, and unlike its field.
+
+    The message begins with ``where``.
+    """
+    own = {(camera.name, camera.T_world_camera) for camera in info.cameras}
+    known = any((c.name, c.T_world_camera) in own for c in stored_cameras(views))
+    if known or not own:
+        return
+    off, usual = colour_noise(field, info.bounds, views), info.colour_noise
+    if off > (UNLIKE_ANY if usual is None else max(UNLIKE, UNLIKE_ITS_OWN * usual)):
+        raise InputError(
+            f"{where}: made from {info.data or 'other views'!r}, and its renderings differ from the photos by {off:.0%} of the"
+            " range of colours; expected photos of the same scene, with poses in the coordinates of the map"
+        )

@@ -1,0 +1,157 @@
+"""The summary of a map: what a person wants to know about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from bidnerf_core.captures.advice import sentences
+from bidnerf_core.captures.cameras import MovedCamera, PoseRefinement, pose_sentences
+from bidnerf_core.captures.report import CaptureReport
+from bidnerf_core.errors import amount
+from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
+from bidnerf_core.io.json import to_plain
+from bidnerf_core.mapping.landmarks import HeldOutTrial, LandmarkMap
+from bidnerf_core.mapping.surface_map import SurfaceMap
+from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.progress import duration_text
+
+
+@dataclass(frozen=True)
+class SurfaceSize:
+    """The size of a map's surface."""
+
+    cell: float  # metres: side of a cell of its index
+    cells: int  # that are stored
+    MiB: float
+
+
+@dataclass(frozen=True)
+class MapSummary:
+    """The facts about a map. ``str()`` of it is a description for people, ``plain()`` an object for JSON."""
+
+    map: str  # its folder; empty for a map in memory
+    backend: str
+    data: str  # name of the dataset's folder
+    cameras: int
+    distances: bool  # whether the training images determine distances
+    poses: PoseRefinement | None  # the consistency of the given poses, where it is known
+    step: int
+    complete: bool
+    seconds: float  # of training
+    levels: int
+    parameters: int
+    surfels: int
+    surface: SurfaceSize | None
+    landmarks: int
+    trial: HeldOutTrial | None
+    bytes: int | None  # of the files in its folder
+    bounds: SceneBounds
+    config: dict[str, Any]
+    bidnerf: str  # the version that wrote it
+    moved: tuple[MovedCamera, ...]  # by the refinement of poses
+    capture: CaptureReport | None  # the record of the photos, where there is one
+    colour_noise: float | None  # root mean square error of rendered colours on training images
+    remarks: tuple[str, ...]  # sentences about the poses and the photos
+
+    def plain(self) -> dict[str, Any]:
+        """Return the facts as values that JSON can hold."""
+        facts: dict[str, Any] = to_plain(replace(self, remarks=()))
+        del facts["remarks"]
+        return facts
+
+    def __str__(self) -> str:
+        rows = [f"{key + ':':<12} {value}" for key, value in self._lines().items()]
+        return "\n".join([*rows, *(f"- {remark}" for remark in self.remarks)])
+
+    def _lines(self) -> dict[str, str]:
+        photos = amount(self.cameras, "image") if self.cameras else "cameras not recorded"
+        state = "complete" if self.complete else "not complete; 'bidnerf train --resume' goes on with it"
+        time = duration_text(self.seconds)
+        place = f"{self.map}, {(self.bytes or 0) / 2**20:.1f} MiB" if self.map else "in memory"
+        return {
+            "map": f"{place}, written by bidnerf {self.bidnerf}",
+            "made from": f"{self.data or 'unnamed data'}, {photos}",
+            "training": f"{self.step} steps of backend {self.backend} in {time}, {state}",
+            "field": self._field_line(),
+            "scene": _scene_line(self.bounds),
+            "distances": "known"
+            if self.distances
+            else "not known, since all images were taken from one place",
+            "surface": self._surface_line(),
+            "landmarks": str(self.landmarks or "none; 'bidnerf bake MAP --data DATA' builds them"),
+            "settings": _shown(self.config),
+        }
+
+    def _field_line(self) -> str:
+        error = ""
+        if self.colour_noise is not None:
+            error = f", off by {self.colour_noise:.1%} of the range of colours on its training images (RMS)"
+        return f"{amount(self.parameters, 'parameter')} in {amount(self.levels, 'level')}{error}"
+
+    def _surface_line(self) -> str:
+        if self.surface is None:
+            return "none; 'bidnerf bake MAP' makes one"
+        cells = f"{amount(self.surface.cells, 'cell')} with a side of {self.surface.cell:.3g}"
+        return f"{amount(self.surfels, 'surfel')}, indexed by {cells}, {self.surface.MiB:.1f} MiB"
+
+
+def summarized(
+    info: MapInfo, field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None,
+    capture: CaptureReport | None, folder: Path | None,
+) -> MapSummary:  # fmt: skip
+    """Return the summary of a map from its parts."""
+    size, files = None, None
+    if surface is not None:
+        size = SurfaceSize(surface.cell, surface.stored_cells, round(surface.mebibytes, 1))
+    if folder is not None:
+        files = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+    refinement = info.pose_refinement
+    remarks = [] if refinement is None else pose_sentences(info.cameras, refinement)
+    moved = (camera.moved for camera in info.cameras)
+    return MapSummary(
+        map="" if folder is None else str(folder),
+        backend=info.backend,
+        data=info.data,
+        cameras=len(info.cameras),
+        distances=info.distances,
+        poses=refinement,
+        step=info.step,
+        complete=info.complete,
+        seconds=round(info.seconds, 1),
+        levels=len(levels(field)),
+        parameters=sum(p.numel() for p in field.parameters()) if isinstance(field, nn.Module) else 0,
+        surfels=0 if surface is None else len(surface.surfels),
+        surface=size,
+        landmarks=0 if landmarks is None else len(landmarks),
+        trial=None if landmarks is None else landmarks.trial,
+        bytes=files,
+        bounds=info.bounds,
+        config=info.config,
+        bidnerf=info.bidnerf,
+        moved=tuple(camera for camera in moved if camera is not None),
+        capture=capture,
+        colour_noise=info.colour_noise,
+        remarks=tuple(remarks if capture is None else [*remarks, *sentences(capture)]),
+    )
+
+
+def _scene_line(bounds: SceneBounds) -> str:
+    beyond = "more beyond it" if bounds.contracted else "nothing beyond it"
+    box = (
+        f"a box of {' x '.join(f'{side:.3g}' for side in bounds.size)} from {_shown(bounds.lower)}, {beyond}"
+    )
+    return (
+        f"{box}; seen from {bounds.near:.3g} to {bounds.far:.3g} away; background {_shown(bounds.background)}"
+    )
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_shown(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return "(" + ", ".join(_shown(item) for item in value) + ")"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

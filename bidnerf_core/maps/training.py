@@ -1,0 +1,249 @@
+"""Making maps: training a field on posed images, baking what localization needs beside it, and going on where that stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import nn
+
+from bidnerf_core.backend import Backend, load_backend
+from bidnerf_core.captures.cameras import as_given, at_stored_poses, stored_cameras
+from bidnerf_core.captures.training_views import RefinementChoice, located, prepared
+from bidnerf_core.carving import estimate_bounds
+from bidnerf_core.datasets import Background, Dataset
+from bidnerf_core.datasets.colmap import SparseChoice
+from bidnerf_core.devices import moved, working_device
+from bidnerf_core.errors import Cancelled, InputError, amount
+from bidnerf_core.frames.frame import View
+from bidnerf_core.io.json import from_plain, to_plain
+from bidnerf_core.io.tensors import packed
+from bidnerf_core.mapping import BakeConfig
+from bidnerf_core.mapping.landmark_building import TrackedViews
+from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS, Checkpoints
+from bidnerf_core.maps.description import MapInfo, load_info
+from bidnerf_core.maps.files import load_state, map_folder
+from bidnerf_core.maps.map import Map, build_field, frozen_field, load_map
+from bidnerf_core.maps.views import Images, ReadViews, read_views
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
+from bidnerf_core.training import TrainingStopped
+
+log = logging.getLogger("bidnerf")
+USUAL_BAKE = BakeConfig()
+
+
+class OtherSettings(InputError):
+    """A training cannot be resumed with settings that differ from those that it was begun with."""
+
+
+@dataclass(frozen=True)
+class _Work:
+    """How to train and bake, whatever the views."""
+
+    out: Path | None
+    bake: BakeConfig | None
+    device: torch.device
+    checkpoint_seconds: float
+    progress: ProgressCallback | None
+    cancel: Cancel | None
+
+
+def train(
+    data: Images,
+    backend: str = "hashgrid",
+    out: str | Path | None = None,
+    config: Any = None,
+    split: str = "train",
+    refine_poses: RefinementChoice = "auto",
+    bake: bool | BakeConfig = True,
+    device: torch.device | str = "cpu",
+    overwrite: bool = False,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+    *,
+    background: Background | None = None,
+    depth_points: str | Path | None = None,
+    point_choice: SparseChoice | None = None,
+    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+) -> Map:
+    """Train a map on posed images: check and refine their poses, train the field, and bake a surface and landmarks.
+
+    ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``split`` names the views of a dataset.
+    ``backend`` is the name of an installed backend, and ``config`` holds its settings: an object of its ``config_type``, or a dict of
+    those that differ from the defaults. The map is stored in folder ``out`` while it is trained, and stays in memory only if
+    that is None. ``refine_poses`` is "always", "never", or "auto": if the images contradict the given poses. ``bake`` may hold
+    the settings of baking.
+
+    ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True, ``Cancelled`` is
+    raised; a map in a folder has then been saved, and ``resume`` goes on with it. An error that ``progress`` raises ends the
+    training as well; the map in the folder is then that of the last checkpoint, at most ``checkpoint_seconds`` old.
+
+    ``background`` is the colour behind images with an alpha channel. Images without depth take that of the points of the COLMAP
+    sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones.
+
+    Raises ``InputError`` where data, settings or folder are not usable; the folder must be empty unless ``overwrite`` is set.
+    """
+    chosen = load_backend(backend)
+    settings = _settings(chosen, backend, config)
+    work = _work(out, bake, device, checkpoint_seconds, progress, cancel)
+    with contextlib.nullcontext() if work.out is None else map_folder(work.out, overwrite):
+        read = read_views(data, split, background, depth_points, point_choice, progress, cancel)
+        source = read.source or "views in memory"
+        if not any(view.frame.has_depth for view in read.views):
+            log.info(f"{source}: no measured depth; training on colour only")
+        taken = prepared(read.views, refine_poses, progress, cancel)
+        if not taken.distances:
+            log.info(
+                f"{source}: the photos are from one place and show no distances; the map's depth will be arbitrary, and"
+                " localization in it will tell directions, never positions"
+            )
+        check_cancelled(cancel, "training")
+        bounds = estimate_bounds(taken.views, read.background)
+        info = MapInfo(
+            backend, to_plain(settings, "config"), bounds, 0, False, read.source, cameras=taken.cameras,
+            pose_refinement=taken.refinement, distances=taken.distances, sparse_depth=read.sparse_depth,
+        )  # fmt: skip
+        return _trained(chosen, info, taken.views, taken.tracked, work)
+
+
+def resume(
+    folder: str | Path,
+    data: Images,
+    split: str = "train",
+    bake: bool | BakeConfig = True,
+    device: torch.device | str = "cpu",
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+    *,
+    background: Background | None = None,
+    depth_points: str | Path | None = None,
+    point_choice: SparseChoice | None = None,
+    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+) -> Map:
+    """Go on with the interrupted training of the map in ``folder``, with the same result as an uninterrupted one.
+
+    A map that is trained but not baked is baked. Backend, settings and poses are those that the training was begun with;
+    ``data``, ``split``, ``background``, ``depth_points`` and ``point_choice`` must give the same views. The other arguments,
+    and what is raised, are as for ``train``. Raises ``InputError`` where nothing is left to do.
+    """
+    work = _work(folder, bake, device, checkpoint_seconds, progress, cancel)
+    out = Path(folder)
+    interrupted(out, work.bake is not None)
+    with map_folder(out, overwrite=True):
+        info = interrupted(out, work.bake is not None)  # another process may have finished meanwhile
+        if background is None and isinstance(data, str | Path):
+            background = info.bounds.background
+        read = read_views(data, split, background, depth_points, point_choice, progress, cancel)
+        _check_same_views(out, info, read, data, split)
+        views = at_stored_poses(read.views, info.cameras)
+        if info.complete:  # stopped between training and baking
+            log.info(f"{out}: training is complete ({amount(info.step, 'step')}); baking its surface")
+            scene = load_map(out, work.device, baked=False)
+            return scene.with_baked_parts(views, work.bake or USUAL_BAKE, progress=progress, cancel=cancel)
+        tracked, views = located(views, progress, cancel)  # the same as when the training began
+        return _trained(load_backend(info.backend, str(out)), info, views, tracked, work)
+
+
+def interrupted(folder: Path, baking: bool = True) -> MapInfo:
+    """Return the description of the map in ``folder``, whose training or, with ``baking``, whose surface is incomplete.
+
+    Raises ``InputError`` where nothing is left to do.
+    """
+    try:
+        info = load_info(folder)
+    except InputError as error:
+        raise InputError(f"{error}; nothing to resume, train without --resume") from error
+    if info.complete and not (baking and info.surface is None):
+        baked = " and baked" if info.surface is not None else ""
+        raise InputError(
+            f"{folder}: training is complete ({amount(info.step, 'step')}){baked}, nothing to resume"
+        )
+    return info
+
+
+def _settings(chosen: Backend, name: str, config: Any) -> Any:
+    kind = chosen.config_type
+    if config is None or isinstance(config, dict):
+        return from_plain(kind, config or {}, f"settings of backend {name!r}")
+    if not isinstance(config, kind):
+        found = type(config).__name__
+        raise InputError(f"config is a {found}, expected a {kind.__name__} or a dict of its settings")
+    return config
+
+
+def _work(
+    out: str | Path | None, bake: bool | BakeConfig, device: torch.device | str, seconds: float,
+    progress: ProgressCallback | None, cancel: Cancel | None,
+) -> _Work:  # fmt: skip
+    if not seconds >= 0:
+        raise InputError(f"checkpoint_seconds is {seconds}, expected 0 or more")
+    config = bake if isinstance(bake, BakeConfig) else USUAL_BAKE if bake else None
+    place = None if out is None else Path(out)
+    return _Work(place, config, working_device(device), seconds, progress, cancel)
+
+
+def _check_same_views(out: Path, info: MapInfo, read: ReadViews, data: Images, split: str) -> None:
+    """Raise ``InputError`` for views, or their depth or background, that the training was not begun with."""
+    if read.source and read.background != info.bounds.background:
+        raise OtherSettings(
+            f"{out}: was begun over background {info.bounds.background}, got {read.background}"
+        )
+    if stored_cameras(read.views) != as_given(info.cameras):
+        place = data.path if isinstance(data, Dataset) else data if isinstance(data, str | Path) else "views"
+        part = f"split {split!r} has" if read.source else "these have"
+        raise InputError(
+            f"{place}: {part} other frames or poses than {out} was begun with, expected those of {info.data!r} unchanged"
+        )
+    if read.sparse_depth != info.sparse_depth:
+        raise OtherSettings(
+            f"{out}: was begun with the depth of {info.sparse_depth} pixels from points, got {read.sparse_depth}; "
+            "resuming keeps the points (--depth-points) and the choice of them"
+        )
+
+
+def _trained(
+    backend: Backend, info: MapInfo, views: Sequence[View], tracked: TrackedViews | None, work: _Work
+) -> Map:
+    """Train from the state that ``info`` describes, and bake."""
+    where = str(work.out or info.data or "map in memory")
+    built, config = build_field(backend, info, where)
+    field = moved(built, work.device)
+    state = None
+    if info.step and work.out is not None:
+        state = load_state(work.out, info, field)
+        log.info(f"{where}: going on from step {info.step}")
+    report = Checkpoints(info, work.out, state, work.checkpoint_seconds, work.progress, work.cancel)
+    del state  # the report frees it once training goes on from it
+    try:
+        backend.train(field, views, config, report)
+    except TrainingStopped as stopped:
+        kept = "saved" if work.out is not None else "cancelled"
+        advice = (
+            "; resuming it (--resume) goes on from there" if work.out is not None else ", nothing is stored"
+        )
+        raise Cancelled(f"{where}: {kept} after step {stopped.step}{advice}") from stopped
+    report.finish(field)
+    weights = packed(cast(nn.Module, field).state_dict())
+    del field, built
+    scene = Map(report.info, frozen_field(report.info, weights, work.out), folder=work.out).to(work.device)
+    if work.bake is not None:
+        scene = _baked(scene, views, tracked, work.bake, work)
+    if work.out is not None:
+        size = sum(file.stat().st_size for file in work.out.iterdir()) / 2**20
+        log.info(f"{where}: map of {info.data}, {size:.1f} MiB")
+    return scene
+
+
+def _baked(
+    scene: Map, views: Sequence[View], tracked: TrackedViews | None, config: BakeConfig, work: _Work
+) -> Map:
+    try:
+        return scene.with_baked_parts(list(views), config, False, tracked, work.progress, work.cancel)
+    except InputError as error:  # the map itself is sound
+        log.info(f"{scene.folder or 'map in memory'}: no surface baked: {error}")
+        return scene if scene.folder is None else load_map(scene.folder, work.device)

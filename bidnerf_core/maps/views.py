@@ -1,0 +1,93 @@
+"""The views that a map is made from: those of a dataset, of a path to one, or views in memory."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from bidnerf_core.datasets import Background, Dataset, open_dataset
+from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
+from bidnerf_core.errors import InputError
+from bidnerf_core.frames.frame import BLACK, View
+from bidnerf_core.io.images import background_colour
+from bidnerf_core.progress import Cancel, ProgressCallback, counter
+
+log = logging.getLogger("bidnerf")
+
+Images: TypeAlias = Dataset | Sequence[View] | str | Path
+"""Images with poses: a dataset, the path to one, or views whose reference frame is the world."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReadViews:
+    """Views that were read, and their source."""
+
+    views: list[View]
+    source: str  # name of the dataset's folder; empty for views from memory
+    background: tuple[float, float, float]  # behind images with an alpha channel
+    sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
+
+
+def read_views(
+    data: Images,
+    split: str = "train",
+    background: Background | None = None,
+    depth_points: str | Path | None = None,
+    point_choice: SparseChoice | None = None,
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+) -> ReadViews:
+    """Read the views of ``data``; ``split`` names those of a dataset.
+
+    ``background`` is the colour behind images with an alpha channel, by default that of the dataset. Images without depth take
+    that of the points of the COLMAP model in folder ``depth_points``, see ``SparsePoints``. Raises ``InputError`` where there
+    are no views, and where they or the model are not usable.
+    """
+    if isinstance(data, str | Path):
+        data = open_dataset(data, background)
+        background = None
+    if isinstance(data, Dataset):
+        if background is not None and background_colour(background) != data.background:
+            raise InputError(f"{data.path}: was opened over background {data.background}, got {background!r}")
+        if not data.frame_names(split):
+            raise InputError(f"{data.path}: split {split!r} has no frames")
+        views = data.views(split, None, counter("reading", "images", progress, cancel))
+        source, colour = data.path.resolve().name, data.background
+    else:
+        views, source = _checked(data), ""
+        colour = BLACK if background is None else background_colour(background)
+    if depth_points is None:
+        return ReadViews(views, source, colour)
+    views, count = _with_depth(views, Path(depth_points), point_choice or SparseChoice(), split)
+    return ReadViews(views, source, colour, count)
+
+
+def _checked(views: Sequence[View]) -> list[View]:
+    found = list(views) if isinstance(views, Sequence) else [views]
+    for view in found:
+        if not isinstance(view, View):
+            raise InputError(
+                f"data is or holds a {type(view).__name__}, expected a dataset, a path, or views with poses"
+            )
+    if not found:
+        raise InputError("data holds no views, expected at least one")
+    return found
+
+
+def _with_depth(views: list[View], model: Path, choice: SparseChoice, split: str) -> tuple[list[View], int]:
+    """Return the views with the depth of the model's points, and the number of pixels that have it."""
+    places = [(view.frame.name, view.T_ref_camera) for view in views]
+    sparse = SparsePoints(model, places, choice, split)
+    changed = [sparse.onto(view, split) for view in views]
+    new = [after for after, before in zip(changed, views, strict=True) if after is not before]
+    count = sum(int((view.frame.depth > 0).sum()) for view in new if view.frame.depth is not None)
+    if count == 0:
+        raise InputError(
+            f"{model}: gives no depth to split {split!r}, expected points that its images observe"
+            " and images without depth"
+        )
+    log.info(f"{sparse.summary}; depth at {count} pixels of {len(new)} of {len(views)} images")
+    return changed, count
