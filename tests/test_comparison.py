@@ -21,8 +21,8 @@ from bidnerf_core.evaluation.comparison import (
     map_row,
     plan_comparison,
 )
-from bidnerf_core.evaluation.comparison_figure import comparison_figure
 from bidnerf_core.evaluation.evaluate import run_comparison
+from bidnerf_core.evaluation.plots import comparison_figure
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trials import run_trial

@@ -17,10 +17,10 @@ import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.bench import Plan, left_to_do, planned
-from bidnerf_core.evaluation.fault_figure import draw_faults, fault_curves
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, faulty
 from bidnerf_core.evaluation.groups import grouped
 from bidnerf_core.evaluation.json_lines import RowStore
+from bidnerf_core.evaluation.plots import draw_faults, fault_curves
 from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trials import trial_views

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.figures import convergence_plot, save_gif
+from bidnerf_core.evaluation.plots import convergence_plot
 from bidnerf_core.results.errors import PoseError
 from bidnerf_core.results.overlays import (
     NO_DEPTH,
@@ -21,6 +21,7 @@ from bidnerf_core.results.overlays import (
     comparison,
     depth_to_rgb,
     edges,
+    save_gif,
     tile,
 )
 

@@ -15,8 +15,8 @@ from bidnerf_core.cli.output import print_json, say, show
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.evaluation.bench import Plan, changed_settings
 from bidnerf_core.evaluation.comparison import Comparison
-from bidnerf_core.evaluation.comparison_figure import comparison_figure
 from bidnerf_core.evaluation.evaluate import run_comparison
+from bidnerf_core.evaluation.plots import comparison_figure
 from bidnerf_core.evaluation.protocols import PROTOCOLS, find_protocol
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.io.json import to_plain

@@ -19,7 +19,7 @@ from bidnerf_core.cli.options import DEFAULT_BACKEND, LARGEST_SEED, Flag, option
 from bidnerf_core.cli.output import console, print_table, say, show
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c, timed
 from bidnerf_core.errors import InputError, UsageError
-from bidnerf_core.evaluation.figures import convergence_plot, save_gif
+from bidnerf_core.evaluation.plots import convergence_plot
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
@@ -29,7 +29,7 @@ from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.maps.map import Map
 from bidnerf_core.maps.training import train
 from bidnerf_core.results.errors import PoseError, pose_error
-from bidnerf_core.results.overlays import Painter
+from bidnerf_core.results.overlays import Painter, save_gif
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit

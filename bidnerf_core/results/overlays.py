@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
@@ -15,6 +17,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.files import write_file
 from bidnerf_core.io.images import reduced
 from bidnerf_core.localization import Localization
 from bidnerf_core.localization.problem import SceneMap
@@ -199,3 +202,16 @@ def require_same_size(images: Sequence[np.ndarray], names: Sequence[str]) -> Non
         if image.shape != images[0].shape:
             found, expected = (f"{x.shape[1]}x{x.shape[0]}" for x in (image, images[0]))
             raise InputError(f"{name} is {found} pixels, {names[0]} is {expected}: expected the same")
+
+
+def save_gif(path: str | Path, frames: Sequence[ArrayLike | Tensor], fps: float = 8.0) -> None:
+    """Write an endless animation of images (h w 3) of the same size."""
+    if not (math.isfinite(fps) and fps > 0):
+        raise InputError(f"{path}: {fps} frames a second, expected a positive number")
+    pictures = [as_picture(frame, f"frame {i}") for i, frame in enumerate(frames)]
+    if not pictures:
+        raise InputError(f"{path}: an animation of no frames")
+    require_same_size(pictures, [f"frame {i}" for i in range(len(pictures))])
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    content = iio.imwrite("<bytes>", np.stack(pictures), extension=".gif", duration=1000 / fps, loop=0)
+    write_file(Path(path), bytes(content))

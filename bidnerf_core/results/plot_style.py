@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, printable
 from bidnerf_core.io.files import write_file
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
@@ -18,8 +18,11 @@ STYLE: dict[str, Any] = {
     "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "axes.edgecolor": "#555",
     "xtick.color": "#333", "ytick.color": "#333", "xtick.major.width": 0.7, "ytick.major.width": 0.7,
     "grid.color": "#ddd", "grid.linewidth": 0.6, "legend.frameon": False, "legend.fontsize": 8.5,
-    "svg.hashsalt": "bidnerf",
+    "svg.hashsalt": "bidnerf", "text.parse_math": False,  # names may hold dollar signs
 }  # fmt: skip
+
+LONGEST_LINE = 200
+"""Maximum number of characters of a line of text in a figure."""
 
 CRITERION_NAMES = {
     "10%": "translation error at most 10 % of the start's",
@@ -67,10 +70,31 @@ def save_figure(figure: Any, folder: Path, name: str) -> Path:
 
 
 def write_figure(figure: Any, path: Path, **options: Any) -> None:
-    """Write a figure in the format of the path's suffix, whole or not at all."""
+    """Write a figure in the format of the path's suffix, whole or not at all.
+
+    Its text, which holds the names of files, frames and settings, is made printable and cut to a length that can be drawn.
+    """
+    require_matplotlib()
+    from matplotlib.text import Text
+    from matplotlib.ticker import FixedFormatter
+
+    for text in figure.findobj(Text):
+        text.set_text(_drawable(text.get_text()))
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            formatter = axis.get_major_formatter()
+            if isinstance(formatter, FixedFormatter):  # it sets the labels anew when they are drawn
+                formatter.seq = [_drawable(str(label)) for label in formatter.seq]
     file = io.BytesIO()
-    figure.savefig(file, format=path.suffix.lstrip("."), **options)
+    figure.savefig(file, format=path.suffix.lstrip(".") or "png", **options)
     write_file(path, file.getvalue())
+
+
+def _drawable(text: str) -> str:
+    lines = (printable(line) for line in text.split("\n"))
+    return "\n".join(
+        line if len(line) <= LONGEST_LINE else line[: LONGEST_LINE - 3] + "..." for line in lines
+    )
 
 
 def line_look(place: int) -> dict[str, Any]:

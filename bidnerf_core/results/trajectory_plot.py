@@ -16,7 +16,7 @@ from bidnerf_core.devices import moved
 from bidnerf_core.geometry.arcs import mean_up
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.results.plot_style import new_figure, styled
+from bidnerf_core.results.plot_style import new_figure, styled, write_figure
 
 SURFELS = 12_000
 """Maximum number of surfels that are drawn."""
@@ -50,7 +50,7 @@ def plot_path(path: PlottedPath, surface: SurfaceMap | None, file: Path) -> None
         handles, labels = panels[0].get_legend_handles_labels()
         if labels:
             figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-        figure.savefig(file, dpi=150)
+        write_figure(figure, file, dpi=150)
 
 
 def _axes(poses: SE3) -> Float[np.ndarray, "3 3"]:

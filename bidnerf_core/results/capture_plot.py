@@ -14,7 +14,7 @@ from torch import Tensor
 from bidnerf_core.captures.coverage import horizontal_axes
 from bidnerf_core.captures.report import CaptureReport, Gap, PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
-from bidnerf_core.results.plot_style import COLOURS, new_figure, styled
+from bidnerf_core.results.plot_style import COLOURS, new_figure, styled, write_figure
 
 LOOKS: dict[PhotoProblem, tuple[str, str]] = {
     "mirrored": (COLOURS[3], "P"), "turned": (COLOURS[3], "v"), "badly posed": (COLOURS[1], "X"),
@@ -54,7 +54,7 @@ def draw_capture(
         figure.legend(loc="outside lower center", ncols=4)
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(out, dpi=150, format="png")
+            write_figure(figure, out, dpi=150)
         except OSError as error:
             raise InputError(f"{out}: cannot be written ({error.strerror})") from error
 
