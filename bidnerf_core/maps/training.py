@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import torch
 from torch import nn
@@ -90,6 +90,9 @@ def train(
     """
     chosen = load_backend(backend)
     settings = _settings(chosen, backend, config)
+    if refine_poses not in get_args(RefinementChoice):
+        choices = ", ".join(get_args(RefinementChoice))
+        raise InputError(f"refine_poses is {refine_poses!r}, expected one of {choices}")
     work = _work(out, bake, device, checkpoint_seconds, progress, cancel)
     with contextlib.nullcontext() if work.out is None else map_folder(work.out, overwrite):
         read = read_views(data, split, background, depth_points, point_choice, progress, cancel)
