@@ -288,7 +288,7 @@ def test_colmaps_cameras_project_as_pycolmap_does(tmp_path: Path) -> None:
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "missing": (lambda path: None, "no such file, expected a JSON file or COLMAP's cameras.txt"),
     "folder": (lambda path: path.mkdir(), "is a folder"),
-    "binary": (lambda path: path.write_bytes(b"\xff\xfe\x00"), "neither JSON nor text"),
+    "binary": (lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not text"),
     "empty": (lambda path: path.write_text("# nothing\n"), "holds 0 cameras, expected one"),
     "short": (lambda path: path.write_text("1 PINHOLE 3 4\n"), "line 1 has 4 entries, expected CAMERA_ID"),
     "fisheye": (

@@ -140,10 +140,10 @@ def test_a_file_that_is_cut_or_changed_never_ends_otherwise_than_in_a_line(
     [
         ("images.txt", "1 1 0 0 0 0 0 0 1\n\n", "line 1 has 9 entries"),
         ("images.txt", "1 1 0 0 x 0 0 0 1 a.png\n\n", "line 1: could not convert"),
-        ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n", "invalid pose"),
-        ("images.txt", "1 nan 0 0 0 0 0 0 1 a.png\n\n", "invalid pose"),
+        ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n", "is not finite"),
+        ("images.txt", "1 nan 0 0 0 0 0 0 1 a.png\n\n", "is not finite"),
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n1 2\n", "line 2 has 2 entries"),
-        ("images.txt", f"1 1 0 0 0 0 0 0 1 a.png\n1 2 {10**30}\n", "is no id"),
+        ("images.txt", f"1 1 0 0 0 0 0 0 1 a.png\n1 2 {10**30}\n", "has more than 64 bits"),
         ("points3D.txt", "1 0 0 0 1 2 3 0.5 1\n", "line 1 has 9 entries"),
         ("points3D.txt", "1 0 0 0 1 2 3 0.5\n1 0 0 0 1 2 3 0.5\n", "the same id"),
         ("points3D.txt", "", "none of its 0 points"),

@@ -11,6 +11,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics, focal_length
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import read_file
 from bidnerf_core.io.json import Record, parse_record
+from bidnerf_core.io.rows import Row, parse_rows
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
@@ -145,35 +146,24 @@ def read_text_cameras(path: Path) -> dict[int, Intrinsics]:
 
 
 def _colmap_cameras(path: Path, content: bytes) -> dict[int, Intrinsics]:
-    try:
-        lines = [line.partition("#")[0].split() for line in content.decode("utf-8-sig").splitlines()]
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: neither JSON nor text, expected transforms.json or cameras.txt "
-            "(COLMAP's model_converter makes it of cameras.bin)"
-        ) from error
+    expected = "transforms.json or cameras.txt (COLMAP's model_converter makes it of cameras.bin)"
     found: dict[int, Intrinsics] = {}
-    for number, words in enumerate(lines, start=1):
-        if words:
-            key, camera = _text_camera(f"{path}: line {number}", words)
-            if found.setdefault(key, camera) != camera:
-                raise InputError(f"{path}: line {number}: camera {key} again, expected each id once")
+    for row in parse_rows(content, path, expected, "CAMERA_ID MODEL WIDTH HEIGHT and parameters"):
+        key, camera = _text_camera(row)
+        if found.setdefault(key, camera) != camera:
+            raise InputError(f"{row.where}: camera {key} again, expected each id once")
     return found
 
 
-def _text_camera(where: str, words: Sequence[str]) -> tuple[int, Intrinsics]:
+def _text_camera(row: Row) -> tuple[int, Intrinsics]:
     """Read ``CAMERA_ID MODEL WIDTH HEIGHT PARAMS...``."""
-    expected = "expected CAMERA_ID MODEL WIDTH HEIGHT and parameters"
+    words = row.words
     if len(words) < 5:
-        raise InputError(f"{where} has {len(words)} entries, {expected}")
+        raise row.error(f" has {len(words)} entries")
     if words[1] not in COLMAP_MODELS:
-        raise InputError(f"{where}: camera model {words[1]}, expected one of {', '.join(COLMAP_MODELS)}")
-    try:
-        number, width, height = int(words[0]), int(words[2]), int(words[3])
-        parameters = [float(word) for word in words[4:]]
-    except ValueError as error:
-        raise InputError(f"{where}: {error}, {expected}") from error
-    return number, colmap_camera(where, words[1], width, height, parameters)
+        raise InputError(f"{row.where}: camera model {words[1]}, expected one of {', '.join(COLMAP_MODELS)}")
+    number, width, height = (row.integer(words[place]) for place in (0, 2, 3))
+    return number, colmap_camera(row.where, words[1], width, height, row.numbers(words[4:]))
 
 
 def colmap_parameters(model: str) -> int:

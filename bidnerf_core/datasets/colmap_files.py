@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,14 +29,15 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import read_file
+from bidnerf_core.io.rows import Row, read_lines
 
 _Item = TypeVar("_Item")
-Number = TypeVar("Number", int, float)
 
 NAMES = ("images", "points3D")
 COUNT, IMAGE, POINT = struct.Struct("<Q"), struct.Struct("<I7dI"), struct.Struct("<q3d3BdQ")
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 CAMERA_RECORD = struct.Struct("<IiQQ")
+MODEL_FILE = "a file of a COLMAP sparse model"
 LARGEST_MODEL = 2**30  # bytes of one file of a model
 TRACK_BYTES = 8  # an image and one of its keypoints, 4 bytes each
 
@@ -196,39 +197,33 @@ def _binary_point(file: _Bytes) -> ModelPoint:
 
 def _text_images(path: Path) -> list[ModelImage]:
     """Read two lines per image; the second is empty where nothing was observed."""
-    found, lines = [], iter(enumerate(_lines(path), start=1))
-    for number, line in lines:
-        if not line or line.startswith("#"):
+    found, rows = [], iter(_rows(path, "id, pose, camera and name of an image"))
+    for row in rows:
+        if not row.text or row.text.startswith("#"):
             continue
-        where, words = f"{path}: line {number}", line.split(maxsplit=9)  # a name may contain blanks
+        words = row.text.split(maxsplit=9)  # a name may contain blanks
         if len(words) < 10:
-            raise InputError(
-                f"{where} has {len(words)} entries, expected id, pose, camera and name of an image"
-            )
-        observed = next(lines, (0, ""))[1].split()
+            raise row.error(f" has {len(words)} entries")
+        following = replace(next(rows, replace(row, text="")), columns="x, y, id of points")
+        observed = following.words
         if len(observed) % 3:
-            raise InputError(
-                f"{path}: line {number + 1} has {len(observed)} entries, expected x, y, id of points"
-            )
-        points = np.array(_numbers(f"{path}: line {number + 1}", observed[2::3], _id), dtype=np.int64)
-        (camera,) = _numbers(where, words[8:9], _id)
-        pose = _numbers(where, words[1:8], float)
-        found.append(_image(where, words[9], camera, pose, points[points >= 0]))
+            raise following.error(f" has {len(observed)} entries")
+        points = np.array([following.integer(word) for word in observed[2::3]], dtype=np.int64)
+        pose = row.numbers(words[1:8])
+        found.append(_image(row.where, words[9], row.integer(words[8]), pose, points[points >= 0]))
     return found
 
 
 def _text_points(path: Path) -> list[ModelPoint]:
     found = []
-    for number, line in enumerate(_lines(path), start=1):
-        if not line or line.startswith("#"):
+    for row in _rows(path, "id, x y z, r g b, error and a track"):
+        if not row.text or row.text.startswith("#"):
             continue
-        where, words = f"{path}: line {number}", line.split()
+        words = row.words
         if len(words) < 8 or len(words) % 2:
-            raise InputError(
-                f"{where} has {len(words)} entries, expected id, x y z, r g b, error and a track"
-            )
-        x, y, z, error = _numbers(where, [*words[1:4], words[7]], float)
-        found.append(ModelPoint(_numbers(where, words[:1], _id)[0], (x, y, z), error, (len(words) - 8) // 2))
+            raise row.error(f" has {len(words)} entries")
+        x, y, z, error = row.numbers([*words[1:4], words[7]])
+        found.append(ModelPoint(row.integer(words[0]), (x, y, z), error, (len(words) - 8) // 2))
     return found
 
 
@@ -252,23 +247,9 @@ def _together(path: Path, points: list[ModelPoint]) -> ModelPoints:
     return ModelPoints(ids, positions, errors, tracks)
 
 
-def _numbers(where: str, words: Sequence[str], kind: Callable[[str], Number]) -> list[Number]:
-    try:
-        return [kind(word) for word in words]
-    except ValueError as error:
-        raise InputError(f"{where}: {error}, expected numbers as COLMAP writes them") from error
-
-
-def _id(word: str) -> int:
-    found = int(word)
-    if not abs(found) < 2**63:
-        raise ValueError(f"{word} is no id")
-    return found
-
-
-def _lines(path: Path) -> list[str]:
-    return [line.strip() for line in _content(path).decode("utf-8", "replace").split("\n")]
+def _rows(path: Path, columns: str) -> list[Row]:
+    return read_lines(path, MODEL_FILE, columns, LARGEST_MODEL)
 
 
 def _content(path: Path) -> bytes:
-    return read_file(path, "a file of a COLMAP sparse model", LARGEST_MODEL)
+    return read_file(path, MODEL_FILE, LARGEST_MODEL)

@@ -10,7 +10,7 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import read_file
+from bidnerf_core.io.rows import read_rows
 from bidnerf_core.io.tensors import read_archive, read_array
 
 EXPECTED_POINTS = "expected n rows of x, y, z in metres"
@@ -42,19 +42,15 @@ def _read(path: Path) -> tuple[np.ndarray, SE3]:
         return _from_archive(path)
     if path.suffix == ".npy":
         return read_array(path, "a .npy file of points"), SE3.identity()
-    content = read_file(path, "a file of points")
-    try:
-        return _from_text(content.decode()), SE3.identity()
-    except ValueError as error:
-        raise InputError(f"{path}: not a file of points ({error}), {EXPECTED_POINTS}") from error
-
-
-def _from_text(text: str) -> np.ndarray:
-    """Parse rows of numbers, of which the first three are used."""
-    lines = [line.partition("#")[0].strip() for line in text.splitlines()]
+    rows = read_rows(path, "a file of points", EXPECTED_POINTS.removeprefix("expected "))
     # A row with commas has no other separator: "1,5 2,5" has decimal commas and is rejected.
-    rows = [line.split("," if "," in line else None)[:3] for line in lines if line]
-    return np.array([[float(word) for word in row] for row in rows], dtype=np.float64)
+    words = [(row, row.text.split("," if "," in row.text else None)[:3]) for row in rows]
+    lengths = {len(found) for _, found in words}
+    if len(lengths) > 1:
+        raise InputError(
+            f"{path}: has rows of {min(lengths)} and of {max(lengths)} numbers, {EXPECTED_POINTS}"
+        )
+    return np.array([row.numbers(found) for row, found in words], dtype=np.float64), SE3.identity()
 
 
 def _from_archive(path: Path) -> tuple[np.ndarray, SE3]:

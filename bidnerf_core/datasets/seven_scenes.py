@@ -28,7 +28,6 @@ import torch
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource, folder_camera
 from bidnerf_core.datasets.dataset import Dataset
-from bidnerf_core.datasets.pose_files import read_pose_matrix
 from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
@@ -38,9 +37,10 @@ from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import natural_order
+from bidnerf_core.geometry.pose_rows import read_pose_matrix
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.files import read_file
 from bidnerf_core.io.images import Background
+from bidnerf_core.io.rows import read_rows
 
 DEPTH_CAMERA = Intrinsics(585, 585, 320, 240, 640, 480)
 COLOUR_CAMERA = Intrinsics(525, 525, 320, 240, 640, 480)
@@ -172,18 +172,15 @@ def _splits(path: Path) -> dict[str, list[SceneFrame]]:
 
 def _listed(file: Path, folders: dict[int, Path]) -> list[int]:
     """Return the numbers of the sequences that a split file lists. Raises ``InputError``."""
-    lines = read_file(file, "a list of sequences").decode("utf-8-sig", "replace").split("\n")
     numbers = list[int]()
-    for number, line in enumerate(map(str.strip, lines), start=1):
-        if not line:
-            continue
-        found = SEQUENCE.fullmatch(line)
+    for row in read_rows(file, "a list of sequences", "a sequence such as sequence1"):
+        found = SEQUENCE.fullmatch(row.text)
         if found is None:
-            raise InputError(f"{file}: line {number}: {line[:40]!r}, expected a sequence such as sequence1")
+            raise row.error(f": {row.text[:40]!r}")
         if int(found[1]) not in folders:
-            raise InputError(f"{file}: line {number}: no folder of {line}, expected seq-{int(found[1]):02d}")
+            raise InputError(f"{row.where}: no folder of {row.text}, expected seq-{int(found[1]):02d}")
         if int(found[1]) in numbers:
-            raise InputError(f"{file}: line {number}: {line} again, expected each sequence once")
+            raise InputError(f"{row.where}: {row.text} again, expected each sequence once")
         numbers.append(int(found[1]))
     if not numbers:
         raise InputError(f"{file}: lists no sequence, expected lines such as sequence1")

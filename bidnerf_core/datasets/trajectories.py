@@ -1,9 +1,14 @@
-"""Trajectories: poses at given times, and poses at the times in between."""
+"""Rows with time stamps, as in the TUM RGB-D benchmark; trajectories, and their poses at the times in between.
+
+A row is ``timestamp value value ...``, separated by blanks or commas; ``#`` begins a comment, empty lines are skipped, and
+Windows line endings are allowed. Rows may be in any order.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +17,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.rows import Row, read_rows
 
 NUMBERS_A_LINE = "tx ty tz qx qy qz qw"
 UNIT_TO = 0.01
@@ -22,6 +27,58 @@ UNIT_TO = 0.01
 LARGEST_GAP = 0.1
 """Seconds. Within this time a hand-held camera deviates from the interpolated path by a few millimetres; motion capture that
 lost its markers leaves longer gaps, in which no pose is known."""
+
+
+@dataclass(frozen=True)
+class TimedRow:
+    """A row that begins with a time stamp."""
+
+    row: Row
+    time: float  # seconds
+    words: tuple[str, ...]  # what follows the time stamp
+
+    @property
+    def where(self) -> str:
+        """The file and the line, for messages."""
+        return self.row.where
+
+
+def read_timed_rows(path: Path, columns: str) -> list[TimedRow]:
+    """Read the rows in chronological order; ``columns`` names the columns after the time stamp ("tx ty tz").
+
+    Raises ``InputError`` where the file is missing, not text, too large or without rows, and for a row with fewer
+    entries or without a finite time.
+    """
+    rows = [
+        _timed(row, 1 + len(columns.split()))
+        for row in read_rows(path, "a list of time stamps", f"timestamp {columns}")
+    ]
+    if not rows:
+        raise InputError(f"{path}: has no rows, expected lines of timestamp {columns}")
+    return sorted(rows, key=lambda row: row.time)
+
+
+def _timed(row: Row, count: int) -> TimedRow:
+    words = row.text.replace(",", " ").split()
+    if len(words) < count:
+        raise row.error(f" has {len(words)} of {count} entries")
+    try:
+        time = float(words[0])
+    except ValueError as error:
+        raise row.error(f": {words[0]!r} is no time stamp") from error
+    if not math.isfinite(time):
+        raise row.error(f": the time stamp is {words[0]}")
+    return TimedRow(row, time, tuple(words[1:]))
+
+
+def require_distinct_times(rows: list[TimedRow]) -> None:
+    """Raise ``InputError`` where two of the rows, which are in chronological order, have the same time stamp."""
+    for row, following in pairwise(rows):
+        if row.time == following.time:
+            first, second = sorted((row.row, following.row), key=lambda row: row.line)
+            raise InputError(
+                f"{second.where}: the time stamp {row.time:.6f} of line {first.line} again, expected each once"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +136,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 def _pose_numbers(row: TimedRow) -> list[float]:
     """Return the translation and the quaternion (x, y, z, w) of a row."""
-    try:
-        numbers = [float(word) for word in row.words[:7]]
-    except ValueError as error:
-        raise InputError(f"{row.where}: {error}, expected timestamp {NUMBERS_A_LINE}") from error
-    if not all(map(math.isfinite, numbers)):
-        raise InputError(f"{row.where}: the pose is not finite, expected timestamp {NUMBERS_A_LINE}")
+    numbers = row.row.numbers(row.words[:7])
     length = math.hypot(*numbers[3:])
     if abs(length - 1) > UNIT_TO:
         raise InputError(f"{row.where}: the quaternion has length {length:.3g}, expected 1 (qx qy qz qw)")

@@ -34,8 +34,13 @@ from bidnerf_core.datasets.reader import Reader, ReadOptions
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.datasets.splits import SplitDataset, Splits, hold_out
-from bidnerf_core.datasets.timed_rows import TimedRow, read_timed_rows, require_distinct_times
-from bidnerf_core.datasets.trajectories import LARGEST_GAP, read_trajectory
+from bidnerf_core.datasets.trajectories import (
+    LARGEST_GAP,
+    TimedRow,
+    read_timed_rows,
+    read_trajectory,
+    require_distinct_times,
+)
 from bidnerf_core.depth.images import DepthReader
 from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError

@@ -1,10 +1,11 @@
-"""Camera poses of datasets, converted to our conventions: ``T_world_camera`` with OpenCV axes.
+"""Camera poses as rows of numbers, converted to our conventions: ``T_world_camera`` with OpenCV axes.
 
 NeRF's and nerfstudio's JSON and ARKit's exports hold camera-to-world matrices with OpenGL axes (x right, y up, z backward).
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,7 +15,10 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import Record
+from bidnerf_core.io.rows import read_rows
 
+LARGEST_POSE = 4096
+"""Bytes of a file of one pose."""
 RIGID_TO = 5e-3
 """Largest entry of R^T R - 1 that is attributed to rounding (matrices printed with three decimals reach 2e-3)."""
 
@@ -71,3 +75,20 @@ def _matrix(record: Record, key: str, rows: list[Any] | None) -> Tensor:
     if len(numbers) == 4 and max(abs(x - y) for x, y in zip(numbers[3], (0, 0, 0, 1), strict=True)) > 1e-6:
         raise record.error(f"the last row of {key} is {numbers[3]}, expected [0, 0, 0, 1]")
     return torch.tensor(numbers[:3], dtype=torch.float64)
+
+
+def read_pose_matrix(path: Path) -> SE3:
+    """Read ``T_world_camera`` (metres, OpenCV axes, float64) from a text file of one 4x4 matrix.
+
+    Raises ``InputError``, which names the line that is not usable.
+    """
+    expected = "4 rows of 4 numbers, the last of them 0 0 0 1"
+    rows = [row.numbers(count=4) for row in read_rows(path, "a file of a pose", expected, LARGEST_POSE)]
+    if len(rows) != 4:
+        raise InputError(f"{path}: has {len(rows)} rows, expected {expected}")
+    if max(abs(x - y) for x, y in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:
+        raise InputError(f"{path}: the last row is {rows[3]}, expected {expected}")
+    try:
+        return rigid_pose(torch.tensor(rows[:3], dtype=torch.float64))
+    except InputError as error:
+        raise InputError(f"{path}: the rotation is {error}, expected a rigid transform") from error
