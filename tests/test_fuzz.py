@@ -43,15 +43,15 @@ from bidnerf_core.training import TrainingState
 from bidnerf_hashgrid import backend
 from commands import Run
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+ROBUSTNESS = Path(__file__).parent / "robustness"
 
 
 @pytest.fixture(scope="module")
 def malformed() -> Iterator[Any]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        yield importlib.import_module("malformed")
-        sys.modules.pop("malformed")
+        patch.syspath_prepend(str(ROBUSTNESS))
+        yield importlib.import_module("damage")
+        sys.modules.pop("damage")
 
 
 @pytest.fixture(scope="module")
