@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from safetensors import safe_open
 
-from bidnerf_core import SE3, Frame, InputError, Intrinsics, Localizer, Tracker, load_map, registry
+from bidnerf_core import SE3, Frame, InputError, Intrinsics, Localizer, Tracker, load_map
 from bidnerf_core.cli import bake, evaluate, localize, main, render, report, track, train  # noqa: F401  (before a fork)
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.localization import settings_of
@@ -50,7 +50,6 @@ BAKED = ["--cells", "2000"]
 SECONDS, MEMORY = 25.0, 2 * 2**30
 """Limits of a case: wall time, and address space beyond that of the process before it."""
 NOBODY = 65534
-LIST_BACKENDS = registry.list_backends
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}")
 
 Words: TypeAlias = Sequence[object]
@@ -72,8 +71,6 @@ def command(*words: object) -> None:
 def sound_folder(folder: Path, test: int = 2) -> Path:
     """Write a dataset, a map of it with surface and landmarks, photos with depth, and every other kind of input."""
     torch.set_num_threads(1)
-    installed = LIST_BACKENDS()
-    registry.list_backends = lambda: installed  # which do not change, and take half a second to list
     scene = demo_object()
     seen, unseen = (
         seen_from(scene, CAMERA, orbit(3.5, count, seed=seed)) for seed, count in ((0, 6), (1, test))
