@@ -15,10 +15,10 @@ from bidnerf_core.captures.photos import LEAST_BLUR, detail_kept
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.scenes.demo import demo_object
+from bidnerf_core.testing.textured_field import ground
 from bidnerf_core.training import Progress, Silent, Supervision, SupervisionConfig, supervised_loss
 from landmark_scene import looking_in
 from test_supervision import BACKENDS
-from textured_field import ground
 
 BOUNDS, COUNT, BLURRED = demo_object().bounds, 12, 5
 CAMERA = Intrinsics(100.0, 100.0, 48.0, 36.0, 96, 72)

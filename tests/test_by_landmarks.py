@@ -12,7 +12,6 @@ from torch import Tensor
 
 import bidnerf_core.localization.auto as auto_module
 import bidnerf_core.localization.by_landmarks as by_landmarks_module
-import textured_field
 from bidnerf_core import Localization, Localizer, Outcome, View
 from bidnerf_core.depth.sensors import find_depth_sensor
 from bidnerf_core.geometry.se3 import SE3
@@ -37,7 +36,8 @@ from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.search.landmarks import Confirmation
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.results.errors import pose_error
-from textured_field import CAMERA, MapWithLandmarks, textured_map, unseen
+from bidnerf_core.testing import textured_field
+from bidnerf_core.testing.textured_field import CAMERA, MapWithLandmarks, textured_map, unseen
 
 TRUTH = unseen().T_ref_camera
 RAYS = 256

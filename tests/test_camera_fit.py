@@ -24,9 +24,9 @@ from bidnerf_core.mapping.calibration import GIVEN, UNSTRETCHED, Calibration, St
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.observed_points import ObservedPoints
 from bidnerf_core.results.errors import pose_error
+from bidnerf_core.testing.textured_field import CAMERA, textured_map, training_views, unseen
 from landmark_scene import PINHOLE, Points, looking_in, ring
 from problems import localize
-from textured_field import CAMERA, textured_map, training_views, unseen
 
 FOCAL = 500.0
 LIMIT = 2.0

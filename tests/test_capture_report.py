@@ -27,8 +27,8 @@ from bidnerf_core.results.capture_plot import draw_capture
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
+from bidnerf_core.testing.textured_field import BOUNDS, TexturedGround
 from landmark_scene import Points, looking_in, ring
-from textured_field import BOUNDS, TexturedGround
 
 CAMERA = Intrinsics(162.0, 162.0, 80.0, 60.0, 160, 120)
 

@@ -24,9 +24,9 @@ from bidnerf_core.cli.watch_folder import FrameRequest, requests
 from bidnerf_core.datasets import open_dataset, write_transforms
 from bidnerf_core.datasets.trajectories import read_trajectory
 from bidnerf_core.maps.description import MapInfo
+from bidnerf_core.testing.textured_field import CAMERA, MapWithLandmarks, textured_map
 from commands import Run
 from flights import covered, flight
-from textured_field import CAMERA, MapWithLandmarks, textured_map
 
 FRAMES = 6
 

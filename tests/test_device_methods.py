@@ -12,7 +12,6 @@ from torch import Tensor
 
 import baked
 import module_fields
-import textured_field
 from bidnerf_core import SE3, Frame, Localization, Localizer, Tracker
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames.frame import View
@@ -22,11 +21,12 @@ from bidnerf_core.localization.search import matching
 from bidnerf_core.localization.search.by_images import ImageSearch, ImageStage
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.results.errors import pose_error
+from bidnerf_core.testing import textured_field
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
+from bidnerf_core.testing.textured_field import MapWithLandmarks
 from flights import INTERVAL, flight_frame, flight_pose
 from module_fields import AsModule
 from problems import FieldMap
-from textured_field import MapWithLandmarks
 
 SETTINGS = {
     "points": 400,

@@ -27,7 +27,7 @@ from bidnerf_core.localization.method_settings import ColourSettings, Refinement
 from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.results.errors import pose_error
-from textured_field import textured_map, unseen
+from bidnerf_core.testing.textured_field import textured_map, unseen
 
 TRUTH = unseen().T_ref_camera
 OFF = torch.tensor([0.02, -0.01, 0.03, 0.004, -0.006, 0.003], dtype=torch.float64)

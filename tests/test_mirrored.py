@@ -15,7 +15,7 @@ from bidnerf_core.localization.search.mirrored import (
     mirror_evidence,
     mirror_image,
 )
-from textured_field import textured_map, unseen
+from bidnerf_core.testing.textured_field import textured_map, unseen
 
 
 def matcher() -> LandmarkMatcher:

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 import baked
 import module_fields
-import textured_field
 import tiny
 from bidnerf_core import Localizer, Map, load_backend
 from bidnerf_core.devices import moved
@@ -24,6 +23,7 @@ from bidnerf_core.localization import AutoConfig
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.scenes.fields import HomogeneousBall
+from bidnerf_core.testing import textured_field
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from problems import FieldMap
 

@@ -39,9 +39,9 @@ from bidnerf_core.mapping.landmark_building import LandmarkConfig, TrackedViews,
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
 from bidnerf_core.mapping.pose_scatter import observed_at_rest, pose_updates
 from bidnerf_core.mapping.resection import resect
+from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, unseen
 from bidnerf_core.training import RayBank
 from landmark_scene import PINHOLE, Points, looking_in
-from textured_field import BOUNDS, CAMERA, ground, unseen
 
 VIEWS, NOISE = 16, 0.3
 METRES, RADIANS = 0.01, 0.008  # what a hand does in a few hundredths of a second: about three pixels

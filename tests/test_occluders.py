@@ -21,8 +21,8 @@ from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
 from bidnerf_core.mapping.calibration import GIVEN
 from bidnerf_core.mapping.features import SIFT
 from bidnerf_core.results.errors import pose_error
+from bidnerf_core.testing.textured_field import textured_map, unseen
 from problems import localize
-from textured_field import textured_map, unseen
 
 QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)
 SIZE = baked.CAMERA.height

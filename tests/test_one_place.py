@@ -15,7 +15,6 @@ from bidnerf_core.localization.direction_only import direction_only
 from bidnerf_core.mapping.landmark_building import LandmarkConfig, tracked_views
 from bidnerf_core.maps.description import load_info
 from landmark_scene import Points, looking_in, ring
-from textured_field import MapWithLandmarks, textured_map, unseen
 
 CENTRE = looking_in(0.0)
 

@@ -19,8 +19,8 @@ from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.map import Map
 from bidnerf_core.results.errors import pose_error
+from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, textured_map, unseen
 from commands import Run
-from textured_field import BOUNDS, CAMERA, textured_map, unseen
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from bidnerf_core.localization.result import Verdict
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import MirrorEvidence, mirror_image
 from bidnerf_core.results.errors import pose_error
-from textured_field import CAMERA, TexturedGround, seen, textured_map, unseen
+from bidnerf_core.testing.textured_field import CAMERA, TexturedGround, seen, textured_map, unseen
 
 
 def stated(factor: float) -> Intrinsics:

@@ -18,7 +18,7 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.results.errors import pose_error
-from textured_field import textured_map, unseen
+from bidnerf_core.testing.textured_field import textured_map, unseen
 
 TRUTH = unseen().T_ref_camera
 CHI2_99 = 16.8  # of six degrees of freedom

@@ -15,6 +15,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.tracking.answers import METHOD
 from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
+from bidnerf_core.testing.textured_field import CAMERA, textured_map, view
 from flights import (
     FRAMES,
     INTERVAL,
@@ -27,7 +28,6 @@ from flights import (
     tracked,
     without_depth,
 )
-from textured_field import CAMERA, textured_map, view
 
 CHI2_99 = 16.8  # of six degrees of freedom
 

@@ -31,6 +31,7 @@ from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping.features import grey_image
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
+from bidnerf_core.testing.textured_field import textured_map
 from flights import (
     INTERVAL,
     assert_honest,
@@ -41,7 +42,6 @@ from flights import (
     tracked,
     without_depth,
 )
-from textured_field import textured_map
 
 NEAR = torch.tensor([0.01, -0.01, 0.01, 0.01, 0.01, -0.02], dtype=torch.float64)
 

@@ -21,9 +21,9 @@ from bidnerf_core.localization.twin_rejection import twin_rejection
 from bidnerf_core.mapping.landmark_building import build_landmarks
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.results.errors import pose_error
+from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, textured_map, unseen
 from landmark_scene import Points, looking_in, ring
 from problems import localize
-from textured_field import BOUNDS, CAMERA, ground, textured_map, unseen
 
 REPEATED = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "repeated_scene.py"))
 twice, DoubledField, copies = (REPEATED[name] for name in ("twice", "DoubledField", "copies"))

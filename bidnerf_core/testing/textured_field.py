@@ -1,16 +1,16 @@
-"""A textured hilly ground in closed form, whose images have keypoints: what tests of landmarks beside a field share."""
+"""A textured hilly ground in closed form, whose images have keypoints, as a field, as views and as a map with all its parts."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
+from bidnerf_core.fields.contract import FieldValues, RadianceField, RaySampler, SceneBounds
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import Frame, View
@@ -60,7 +60,7 @@ class TexturedGround:
 class MapWithLandmarks:
     """A field as a map with everything that is baked beside it."""
 
-    field: TexturedGround
+    field: RadianceField
     bounds: SceneBounds
     landmarks: LandmarkMap | None
     surface: SurfaceMap | None = None
@@ -100,3 +100,36 @@ def unseen() -> View:
 def textured_map(surface: bool = False) -> MapWithLandmarks:
     baked = bake(ground(), BOUNDS, [], training_views(), BakeConfig(cells=200_000)) if surface else None
     return MapWithLandmarks(ground(), BOUNDS, build_landmarks(training_views()), baked)
+
+
+@dataclass(frozen=True, eq=False)
+class MovedField:
+    """A field in another world frame."""
+
+    field: TexturedGround
+    T_new_old: SE3
+
+    @property
+    def sampler(self) -> RaySampler:
+        return self.field.sampler
+
+    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
+        back = self.T_new_old.inverse().to(dtype=positions.dtype)
+        return self.field.query(back.apply(positions), back.rotate(directions))
+
+
+QUARTER_TURN = SE3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi / 2], dtype=torch.float64))
+T_MOVED_WORLD = SE3(QUARTER_TURN.rotation, torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64))
+"""The ground's world in another one, in which its box still has sides along the axes."""
+
+
+@functools.cache
+def moved_map() -> MapWithLandmarks:
+    """Return the map of the same ground in a world that is moved by ``T_MOVED_WORLD``, made anew from the same images."""
+    moved = MovedField(ground(), T_MOVED_WORLD)
+    corners = T_MOVED_WORLD.apply(torch.tensor([BOUNDS.lower, BOUNDS.upper], dtype=torch.float64))
+    lower, upper = (tuple(side.tolist()) for side in (corners.amin(0), corners.amax(0)))
+    bounds = replace(BOUNDS, lower=lower, upper=upper)
+    views = [replace(v, T_ref_camera=(T_MOVED_WORLD @ v.T_ref_camera).normalized()) for v in training_views()]
+    surface = bake(moved, bounds, [], views, BakeConfig(cells=200_000))
+    return MapWithLandmarks(moved, bounds, build_landmarks(views), surface)
