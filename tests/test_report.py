@@ -7,6 +7,7 @@ import dataclasses
 import json
 import re
 import sys
+import warnings
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,12 +18,15 @@ import pytest
 from scipy.stats import mannwhitneyu
 
 from bidnerf_core.cli import main
+from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.groups import grouped, situation_titles, situations
-from bidnerf_core.evaluation.plots import Figures
+from bidnerf_core.evaluation.plots import MOST_LINES, Figures
 from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
+from bidnerf_core.evaluation.report import page
 from bidnerf_core.evaluation.results import ResultTable
 from bidnerf_core.evaluation.summary import NEVER, compare_pair, median, pairwise_tests, steps_of, summarize
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
+from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import success_rate
 
 STEPS = 10
@@ -317,3 +321,103 @@ def test_a_recorded_command_has_no_local_paths(monkeypatch: pytest.MonkeyPatch) 
     ]
     monkeypatch.setattr(sys, "argv", words)
     assert script_command() == "python run.py map:lego map:room --out=d f g/h --size 0.5:10"
+
+
+HOSTILE = (
+    r"$\frac{$", "$x^{y$", r"$\badmacro{1}$", "$$", "\x1b[31mred", "nul\0", "\x07bell", "\u202eesrever", "\u2028line",
+    "<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "{{ 7 * 7 }}", "{% raw %}", "a\nb", "&amp;", "]]>", "x" * 5000,
+)  # fmt: skip
+
+
+def hostile_result(place: int) -> TrialResult:
+    """Return a result that holds every fourth hostile text wherever a file may hold any text."""
+    texts, usual = HOSTILE[place::4], result(place, 2 + place, protocol="none")
+    text, name = "".join(texts), "".join(texts).replace("\0", "")
+    trial = dataclasses.replace(usual.trial, map=name, data=name, split=text, device=text, depth_points=name)
+    return dataclasses.replace(
+        usual, settings={each: each for each in texts}, backend=text, weights=text, reason=text, trial=trial
+    )
+
+
+def harmless(text: str) -> bool:
+    """Return whether text, apart from line feeds, holds nothing that a terminal or a browser would obey."""
+    return all(character.isprintable() or character == "\n" for character in text)
+
+
+@pytest.mark.filterwarnings("ignore:constrained_layout")  # such names are wider than the figure
+def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    file = write(tmp_path / "r.jsonl", *map(hostile_result, range(4)))
+    run = provenance(HOSTILE[4], "\x1b]0;title\x07")
+    for text in HOSTILE:
+        note_run(file, dataclasses.replace(run, command=text, cpu=text, versions={text: text}))
+    title = "<b>\x1b[2J\udcff\u202e$\\frac{$"
+    with pytest.warns(
+        UserWarning, match="constrained_layout"
+    ):  # a name of 5000 characters is wider than the figure
+        assert main(["report", str(file), "--out", str(tmp_path / "out"), "--title", title]) == 0
+    said = capfd.readouterr()
+    assert harmless(said.out)
+    assert harmless(said.err)
+    content = (tmp_path / "out" / "index.html").read_text()
+    assert harmless(content)
+    for markup in ("<script", "<img src=x", "<b>"):
+        assert markup not in content
+    page = read(tmp_path / "out")
+    assert page.fetched == []
+    for shown in (
+        r"$\frac{$",
+        r"\x1b[31mred",
+        r"nul\x00",
+        r"\u202eesrever",
+        "{{ 7 * 7 }}",
+        r"<b>\x1b[2J\udcff",
+    ):
+        assert shown in page.text
+    drawings = list((tmp_path / "out").glob("*.svg"))
+    assert len(drawings) == len(page.pictures) == 5
+    for drawing in drawings:
+        ET.parse(drawing)
+
+
+def test_a_name_that_no_folder_can_have_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = json.dumps(to_plain(result(0, 2)))
+    for name in ("map", "data", "depth_points"):
+        plain = json.loads(line)
+        plain["trial"][name] = "a\0b"
+        (tmp_path / "r.jsonl").write_text(json.dumps(plain))
+        assert main(["report", str(tmp_path / "r.jsonl"), "--out", str(tmp_path / "out")]) == 1
+        error = capsys.readouterr().err
+        assert f"{name} holds a NUL character" in error
+        assert error.count("\n") == 1
+
+
+def test_more_than_can_be_drawn_is_in_the_tables(tmp_path: Path) -> None:
+    many = [
+        dataclasses.replace(r, trial=dataclasses.replace(r.trial, map=f"map {i}"))
+        for i, r in enumerate(result(s, 2, protocol="none") for s in range(MOST_LINES + 50))
+    ]
+    table = ResultTable(tuple(many))
+    figures = Figures(table.groups, tmp_path, "5deg 0.05")
+    assert f"at most {MOST_LINES} of {len(many)} groups" in figures.omitted
+    assert iio.imread(figures.rates().with_suffix(".png")).shape[0] < 2**16
+    assert "map 199" in page("Many", table, [], [], "5deg 0.05")
+
+
+def test_warnings_of_other_libraries_cannot_control_the_terminal(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write(tmp_path / "r.jsonl", result(0, 2))
+
+    def warn(self: Figures) -> Path:
+        warnings.warn("Glyph \x1b[31m missing", UserWarning, stacklevel=1)
+        raise InputError("enough")
+
+    monkeypatch.setattr(Figures, "rates", warn)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *place: print(message, file=sys.stderr)  # type: ignore[assignment]
+        assert main(["report", str(file), "--out", str(tmp_path / "out")]) == 1
+    said = capfd.readouterr().err
+    assert r"Glyph \x1b[31m missing" in said
+    assert harmless(said)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -29,7 +30,7 @@ LARGEST_COUNT = 2**63 - 1
 
 @dataclass(frozen=True)
 class Trial:
-    """Everything that the result of a trial depends on."""
+    """Everything that the result of a trial depends on. Raises ``InputError`` for what cannot be the name of a folder."""
 
     map: str  # folder, or demo:NAME
     data: str  # folder, or demo:NAME
@@ -44,6 +45,11 @@ class Trial:
     depth: bool = True  # whether the method gets the measured depth
     depth_points: str | None = None  # folder of a COLMAP model whose points the method gets as depth rays
     fault: str = "none"  # faults of the images and their sizes, such as depth-scale:1.02+exposure:0.7
+
+    def __post_init__(self) -> None:
+        for name in ("map", "data", "depth_points"):
+            if "\0" in (getattr(self, name) or ""):
+                raise InputError(f"{name} holds a NUL character, expected the name of a folder")
 
     @property
     def frame(self) -> str:
@@ -135,11 +141,11 @@ class TrialResult:
 
 
 def _name(folder: str) -> str:
-    return folder if is_closed_form(folder) else Path(folder).resolve().name
+    return folder if is_closed_form(folder) else Path(os.path.realpath(folder)).name
 
 
 def _parts(folder: str) -> tuple[str, ...]:
-    return Path(folder).resolve().parts[1:]
+    return Path(os.path.realpath(folder)).parts[1:]
 
 
 def views_digest(views: Sequence[View]) -> str:

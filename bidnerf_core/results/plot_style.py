@@ -76,18 +76,24 @@ def write_figure(figure: Any, path: Path, **options: Any) -> None:
     """
     require_matplotlib()
     from matplotlib.text import Text
-    from matplotlib.ticker import FixedFormatter
 
     for text in figure.findobj(Text):
         text.set_text(_drawable(text.get_text()))
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
-            formatter = axis.get_major_formatter()
-            if isinstance(formatter, FixedFormatter):  # it sets the labels anew when they are drawn
-                formatter.seq = [_drawable(str(label)) for label in formatter.seq]
+            _make_labels_drawable(axis.get_major_formatter())
     file = io.BytesIO()
     figure.savefig(file, format=path.suffix.lstrip(".") or "png", **options)
     write_file(path, file.getvalue())
+
+
+def _make_labels_drawable(formatter: Any) -> None:
+    """Change a formatter of given labels, which are set anew whenever a figure is drawn."""
+    from matplotlib.ticker import FuncFormatter
+
+    if isinstance(formatter, FuncFormatter):
+        labels = formatter.func
+        formatter.func = lambda *place: _drawable(str(labels(*place)))
 
 
 def _drawable(text: str) -> str:
