@@ -140,7 +140,7 @@ def test_a_file_that_is_cut_or_changed_never_ends_otherwise_than_in_a_line(
     [
         ("images.txt", "1 1 0 0 0 0 0 0 1\n\n", "line 1 has 9 entries"),
         ("images.txt", "1 1 0 0 x 0 0 0 1 a.png\n\n", "line 1: could not convert"),
-        ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n", "is not finite"),
+        ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n", "invalid pose"),
         ("images.txt", "1 nan 0 0 0 0 0 0 1 a.png\n\n", "is not finite"),
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n1 2\n", "line 2 has 2 entries"),
         ("images.txt", f"1 1 0 0 0 0 0 0 1 a.png\n1 2 {10**30}\n", "has more than 64 bits"),
