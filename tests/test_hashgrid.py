@@ -12,10 +12,9 @@ from torch import Tensor
 
 import tiny
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.concentrated import Concentrated, SplittingSampler
 from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySampler, SceneBounds
 from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.sampling import Resampled
+from bidnerf_core.fields.sampling import Concentrated, Resampled, SplittingSampler
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_hashgrid import HashGridConfig, HashGridField, backend
 from bidnerf_hashgrid.encoding import HashEncodingConfig

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.fields.blurring import Blurred
 from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import METHODS, Localizer, settings_of
+from bidnerf_core.localization.costs.blurred_field import Blurred
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import (

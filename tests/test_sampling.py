@@ -9,10 +9,9 @@ import pytest
 import torch
 from torch import Generator
 
-from bidnerf_core.fields.concentrated import Concentrated
 from bidnerf_core.fields.contract import FieldValues, Rays, RaySampler, RaySamples, SceneBounds
 from bidnerf_core.fields.rendering import render
-from bidnerf_core.fields.sampling import AroundDepth, Importance, Resampled, Stratified
+from bidnerf_core.fields.sampling import AroundDepth, Concentrated, Importance, Resampled, Stratified
 from bidnerf_core.scenes.fields import GaussianBlobs, HomogeneousBall
 from bidnerf_core.testing import samples as laws
 from bidnerf_hashgrid.occupancy import OccupancyGrid

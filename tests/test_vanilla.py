@@ -15,6 +15,7 @@ from torch import Tensor
 from bidnerf_core.carving import occupied_voxels
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField, RaySampler, RaySamples, SceneBounds, levels
+from bidnerf_core.fields.encoding import encoded_width, frequency_encoding, octaves
 from bidnerf_core.fields.rendering import query_samples, render
 from bidnerf_core.fields.sampling import Importance, OccupiedOnly, Stratified
 from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
@@ -28,7 +29,6 @@ from bidnerf_core.testing.recipes import Recorder
 from bidnerf_core.testing.scene import BOUNDS, SIDE, points, rgb_views, rgbd_views
 from bidnerf_core.training import RayBank, Supervision, TrainingState, ray_termination, supervised_loss
 from bidnerf_vanilla import VanillaConfig, VanillaField, backend
-from bidnerf_vanilla.encoding import encoded_width, positional_encoding
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
 from bidnerf_vanilla.recipe import step_outcome
 from voxels import cell_centres
@@ -59,7 +59,7 @@ def rays_of_view(count: int = 200):  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("frequencies", [0, 1, 4, 10])
 def test_encoding_is_equation_4(frequencies: int, include_input: bool) -> None:
     given = torch.rand(9, 3, dtype=torch.float64) * 2 - 1
-    found = positional_encoding(given, frequencies, include_input)
+    found = frequency_encoding(given, octaves(frequencies, given), include_input)
     assert found.shape == (9, encoded_width(frequencies, include_input))
     for row, point in zip(found.tolist(), given.tolist(), strict=True):
         expected = list(point) if include_input else []
@@ -70,7 +70,15 @@ def test_encoding_is_equation_4(frequencies: int, include_input: bool) -> None:
 
 
 def test_encoding_of_nothing_is_nothing() -> None:
-    assert positional_encoding(torch.zeros(0, 3), 3).shape == (0, 21)
+    nothing = torch.zeros(0, 3)
+    assert frequency_encoding(nothing, octaves(3, nothing)).shape == (0, 21)
+
+
+def test_the_order_of_sines_and_cosines_is_all_that_differs() -> None:
+    given = torch.rand(5, 2, 3)
+    found = frequency_encoding(given, octaves(4, given), False, sines_first=True).unflatten(-1, (2, 4, 3))
+    usual = frequency_encoding(given, octaves(4, given), False).unflatten(-1, (4, 2, 3))
+    assert torch.equal(found, usual.transpose(-3, -2))
 
 
 # The network.

@@ -7,17 +7,12 @@ from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from bidnerf_adanerf.bins import Bins, Sparse
 from bidnerf_adanerf.config import AdaNerfConfig
 from bidnerf_adanerf.networks import Oracle, ShadingNetwork
 from bidnerf_core.fields.contract import FieldValues, SceneBounds
-
-SHARPNESS = 30.0
-"""Density per side of the scene at a raw density of about 1, so that networks with small outputs can represent surfaces."""
-THINNESS = 1.0
-"""Shift of raw density that makes an untrained field nearly transparent."""
+from bidnerf_core.fields.encoding import query_network
 
 
 class AdaNerfField(nn.Module):
@@ -51,12 +46,7 @@ class AdaNerfField(nn.Module):
         return DenseField(self)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Return the values; positions are scaled to the cube [-1, 1], so that the unit of length has no effect."""
-        shape = positions.shape[:-1]
-        points = self.bounds.normalized(positions.reshape(-1, 3))
-        raw, rgb = self.shading(points, directions.reshape(-1, 3))
-        density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.side)
-        return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
+        return query_network(self.shading, self.bounds, positions, directions)
 
 
 @dataclass(frozen=True)

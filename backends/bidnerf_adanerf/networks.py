@@ -9,17 +9,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-
-def encoded_width(frequencies: int) -> int:
-    """Return the length of a point's encoding."""
-    return 3 * (1 + 2 * frequencies)
+from bidnerf_core.fields.encoding import encoded_width, frequency_encoding, octaves
 
 
 def encode(points: Float[Tensor, "*p 3"], frequencies: int) -> Float[Tensor, "*p f"]:
-    """Return ``(p, sin(2^k pi p), cos(2^k pi p))`` for k < ``frequencies`` and p in [-1, 1] (Mildenhall et al. 2020, eq. 4)."""
-    octaves = torch.arange(frequencies, dtype=points.dtype, device=points.device)
-    angles = (points[..., None, :] * (torch.pi * 2**octaves)[:, None]).flatten(-2)
-    return torch.cat([points, angles.sin(), angles.cos()], dim=-1)
+    """Return the encoding of points of the cube [-1, 1], in the order of the inputs of stored networks."""
+    return frequency_encoding(points, octaves(frequencies, points), sines_first=True)
 
 
 def trunk(inputs: int, width: int, layers: int) -> nn.Sequential:

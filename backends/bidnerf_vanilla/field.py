@@ -7,18 +7,13 @@ from typing import Annotated
 
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.fields.sampling import Importance, OccupiedOnly, Stratified
+from bidnerf_core.fields.encoding import query_network
+from bidnerf_core.fields.sampling import HierarchicalField, Importance, OccupiedOnly, Stratified
 from bidnerf_core.fields.voxel_grid import OccupancyMask, VoxelGrid
 from bidnerf_core.settings import Count, Range
 from bidnerf_vanilla.network import NerfNetwork, NetworkConfig
-
-SHARPNESS = 30.0
-"""Density per side of the scene at a raw density of about 1, so that networks with small outputs can represent surfaces."""
-THINNESS = 1.0
-"""Shift of raw density that makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF)."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +36,10 @@ class Level(nn.Module):
         self.network = NerfNetwork(config)
 
     def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        """Return the values; positions are scaled to the cube [-1, 1], so that the unit of length has no effect."""
-        shape = positions.shape[:-1]
-        points = self.bounds.normalized(positions.reshape(-1, 3))
-        raw, rgb = self.network(points, directions.reshape(-1, 3))
-        density = functional.softplus(raw - THINNESS) * (SHARPNESS / self.bounds.side)
-        return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
+        return query_network(self.network, self.bounds, positions, directions)
 
 
-class VanillaField(nn.Module):
+class VanillaField(HierarchicalField):
     """The fine level, with the coarse one in ``levels``; its sampler is hierarchical and uses the coarse one (section 5.2)."""
 
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
@@ -64,14 +54,3 @@ class VanillaField(nn.Module):
         self.fine = Level(
             config, bounds, OccupiedOnly(self.room, Importance(self.coarse, config.fine_samples))
         )
-
-    @property
-    def sampler(self) -> RaySampler:
-        return self.fine.sampler
-
-    @property
-    def levels(self) -> tuple[Level, VanillaField]:
-        return self.coarse, self
-
-    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        return self.fine.query(positions, directions)

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from bidnerf_core.fields.encoding import encoded_width, frequency_encoding, octaves
 from bidnerf_core.settings import Count, Range, Settings
-from bidnerf_vanilla.encoding import encoded_width, positional_encoding
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,11 @@ class NerfNetwork(nn.Module):
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]:
         """Return density before its activation, and rgb in [0, 1], at ``points`` of the cube [-1, 1]."""
         config = self.config
-        position = positional_encoding(points, config.position_frequencies, config.include_input)
-        direction = positional_encoding(directions, config.direction_frequencies, config.include_input)
+        factors = [
+            octaves(count, points) for count in (config.position_frequencies, config.direction_frequencies)
+        ]
+        position = frequency_encoding(points, factors[0], config.include_input)
+        direction = frequency_encoding(directions, factors[1], config.include_input)
         hidden = position
         for number, layer in enumerate(self.trunk):
             given = torch.cat([hidden, position], dim=-1) if self._is_fed(number) else hidden

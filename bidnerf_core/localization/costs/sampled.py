@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import constant
-from bidnerf_core.fields.blurring import Blurred
 from bidnerf_core.fields.contract import RadianceField, Rays, SceneBounds, widened
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render
@@ -19,6 +18,7 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.pixels import PixelDrawer, draw, drawer
 from bidnerf_core.geometry.robust import Robust
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.costs.blurred_field import Blurred
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
 from bidnerf_core.localization.method_settings import DescentSettings, ReachSettings
 from bidnerf_core.localization.problem import Problem

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
-from bidnerf_core.fields.sampling import Importance, Stratified
+from bidnerf_core.fields.sampling import HierarchicalField, Importance, Stratified
 from bidnerf_core.settings import Count
 from bidnerf_nerf_pytorch.network import Network, NetworkConfig
 
@@ -36,7 +36,7 @@ class Level(nn.Module):
         return FieldValues(density.relu().reshape(shape), torch.sigmoid(rgb).reshape(*shape, 3))
 
 
-class NerfPytorchField(nn.Module):
+class NerfPytorchField(HierarchicalField):
     """The field of the fine network; ``levels`` are that of the coarse network and this one."""
 
     def __init__(self, config: FieldConfig, bounds: SceneBounds) -> None:
@@ -45,14 +45,3 @@ class NerfPytorchField(nn.Module):
         self.bounds = bounds
         self.coarse = Level(config, Stratified(config.coarse_samples))
         self.fine = Level(config, Importance(self.coarse, config.fine_samples))
-
-    @property
-    def sampler(self) -> RaySampler:
-        return self.fine.sampler
-
-    @property
-    def levels(self) -> tuple[Level, NerfPytorchField]:
-        return self.coarse, self
-
-    def query(self, positions: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) -> FieldValues:
-        return self.fine.query(positions, directions)

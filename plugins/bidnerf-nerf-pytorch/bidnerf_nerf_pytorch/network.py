@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from bidnerf_core.fields.encoding import encoded_width, frequency_encoding
+from bidnerf_core.fields.encoding import octaves as powers_of_two
 from bidnerf_core.settings import Count, Range, Settings
 
 
@@ -71,20 +73,13 @@ class Network(nn.Module):
         return self.fc_alpha(hidden)[:, 0], self.fc_rgb(looked)
 
 
-def encoded_width(frequencies: int, include_input: bool) -> int:
-    """Return the length of a point's encoding."""
-    return 3 * (2 * frequencies + include_input)
-
-
 def encoded(
     points: Float[Tensor, "p 3"], frequencies: int, include_input: bool, octaves: bool
 ) -> Float[Tensor, "p f"]:
     """Return ``(p, sin f1 p, cos f1 p, sin f2 p, ...)`` as nerf-pytorch orders it: unlike in NeRF's eq. 4 there is no pi."""
-    steps = torch.arange(frequencies, dtype=points.dtype, device=points.device)
     if octaves:
-        factors = 2**steps
+        factors = powers_of_two(frequencies, points, lowest=1.0)
     else:
+        steps = torch.arange(frequencies, dtype=points.dtype, device=points.device)
         factors = 1 + steps * ((2.0 ** (frequencies - 1) - 1) / max(1, frequencies - 1))
-    angles = points[:, None, :] * factors[:, None]
-    waves = torch.stack([angles.sin(), angles.cos()], dim=-2).flatten(1)
-    return torch.cat([points, waves], dim=-1) if include_input else waves
+    return frequency_encoding(points, factors, include_input)

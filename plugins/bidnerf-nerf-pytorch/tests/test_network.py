@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from bidnerf_nerf_pytorch.network import Network, NetworkConfig, encoded, encoded_width
+from bidnerf_core.fields.encoding import encoded_width
+from bidnerf_nerf_pytorch.network import Network, NetworkConfig, encoded
 
 
 @pytest.mark.parametrize("octaves", [True, False])

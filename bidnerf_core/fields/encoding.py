@@ -1,0 +1,63 @@
+"""The input and the output of networks that are radiance fields: encoding by frequencies, and density from a raw number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from bidnerf_core.fields.contract import FieldValues, SceneBounds
+
+SHARPNESS = 30.0
+"""Density per side of the scene at a raw density of about 1, so that networks with small outputs can represent surfaces."""
+THINNESS = 1.0
+"""Shift of raw density that makes an untrained field nearly transparent (Barron et al. 2021, mip-NeRF)."""
+
+Network: TypeAlias = Callable[
+    [Float[Tensor, "p 3"], Float[Tensor, "p 3"]], tuple[Float[Tensor, "p"], Float[Tensor, "p 3"]]
+]
+"""Returns raw density and rgb in [0, 1] at points of the cube [-1, 1] and unit directions."""
+
+
+def encoded_width(frequencies: int, include_input: bool = True) -> int:
+    """Return the length of a point's encoding."""
+    return 3 * (2 * frequencies + include_input)
+
+
+def octaves(count: int, points: Tensor, lowest: float = torch.pi) -> Float[Tensor, "l"]:
+    """Return ``count`` angular frequencies of which each is twice the one before, in the dtype and on the device of ``points``."""
+    return lowest * 2 ** torch.arange(count, dtype=points.dtype, device=points.device)
+
+
+def frequency_encoding(
+    points: Float[Tensor, "*p 3"],
+    frequencies: Float[Tensor, "l"],
+    include_input: bool = True,
+    sines_first: bool = False,
+) -> Float[Tensor, "*p f"]:
+    """Return ``(p, sin(w_1 p), cos(w_1 p), ..., sin(w_L p), cos(w_L p))`` (Mildenhall et al. 2020, eq. 4).
+
+    For coordinates in [-1, 1], ``octaves`` gives the paper's frequencies. The three sines of a frequency come before its three
+    cosines or, with ``sines_first``, the sines of all frequencies before all cosines. ``p`` itself comes first if
+    ``include_input`` is set.
+    """
+    angles = points[..., None, :] * frequencies[:, None]
+    waves = torch.stack([angles.sin(), angles.cos()], dim=-3 if sines_first else -2).flatten(-3)
+    return torch.cat([points, waves], dim=-1) if include_input else waves
+
+
+def query_network(
+    network: Network,
+    bounds: SceneBounds,
+    positions: Float[Tensor, "*p 3"],
+    directions: Float[Tensor, "*p 3"],
+) -> FieldValues:
+    """Return the values of a network; positions are scaled to the cube [-1, 1], so that the unit of length has no effect."""
+    shape = positions.shape[:-1]
+    raw, rgb = network(bounds.normalized(positions.reshape(-1, 3)), directions.reshape(-1, 3))
+    density = functional.softplus(raw - THINNESS) * (SHARPNESS / bounds.side)
+    return FieldValues(density.reshape(shape), rgb.reshape(*shape, 3))
