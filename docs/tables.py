@@ -95,8 +95,8 @@ def _table(head: Row, rows: Iterable[Row], records: Records) -> str:
 
 def _lines(head: Row, rows: Iterable[Row]) -> str:
     head = list(head)
-    lines: list[Row] = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
+    first, *others = (f"| {' | '.join(map(str, row))} |\n" for row in [head, *rows])
+    return f"{first}|{'---|' * len(head)}\n{''.join(others)}"
 
 
 def _seconds(value: float) -> str:
