@@ -28,7 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bidnerf_core.cli.trial_progress import TrialProgress
+from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.evaluation.bench import (
     Plan,
     changed_settings,
@@ -145,8 +145,8 @@ def run_part(trials: Sequence[Trial], path: Path, workers: int, minutes: float |
         todo = left_to_do(trials, file)
         if todo and minutes != 0:
             note_run(path, provenance(script_command(), f"{workers} local processes of one thread"))
-            with local_processes(workers) as pool, TrialProgress() as progress:
-                run_trials(todo, file, pool, workers, progress, lambda: progress.stopping or late())
+            with local_processes(workers) as pool, Display() as display, stopped_by_ctrl_c() as cancel:
+                run_trials(todo, file, pool, workers, display, lambda: cancel() or late())
         left = len(left_to_do(trials, file))
         if left == len(trials) or (left and minutes is None):
             raise SystemExit(f"stopped; {path} is kept, the same command goes on")

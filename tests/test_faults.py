@@ -149,10 +149,9 @@ def test_sizes_out_of_range_are_refused(name: str) -> None:
             parse_faults(f"{name}:{size}")
 
 
-def test_every_fault_is_documented() -> None:
-    page = (ROOT / "docs" / "faults.md").read_text()
-    for name, fault in FAULTS.items():
-        assert f"| `{name}` | {fault.summary} | {fault.unit} |" in page
+def test_sizes_worth_measuring_are_allowed() -> None:
+    """The table of the documentation is made from the catalogue."""
+    for fault in FAULTS.values():
         assert all(size in fault.allowed for size in fault.sizes)
 
 

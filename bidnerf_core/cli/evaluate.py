@@ -11,7 +11,7 @@ import tyro
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.options import Device, Names, option, parse, require, wrong_usage
 from bidnerf_core.cli.output import show
-from bidnerf_core.cli.trial_progress import TrialProgress
+from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.errors import UsageError, amount
 from bidnerf_core.evaluation.bench import Plan, changed_settings
 from bidnerf_core.evaluation.evaluate import run_plan
@@ -22,6 +22,7 @@ from bidnerf_core.localization import METHODS
 from bidnerf_core.localization.methods import USUAL_METHOD
 
 Place = Annotated[str, tyro.conf.Positional]
+STOPPING = "waiting for the trials under way (Ctrl-C again: at once)"
 
 
 def run(arguments: list[str]) -> None:
@@ -97,10 +98,10 @@ def run(arguments: list[str]) -> None:
             require("--shard", shard, 0, shards - 1)
             if dask is not None and workers is not None:
                 raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
-        with TrialProgress() as progress:
+        with Display() as display, stopped_by_ctrl_c(STOPPING) as cancel:
             found = run_plan(
                 plan, shard=shard, shards=shards, workers=workers, dask=dask, out=out,
-                command=command_line("bidnerf evaluate", arguments), progress=progress, cancel=progress.cancelled,
+                command=command_line("bidnerf evaluate", arguments), progress=display, cancel=cancel,
             )  # fmt: skip
         show(f"{amount(len(found.rows), 'trial')} in {out}; 'bidnerf report {out}' shows them")
 

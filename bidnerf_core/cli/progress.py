@@ -22,7 +22,7 @@ from rich.progress import Progress as Bar
 
 from bidnerf_core.cli.output import console, say
 from bidnerf_core.errors import Cancelled
-from bidnerf_core.progress import Cancel, Progress
+from bidnerf_core.progress import Cancel, Progress, duration_text
 
 LINE_EVERY = 10.0  # seconds, where stderr is not a terminal
 
@@ -60,7 +60,7 @@ class Display:
         if now.total > 1 and now.done and (last or time.monotonic() - self._spoke > LINE_EVERY):
             self._spoke = time.monotonic()
             counted = Progress(now.stage, now.done, now.total, now.unit, text)
-            say(f"{counted}, {each * (now.total - now.done):.0f} s left")
+            say(f"{counted}, {duration_text(each * (now.total - now.done))} left")
 
     def _begin(self, now: Progress) -> None:
         self._stage, self._first = now.stage, max(0, now.done - 1)
@@ -91,7 +91,9 @@ def counted(what: str, unit: str, total: int | None = None) -> Iterator[Callable
 
 
 @contextlib.contextmanager
-def stopped_by_ctrl_c() -> Iterator[Cancel]:
+def stopped_by_ctrl_c(
+    announcement: str = "stopping after this step (Ctrl-C again: at once, back to the last checkpoint)",
+) -> Iterator[Cancel]:
     """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C raises ``KeyboardInterrupt`` at once.
 
     Work that stopped for that reason ends as interrupted, after the line that says what was kept.
@@ -106,7 +108,7 @@ def stopped_by_ctrl_c() -> Iterator[Cancel]:
     def cancel() -> bool:
         if pressed.is_set() and not announced.is_set():  # not in the handler, which may interrupt a print
             announced.set()
-            say("stopping after this step (Ctrl-C again: at once, back to the last checkpoint)")
+            say(announcement)
         return pressed.is_set()
 
     in_main = threading.current_thread() is threading.main_thread()

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from bidnerf_core.evaluation.faults import camera, colour, depth, scene, whole_image
+from bidnerf_core.evaluation.faults import camera, colour, depth, scene
 from bidnerf_core.evaluation.faults.fault import SHARE, SWITCH, Fault
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.settings import Above, Range, WholeNumbers
@@ -165,21 +165,21 @@ vanished = Fault(
 )  # fmt: skip
 
 mirror = Fault(
-    "1: on, 0: off", SWITCH, 0.0, (1.0,), whole_image.mirrored,
+    "1: on, 0: off", SWITCH, 0.0, (1.0,), camera.mirrored,
     summary="left and right swapped",
 )  # fmt: skip
 
 flip = Fault(
-    "1: on, 0: off", SWITCH, 0.0, (1.0,), whole_image.flipped,
+    "1: on, 0: off", SWITCH, 0.0, (1.0,), camera.flipped,
     summary="top and bottom swapped",
 )  # fmt: skip
 
 upside_down = Fault(
-    "1: on, 0: off", SWITCH, 0.0, (1.0,), whole_image.upside_down, T_true_faulty=HALF_TURN,
+    "1: on, 0: off", SWITCH, 0.0, (1.0,), camera.upside_down, T_true_faulty=HALF_TURN,
     summary="the camera held upside down",
 )  # fmt: skip
 
 covered = Fault(
-    "1: on, 0: off", SWITCH, 0.0, (1.0,), whole_image.covered_lens,
+    "1: on, 0: off", SWITCH, 0.0, (1.0,), camera.covered_lens,
     summary="one colour everywhere and no depth",
 )  # fmt: skip
