@@ -224,7 +224,7 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics, chann
         raise InputError(f"{where}: {what} has shape {found}, expected {expected}{hint}")
     if found[:2] != size:
         raise InputError(f"{where}: {what} is {found[1]}x{found[0]}, its camera expects {size[1]}x{size[0]}")
-    if image.layout != torch.strided or image.is_meta:
+    if image.layout != torch.strided or (image.is_meta and type(image) is Tensor):
         raise InputError(f"{where}: {what} is a sparse tensor or has no values, expected a dense one")
     if what == "hidden":
         return
