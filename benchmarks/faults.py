@@ -19,36 +19,43 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
-import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import torch
-from scipy.stats import chi2
+from _lab import (
+    RESULTS,
+    STRICT,
+    Row,
+    cpu_seconds,
+    held_out,
+    judgement,
+    line,
+    one_thread,
+    parser,
+    record,
+    within,
+    without_depth,
+)
+from _lab import answer as timed_answer
 
 from bidnerf_core import Localization, Localizer, Map, load_map
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import FAULTS, NO_FAULT, expand_faults, faulty, find_fault, parse_faults
 from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trial import views_digest
 from bidnerf_core.evaluation.trials import parse_settings
 from bidnerf_core.evaluation.workers import local_processes
 from bidnerf_core.frames.frame import View
 from bidnerf_core.io.json import to_plain
-from bidnerf_core.results.errors import normalized_error_squared, pose_error, success_rate
+from bidnerf_core.results.errors import success_rate
 
-RESULTS = Path(__file__).resolve().parent / "results"
 FOREIGN = "another-scene"
-BOUND = float(chi2.ppf(0.95, 6))
-"""Normalised squared error below which nineteen of twenty errors lie if the covariance is right."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,7 @@ class Query:
         """Return the faulty image with its true pose, which for an image of another scene is a pose in that scene."""
         dataset = dataset_of(self.data, map_of(self.map).bounds.background)
         view = faulty(dataset.views("test", [self.frame])[0], self.fault, self.seed)
-        return view if self.depth else View(replace(view.frame, depth=None), view.T_ref_camera)
+        return view if self.depth else without_depth(view)
 
     def key(self) -> list[Any]:
         """Return everything that the answer depends on, by content."""
@@ -101,16 +108,20 @@ def localizer_of(map: str, config: str) -> Localizer:
     return Localizer(map_of(map), "auto", parse_settings("auto", config))
 
 
-def answer(query: Query) -> dict[str, Any]:
+def answer(query: Query) -> Row:
     """Localize one image; return the whole answer, and its errors where there is a true pose."""
-    torch.set_num_threads(1)
+    one_thread()
     localizer, view = localizer_of(query.map, query.config), query.view()
-    began = time.process_time()
-    found = localizer(view.frame, seed=query.seed)
-    seconds = time.process_time() - began
+    answers: list[Localization] = []
+
+    def localize() -> Localization:
+        answers.append(localizer(view.frame, seed=query.seed))
+        return answers[0]
+
+    judged = timed_answer(localize, None if query.foreign else view)
     scene, mode, fault = query.cell
-    row = {"scene": scene, "mode": mode, "fault": fault, "frame": query.frame, "cpu_seconds": seconds}
-    return row | found.plain() | diagnostics_of(found) | errors_of(found, None if query.foreign else view)
+    row = {"scene": scene, "mode": mode, "fault": fault, "frame": query.frame}
+    return row | answers[0].plain() | diagnostics_of(answers[0]) | judged
 
 
 def diagnostics_of(found: Localization) -> dict[str, Any]:
@@ -119,54 +130,14 @@ def diagnostics_of(found: Localization) -> dict[str, Any]:
     return {name: to_plain(getattr(found, name)) for name in names if getattr(found, name, None) is not None}
 
 
-def errors_of(found: Localization, view: View | None) -> dict[str, Any]:
-    """Return the errors of an answer: None where the query shows another scene, or the answer is not finite."""
-    names = ("translation", "rotation_deg", "normalized_error_squared")
-    if view is None or not bool(found.T_world_camera.matrix().isfinite().all()):
-        return dict.fromkeys(names)
-    error = pose_error(found.T_world_camera, view.T_ref_camera)
-    squared = None
-    if found.covariance is not None:
-        value = float(normalized_error_squared(found.T_world_camera, view.T_ref_camera, found.covariance))
-        squared = value if 0 <= value < float("inf") else None
-    return dict(zip(names, (float(error.translation), float(error.rotation_deg), squared), strict=True))
-
-
-def within(row: dict[str, Any], metres: float, degrees: float) -> bool:
-    """Return whether an answer is within these distances of the true pose."""
-    return row["translation"] is not None and row["translation"] < metres and row["rotation_deg"] < degrees
-
-
-def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the counts of one cell, with Wilson intervals for the shares of right and of silent answers."""
-    right = [within(row, 0.05, 5) for row in rows]
-    accepted = [row["converged"] for row in rows]
-    pairs = list(zip(accepted, right, strict=True))
-    known = [row["normalized_error_squared"] for row in rows if row["converged"]]
-    covered = [value for value in known if value is not None]
-    silent = sum(said and not good for said, good in pairs)
-    return {
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """Return the counts of one cell."""
+    counts = {
         "n": len(rows),
-        "right": sum(right),
-        "strict": sum(within(row, 0.02, 1) for row in rows),
-        "converged": sum(accepted),
-        "silent": silent,
-        "right_but_rejected": sum(good and not said for said, good in pairs),
-        "inside_95_of_converged": [sum(value <= BOUND for value in covered), len(covered)],
-        "median_cpu_seconds": statistics.median(row["cpu_seconds"] for row in rows),
-        "right_rate": asdict(success_rate(sum(right), len(rows))),
-        "silent_rate": asdict(success_rate(silent, len(rows))),
+        "right": sum(map(within, rows)),
+        "strict": sum(within(row, STRICT) for row in rows),
     }
-
-
-def line(name: str, s: dict[str, Any]) -> str:
-    """Return a cell's counts as a line of the table."""
-    inside, known = s["inside_95_of_converged"]
-    return (
-        f"{name:52} n {s['n']:4}  right {s['right']:4}  strict {s['strict']:4}  converged {s['converged']:4}"
-        f"  silent {s['silent']:4}  rejected {s['right_but_rejected']:4}  inside {inside}/{known}"
-        f"  {s['median_cpu_seconds']:.2f} s"
-    )
+    return counts | judgement(rows) | {"median_cpu_seconds": cpu_seconds(rows)["median_cpu_seconds"]}
 
 
 def queries(given: argparse.Namespace) -> Iterator[Query]:
@@ -188,12 +159,10 @@ def frames_of(
 ) -> Iterator[Query]:
     """Yield the queries of one cell: evenly spaced frames for tuning or for reports; none if depth is needed but missing."""
     dataset = dataset_of(data, map_of(map).bounds.background)
-    names = [n for i, n in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == given.tuning_frames]
+    names = held_out(dataset.frame_names("test"), given.tuning_frames, given.frames)
     if depth and not any(view.frame.has_depth for view in dataset.views("test", names[:1])):
         return
-    count = min(given.frames or len(names), len(names))
-    for place in range(count):
-        name = names[place * len(names) // count]
+    for name in names:
         yield Query(map, data, name, depth, fault, foreign, given.config, given.seed)
 
 
@@ -218,56 +187,47 @@ def answered(
 
 def measured(given: argparse.Namespace, store: RowStore, executor: Executor) -> dict[str, Any]:
     """Return the summaries of all cells by scene and mode, and print each when it is complete."""
-    cells: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    cells: dict[tuple[str, str, str], list[Row]] = {}
     last: tuple[str, str, str] | None = None
     for query, row in answered(queries(given), store, executor, given.jobs):
         if last is not None and query.cell != last:
-            print(line(" ".join(last), summary(cells[last])), flush=True)
+            print(line(" ".join(last), cells[last]), flush=True)
         last = query.cell
         cells.setdefault(last, []).append(row)
     if last is None:
         raise InputError("no query, expected frames with what the faults change")
-    print(line(" ".join(last), summary(cells[last])))
+    print(line(" ".join(last), cells[last]))
     results: dict[str, Any] = {}
     for (scene, mode, fault), rows in cells.items():
         results.setdefault(scene, {}).setdefault(mode, {})[fault] = summary(rows)
-    everything = summary([row for rows in cells.values() for row in rows])
-    print(line("all", everything))
-    return {"cells": results, "all": everything}
+    rows = [row for some in cells.values() for row in some]
+    print(line("all", rows))
+    silent = success_rate(judgement(rows)["silent"], len(rows))
+    return {"cells": results, "all": summary(rows) | {"silent_rate": asdict(silent)}}
 
 
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scenes", nargs="+", metavar="MAP:DATA")
-    parser.add_argument(
+    found = parser(__doc__, "faults", scenes=True)
+    found.add_argument(
         "--faults", nargs="*", metavar="FAULT", help="NAME:SIZE,SIZE... or none (default: all)"
     )
-    parser.add_argument(
-        "--foreign",
-        nargs="*",
-        default=[],
-        metavar="DATA",
-        help="datasets of other scenes to take queries from",
+    found.add_argument(
+        "--foreign", nargs="*", default=[], metavar="DATA", help="datasets of other scenes to query with"
     )
-    parser.add_argument("--frames", type=int, help="frames of each cell, evenly spaced (default: all)")
-    parser.add_argument("--tuning-frames", action="store_true")
-    mode = parser.add_mutually_exclusive_group()
+    mode = found.add_mutually_exclusive_group()
     mode.add_argument(
         "--rgb", dest="modes", action="store_const", const=(False,), help="only without measured depth"
     )
     mode.add_argument(
         "--rgbd", dest="modes", action="store_const", const=(True,), help="only with measured depth"
     )
-    parser.add_argument(
+    found.add_argument(
         "--config", default="{}", help="JSON of settings of auto that differ from its defaults"
     )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1, help="number of processes, of one thread each")
-    parser.add_argument("--name", default="faults", help="of the record")
-    parser.set_defaults(modes=(False, True))
-    given = parser.parse_args()
+    found.add_argument("--seed", type=int, default=0)
+    found.add_argument("--jobs", type=int, default=1, help="number of processes, of one thread each")
+    found.set_defaults(modes=(False, True))
+    given = found.parse_args()
     usual = [NO_FAULT, *(f"{name}:{size:g}" for name, fault in FAULTS.items() for size in fault.sizes)]
     given.faults = expand_faults(usual if given.faults is None else given.faults)
     given.config = json.dumps(json.loads(given.config), sort_keys=True)
@@ -276,10 +236,10 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     given = arguments()
-    torch.set_num_threads(1)
+    one_thread()
     with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store, local_processes(given.jobs) as executor:
         results = measured(given, store, executor)
-    print(write_record(RESULTS / f"{given.name}.json", results, given.seed))
+    record(given.name, results, given.seed)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,14 @@
-"""Success of a method on a map from seeded starts, on frames that training never saw.
+"""Success and speed of methods on maps, from the same seeded starts, on frames that training never saw.
 
-    python benchmarks/localization.py MAP DATA --start bid:0.5 --trials 40 --name localization_lego_bid_0.5
-    python benchmarks/localization.py MAP DATA --start none --method auto --all-frames --name no_start_lego
+    python benchmarks/localization.py MAP DATA --start bid:0.5 --trials 40 --method bid --name localization_lego_bid_0.5
+    python benchmarks/localization.py MAP DATA --start none --name no_start_lego
+    python benchmarks/localization.py MAP DATA --start bid:0.5 --trials 20 --method bid bid-lm auto --name speed_lego
 
 ``--start`` is a protocol, with a size where it has sizes: ``bid:SIZE``, ``perturb:METRES:DEGREES``, ``inerf``, ``none``; one
-record may hold several. Frames whose index in the test split is 1 modulo 5 are left out by default, since settings were
-tuned on them. Without ``--trials`` each frame is tried once. Trials run in processes of one thread; finished trials are
+record may hold several. Without ``--trials`` each frame is tried once. All methods take turns on each start, and are compared
+with the first one. Trials run in processes of one thread, one by default, so that times can be compared. Finished trials are
 kept in a ``.jsonl`` next to the record, so that an interrupted run resumes where it stopped. For other purposes, use
 ``bidnerf evaluate``.
-
-Where a method gives a covariance, ``consistent`` counts the answers whose normalised squared error lies inside the 95 %
-bound of chi-squared with 6 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -23,26 +21,23 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from scipy.stats import chi2
+from _lab import BOUND, RESULTS, held_out, parser, record
 
-from bidnerf_core.evaluation.bench import Plan, left_to_do, planned, run_trials
-from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core import SE3
+from bidnerf_core.evaluation.bench import Plan, planned, run_trials
 from bidnerf_core.evaluation.results import ResultsFile, key_of
-from bidnerf_core.evaluation.summary import median, summarize
+from bidnerf_core.evaluation.summary import Summary, median, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.evaluation.workers import local_processes
-from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import to_plain
 from bidnerf_core.results.errors import normalized_error_squared, success_rate
 
-RESULTS = Path(__file__).parent / "results"
+Truth = dict[str, SE3]
+"""T_world_camera of each frame, by its name."""
 
-BOUND = float(chi2(6).ppf(0.95))
 
-
-def summary(rows: list[TrialResult], truth: dict[str, SE3]) -> dict[str, Any]:
-    """Return the usual statistics of trials, and the consistency of their covariances."""
+def summary(rows: list[TrialResult], truth: Truth) -> dict[str, Any]:
+    """Return the usual statistics of trials, and how many errors lie inside the 95 % bounds of their covariances."""
     result = asdict(summarize(rows))
     normalized = [value for row in rows if (value := nees(row, truth)) is not None]
     if normalized:
@@ -52,10 +47,11 @@ def summary(rows: list[TrialResult], truth: dict[str, SE3]) -> dict[str, Any]:
     starts = [row.start_error for row in rows]
     result["median_start_rotation_deg"] = median(e.rotation_deg if e else None for e in starts)
     result["slowest_seconds"] = max(row.seconds for row in rows)
+    result["settings"] = rows[0].settings
     return result
 
 
-def nees(row: TrialResult, truth: dict[str, SE3]) -> float | None:
+def nees(row: TrialResult, truth: Truth) -> float | None:
     """Return the normalised (estimation) error squared: infinite for a singular covariance, None without one."""
     if row.covariance is None or row.T_world_camera is None:
         return None
@@ -65,27 +61,32 @@ def nees(row: TrialResult, truth: dict[str, SE3]) -> float | None:
     return value if math.isfinite(value) and value >= 0 else math.inf
 
 
-def final(row: TrialResult, truth: dict[str, SE3]) -> dict[str, Any]:
-    """Return a trial without its trace."""
-    error = None if row.error is None else to_plain(row.error)
-    value = nees(row, truth)
-    kept = ("frame", "seed", "converged", "reason", "steps", "seconds", "loss")
-    return (
-        {name: getattr(row, name) for name in kept}
-        | (error or {"translation": None})
-        | ({} if value is None else {"normalized_error_squared": value if math.isfinite(value) else None})
-    )
+def times_less(base: Summary, other: Summary) -> dict[str, float | None]:
+    """Return how many times fewer steps and less time ``other`` takes than ``base``: in all, and to success."""
+    found: dict[str, float | None] = {
+        "steps": base.steps / other.steps,
+        "seconds": base.seconds / other.seconds,
+    }
+    for name, one in base.criteria.items():
+        two = other.criteria[name]
+        if one is not None and two is not None:
+            found[f"{name}: steps to success"] = _ratio(one.steps, two.steps)
+            found[f"{name}: time to success"] = _ratio(one.milliseconds, two.milliseconds)
+    return found
 
 
-def trials(given: argparse.Namespace, start: str) -> list[Trial]:
-    """Return the trials from one kind of start."""
+def _ratio(one: float | None, two: float | None) -> float | None:
+    return None if one is None or not two else one / two
+
+
+def trials(given: argparse.Namespace, start: str, method: str) -> list[Trial]:
+    """Return the trials of a method from one kind of start."""
     protocol, *size = start.split(":")
-    _, dataset = opened(str(given.map), str(given.data))
-    names = dataset.frame_names("test")
-    kept = [name for place, name in enumerate(names) if given.all_frames or place % 5 != 1]
+    names = opened(given.map, given.data)[1].frame_names("test")
+    kept = names if given.all_frames else held_out(names, given.tuning_frames)
     return planned(
         Plan(
-            str(given.map), str(given.data), protocol, (tuple(map(float, size)),), given.method,
+            given.map, given.data, protocol, (tuple(map(float, size)),), method,
             json.dumps(json.loads(given.config), sort_keys=True), given.trials or len(kept), given.seed,
             frames=tuple(kept), depth=not given.no_depth,
         )
@@ -93,47 +94,60 @@ def trials(given: argparse.Namespace, start: str) -> list[Trial]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    arguments = parser(__doc__)
+    arguments.add_argument("map")
+    arguments.add_argument("data")
+    arguments.add_argument("--start", nargs="+", default=["none"])
+    arguments.add_argument("--method", nargs="+", default=["auto"])
+    arguments.add_argument(
+        "--config", default="{}", help="JSON of settings that differ from the defaults of all methods"
     )
-    parser.add_argument("map", type=Path)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--start", nargs="+", required=True)
-    parser.add_argument("--name", required=True, help="of the record")
-    parser.add_argument("--method", default="bid")
-    parser.add_argument(
-        "--config", default="{}", help="JSON of the method's settings that differ from the defaults"
+    arguments.add_argument("--trials", type=int, help="from each start")
+    arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--workers", type=int, default=1)
+    arguments.add_argument(
+        "--tuning-frames", action="store_true", help="only frames that settings are tuned on"
     )
-    parser.add_argument("--trials", type=int, help="from each start")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--all-frames", action="store_true", help="also those that settings were tuned on")
-    parser.add_argument("--no-depth", action="store_true", help="withhold the measured depth")
-    given = parser.parse_args()
-    wanted = {start: trials(given, start) for start in given.start}
-    partial = RESULTS / f"{given.name}.partial.jsonl"
-    with ResultsFile(partial) as file, local_processes(given.workers) as pool:
-        every = [trial for part in wanted.values() for trial in part]
-        left = len(left_to_do(every, file))
-        run_trials(every, file, pool, given.workers, lambda row: print(".", end="", flush=True))
-        print(f" {left} trials done")
-        rows = {start: [file.results[key_of(trial)] for trial in part] for start, part in wanted.items()}
-    _, dataset = opened(str(given.map), str(given.data))
-    truth = {view.frame.name: view.T_ref_camera for view in dataset.views("test")}
-    record = {
-        "map": given.map.name,
-        "data": given.data.name,
-        "method": given.method,
-        "depth": not given.no_depth,
-        "settings": rows[given.start[0]][0].settings,
-        "starts": {
-            start: {"summary": summary(part, truth), "rows": [final(row, truth) for row in part]}
-            for start, part in rows.items()
-        },
+    arguments.add_argument("--all-frames", action="store_true", help="also those that settings were tuned on")
+    arguments.add_argument("--no-depth", action="store_true", help="withhold the measured depth")
+    given = arguments.parse_args()
+    wanted = {
+        (start, method): trials(given, start, method) for start in given.start for method in given.method
     }
-    print(write_record(RESULTS / f"{given.name}.json", record, given.seed))
-    print(json.dumps({start: part["summary"] for start, part in record["starts"].items()}, indent=1))
-    partial.unlink()
+    partial = RESULTS / f"{given.name}.rows.jsonl"
+    with ResultsFile(partial) as file, local_processes(given.workers) as pool:
+        turns = [
+            trial
+            for start in given.start
+            for same in zip(*(wanted[start, m] for m in given.method), strict=True)
+            for trial in same
+        ]
+        run_trials(turns, file, pool, given.workers, lambda row: print(".", end="", flush=True))
+        print()
+        rows = {which: [file.results[key_of(trial)] for trial in part] for which, part in wanted.items()}
+    truth = {view.frame.name: view.T_ref_camera for view in opened(given.map, given.data)[1].views("test")}
+    starts: dict[str, Any] = {}
+    for start in given.start:
+        first, *others = given.method
+        base = summarize(rows[start, first])
+        starts[start] = {
+            "methods": {method: summary(rows[start, method], truth) for method in given.method},
+            f"times less than {first}": {m: times_less(base, summarize(rows[start, m])) for m in others},
+        }
+    results = {
+        "map": Path(given.map).name,
+        "data": Path(given.data).name,
+        "depth": not given.no_depth,
+        "starts": starts,
+    }
+    record(given.name, results, given.seed)
+    for start, found in starts.items():
+        for method, s in found["methods"].items():
+            print(
+                start,
+                method,
+                {name: s[name] for name in ("trials", "converged", "converged_but_wrong", "seconds")},
+            )
 
 
 if __name__ == "__main__":

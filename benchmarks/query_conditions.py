@@ -10,27 +10,35 @@ interrupted run resumes where it stopped.
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from _lab import (
+    RESULTS,
+    Row,
+    Scene,
+    answer,
+    cpu_seconds,
+    held_out,
+    judgement,
+    line,
+    one_thread,
+    parser,
+    rates,
+    record,
+    without_depth,
+)
 
-from bidnerf_core import SE3, Frame, Localizer, View, load_map
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core import SE3, Frame, Localization, Localizer, View
 from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.provenance import write_record
-from bidnerf_core.results.errors import pose_error, success_rate
 
-RESULTS = Path(__file__).resolve().parent / "results"
 WRONG_FOCAL = 1.1
 """Factor on a focal length that is declared as approximate."""
 
@@ -80,84 +88,55 @@ CONDITIONS: dict[str, Callable[[Frame], Frame]] = {
 RIG = "rig of three frames"
 
 
-def answer(localizer: Localizer, views: Sequence[View], condition: str) -> dict[str, Any]:
+def localized(localizer: Localizer, views: Sequence[View], condition: str) -> Row:
     """Localize the last view, alone or as part of a rig, and compare the pose with the true one."""
-    without = [replace(view, frame=replace(view.frame, depth=None)) for view in views]
-    query = without if condition == RIG else CONDITIONS[condition](without[-1].frame)
-    began = time.process_time()
-    found = localizer(query)
-    seconds = time.process_time() - began
-    error = pose_error(found.T_world_camera, views[-1].T_ref_camera)
-    return {
-        "translation": float(error.translation), "rotation_deg": float(error.rotation_deg),
-        "converged": found.converged, "outcome": str(found.outcome), "focal_factor": found.focal_factor,
-        "cpu_seconds": seconds,
-    }  # fmt: skip
+    shown = [without_depth(view) for view in views]
+    focal: list[float] = []
+
+    def localize() -> Localization:
+        found = localizer(shown if condition == RIG else CONDITIONS[condition](shown[-1].frame))
+        focal.append(found.focal_factor)
+        return found
+
+    return answer(localize, views[-1]) | {"focal_factor": focal[0]}
 
 
-def summary(rows: Sequence[dict[str, Any]], condition: str) -> dict[str, Any]:
+def summary(rows: Sequence[Row], condition: str) -> dict[str, Any]:
     """Return successes with Wilson intervals, median errors, and how well the answers judge themselves."""
-    right = [r["translation"] < 0.05 and r["rotation_deg"] < 5 for r in rows]
-    strict = [r["translation"] < 0.02 and r["rotation_deg"] < 1 for r in rows]
-    pairs = [(r["converged"], good) for r, good in zip(rows, right, strict=True)]
-    found = {
-        "5deg 0.05": asdict(success_rate(sum(right), len(rows))),
-        "1deg 0.02": asdict(success_rate(sum(strict), len(rows))),
-        "median_translation": statistics.median(r["translation"] for r in rows),
-        "median_rotation_deg": statistics.median(r["rotation_deg"] for r in rows),
-        "accepted_but_wrong": sum(said and not good for said, good in pairs),
-        "right_but_rejected": sum(good and not said for said, good in pairs),
-        "median_cpu_seconds": statistics.median(r["cpu_seconds"] for r in rows),
+    judged = judgement(rows)
+    found = rates(rows) | {
+        "accepted_but_wrong": judged["silent"],
+        "right_but_rejected": judged["right_but_rejected"],
+        "median_cpu_seconds": cpu_seconds(rows)["median_cpu_seconds"],
     }
     if condition == "unknown focal length":
-        errors = [abs(r["focal_factor"] * WRONG_FOCAL - 1) for r in rows]
-        found["median_focal_error"] = statistics.median(errors)
-        found["largest_focal_error"] = max(errors)
+        errors = [abs(row["focal_factor"] * WRONG_FOCAL - 1) for row in rows]
+        found |= {"median_focal_error": statistics.median(errors), "largest_focal_error": max(errors)}
     return found
 
 
-def scene(folder: Path, data: Path, count: int, store: RowStore) -> dict[str, Any]:
+def scene_results(scene: Scene, count: int, store: RowStore) -> dict[str, Any]:
     """Try all conditions on one scene."""
-    stored = load_map(folder)
-    dataset, localizer = open_dataset(data, stored.bounds.background), Localizer(stored, "auto")
-    names = dataset.frame_names("test")
-    chosen = [i for i in range(2, len(names)) if i % 5 != 1][:count]
+    localizer, names = Localizer(scene.map, "auto"), scene.dataset.frame_names("test")
+    chosen = [names.index(name) for name in held_out(names) if name not in names[:2]][:count]
     found = {}
     for condition in (*CONDITIONS, RIG):
         rows = []
         for i in chosen:
-            views = dataset.views("test", names[i - 2 : i + 1])
-            key = [data.name, stored.info.weights, str(stored.info.landmarks), condition, names[i]]
-            rows.append(store.get(key, partial(answer, localizer, views, condition)))
-        s = found[condition] = summary(rows, condition)
-        print(
-            f"{data.name:16} {condition:22} n {len(rows)}: {s['5deg 0.05']['successes']}, {s['1deg 0.02']['successes']},"
-            f" median {s['median_translation']:.4f} {s['median_rotation_deg']:.3f} deg, accepted but wrong"
-            f" {s['accepted_but_wrong']}, right but rejected {s['right_but_rejected']},"
-            f" focal error {s.get('median_focal_error', 0):.4f}, CPU {s['median_cpu_seconds']:.2f} s",
-            flush=True,
-        )
+            views = scene.dataset.views("test", names[i - 2 : i + 1])
+            key = [*scene.key, condition, names[i]]
+            rows.append(store.get(key, partial(localized, localizer, views, condition)))
+        found[condition] = summary(rows, condition)
+        print(line(f"{scene.name} {condition}", rows), flush=True)
     return found
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scenes", nargs="+", help="MAP:DATA")
-    parser.add_argument("--frames", type=int, default=12)
-    parser.add_argument("--name", default="query_conditions", help="of the record")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    kept = RESULTS / f"{given.name}.partial.jsonl"
-    with RowStore(kept) as store:
-        results = {}
-        for pair in given.scenes:
-            folder, data = map(Path, pair.split(":"))
-            results[data.name] = scene(folder, data, given.frames, store)
-    print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
-    kept.unlink(missing_ok=True)
+    given = parser(__doc__, "query_conditions", scenes=True).parse_args()
+    one_thread()
+    with RowStore(RESULTS / f"{given.name}.rows.jsonl") as store:
+        scenes = map(Scene.open, given.scenes)
+        record(given.name, {scene.name: scene_results(scene, given.frames or 12, store) for scene in scenes})
 
 
 if __name__ == "__main__":

@@ -10,21 +10,18 @@ by scene.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from _lab import BOUND, parser, record, within
 from confidence import assessed
-from faults import BOUND, within
 
-from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.results.plot_style import COLOURS, new_figure, styled
 
-RESULTS = Path(__file__).resolve().parent / "results"
 CRITERIA = {
-    "right": lambda row: within(row, 0.05, 5),
+    "right": lambda row: within(row),
     "inside its 95 % bound": lambda row: (row["normalized_error_squared"] or float("inf")) <= BOUND,
 }
 
@@ -65,13 +62,10 @@ def draw(panel: Any, name: str, found: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("rows", nargs="+", type=Path)
-    parser.add_argument("--out", type=Path, required=True, help="of the figure, a PNG")
-    parser.add_argument("--name", default="reliability", help="of the record")
-    given = parser.parse_args()
+    arguments = parser(__doc__, "reliability")
+    arguments.add_argument("rows", nargs="+", type=Path)
+    arguments.add_argument("--out", type=Path, required=True, help="of the figure, a PNG")
+    given = arguments.parse_args()
     results = {path.name.split(".")[0]: reliability(rows_of(path)) for path in given.rows}
     with styled():
         figure = new_figure(4.6 * len(results), 4.0)
@@ -83,7 +77,7 @@ def main() -> None:
         for criterion in CRITERIA:
             errors = {s: round(a["expected_calibration_error"], 3) for s, a in found[criterion].items()}
             print(name, criterion, errors)
-    print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
+    record(given.name, results)
 
 
 if __name__ == "__main__":

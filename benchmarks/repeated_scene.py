@@ -1,38 +1,33 @@
 """Acceptance of poses in a scene that repeats itself.
 
-    python benchmarks/repeated_scene.py MAP:DATA [MAP:DATA ...] [--frames 40] [--tuning-frames]
+    python benchmarks/repeated_scene.py MAP:DATA [MAP:DATA ...] [--frames 40]
 
 Each map is doubled: its field and its landmarks are repeated far away, turned by 0, 90 or 180 degrees about an axis of the
 world. Each copy's descriptors get noise of their own, as if each had been built from its own photos. The test frames show
 nothing that distinguishes the copies, so that no pose should be accepted, from images alone or with measured depth. With a
 start near the true pose (a tenth of the copies' distance away; only where the copy is not turned), the pose in the right copy
-should be accepted. The doubled maps have no surface. Frames whose index in the test split is 1 modulo 5 are for tuning and
-left out.
+should be accepted. The doubled maps have no surface.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections import Counter
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import torch
+from _lab import Scene, answer, one_thread, parser, record, within, without_depth
 from torch import Generator, Tensor, nn
 
-from bidnerf_core import Localizer, Map, load_map
-from bidnerf_core.datasets import open_dataset
+from bidnerf_core import Localizer, Map
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.fields.contract import FieldValues, RadianceField, Rays, RaySamples, SceneBounds
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.results.errors import pose_error, success_rate
+from bidnerf_core.results.errors import success_rate
 
-RESULTS = Path(__file__).resolve().parent / "results"
 TURNS = (0.0, 90.0, 180.0)
 DESCRIPTOR_NOISE = 5.0
 """Standard deviation of the noise in each channel of a descriptor, whose values range from 0 to 255."""
@@ -121,15 +116,10 @@ def copies(bounds: SceneBounds) -> list[SE3]:
 def judged(localizer: Localizer, view: View, near: SE3 | None) -> tuple[bool, bool, str]:
     """Return whether the answer is accepted, whether it is right, and its outcome."""
     try:
-        found = localizer(view.frame, near, seed=0)
+        row = answer(lambda: localizer(view.frame, near, seed=0), view)
     except InputError:
         return False, False, "no landmarks recognised"
-    error = pose_error(found.T_world_camera, view.T_ref_camera)
-    return (
-        found.converged,
-        bool(error.translation < 0.05) and bool(error.rotation_deg < 5),
-        str(found.outcome),
-    )
+    return row["converged"], within(row), row["outcome"]
 
 
 def measured(scene: Map, views: list[View]) -> dict[str, Any]:
@@ -140,52 +130,33 @@ def measured(scene: Map, views: list[View]) -> dict[str, Any]:
         off = torch.zeros(6, dtype=torch.float64)
         off[0] = 0.1 * float(T_world_copy.translation.norm())
         for view in views:
-            colour = replace(view, frame=replace(view.frame, depth=None))
+            colour = without_depth(view)
             modes: list[tuple[str, View, SE3 | None]] = [("RGB", colour, None)]
             modes += [("RGB, start", colour, view.T_ref_camera.retract(off))] if number == 0 else []
             modes += [("RGB-D", view, None)] if view.frame.has_depth else []
             for name, given, near in modes:
                 accepted, right, outcome = judged(localizer, given, near)
-                counts.setdefault(name, Counter()).update(
-                    {
-                        "n": 1,
-                        "believed": accepted,
-                        "right": right,
-                        "believed and right": accepted and right,
-                        outcome: 1,
-                    }
-                )
+                both = {"believed": accepted, "right": right, "believed and right": accepted and right}
+                counts.setdefault(name, Counter()).update({"n": 1, outcome: 1} | both)
     return {name: dict(count) for name, count in counts.items()}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scenes", nargs="+", metavar="MAP:DATA")
-    parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--tuning-frames", action="store_true")
-    parser.add_argument("--name", default="repeated_scene", help="of the record")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
+    given = parser(__doc__, "repeated_scene", scenes=True).parse_args()
+    one_thread()
     scenes: dict[str, Any] = {}
-    for pair in given.scenes:
-        folder, data = pair.split(":", 1)
-        scene = load_map(Path(folder))
-        dataset = open_dataset(Path(data), scene.bounds.background)
-        names = [n for i, n in enumerate(dataset.frame_names("test")) if (i % 5 == 1) == given.tuning_frames]
-        count = min(given.frames, len(names))
-        views = dataset.views("test", [names[i * len(names) // count] for i in range(count)])
-        scenes[Path(folder).name] = measured(scene, views)
-        print(Path(folder).name, scenes[Path(folder).name], flush=True)
     total: dict[str, Counter[str]] = {}
-    for modes in scenes.values():
-        for name, count in modes.items():
+    for scene in map(Scene.open, given.scenes):
+        found = scenes[scene.folder.name] = measured(
+            scene.map, scene.views(given.tuning_frames, given.frames)
+        )
+        print(scene.folder.name, found, flush=True)
+        for name, count in found.items():
             total.setdefault(name, Counter()).update(count)
-    rates = {name: asdict(success_rate(count["believed"], count["n"])) for name, count in total.items()}
-    print({name: dict(count) for name, count in total.items()})
-    results = {"scenes": scenes, "all": total, "believed": rates}
-    print(write_record(RESULTS / f"{given.name}.json", results, seed=0))
+    believed = {name: asdict(success_rate(count["believed"], count["n"])) for name, count in total.items()}
+    record(
+        given.name, {"scenes": scenes, "all": {n: dict(c) for n, c in total.items()}, "believed": believed}
+    )
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import runpy
+import importlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,8 +25,10 @@ from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, textured
 from landmark_scene import Points, looking_in, ring
 from problems import localize
 
-REPEATED = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "repeated_scene.py"))
-twice, DoubledField, copies = (REPEATED[name] for name in ("twice", "DoubledField", "copies"))
+with pytest.MonkeyPatch.context() as patch:
+    patch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    repeated_scene = importlib.import_module("repeated_scene")
+twice, DoubledField, copies = (getattr(repeated_scene, name) for name in ("twice", "DoubledField", "copies"))
 COPY = SE3.exp(torch.tensor([30.0, 5.0, -20.0, 0.2, -0.9, 0.4], dtype=torch.float64))
 POSE = looking_in(0.43, 0.45, 3.6)
 

@@ -1,0 +1,206 @@
+"""What the benchmarks share: test frames, arguments, answers and how they are counted, turns, and records."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+from scipy.stats import chi2
+
+from bidnerf_core import Localization, Map, View, load_map
+from bidnerf_core.datasets import Dataset, open_dataset
+from bidnerf_core.evaluation.provenance import write_record
+from bidnerf_core.results.errors import normalized_error_squared, pose_error, success_rate
+
+RESULTS = Path(__file__).resolve().parent / "results"
+LIMITS = {"5deg 0.05": (0.05, 5.0), "1deg 0.02": (0.02, 1.0)}
+"""The largest errors (metres or scene units, degrees) of an answer that is right, and of one that is strictly right."""
+RIGHT, STRICT = LIMITS
+BOUND = float(chi2.ppf(0.95, 6))
+"""Normalised squared error below which nineteen of twenty errors lie if the covariance is right."""
+
+Row = dict[str, Any]
+
+
+def held_out(names: Sequence[str], tuning: bool = False, count: int | None = None) -> list[str]:
+    """Return ``count`` evenly spaced frames of a test split: those on which settings are tuned, or all others, for reports.
+
+    Frames whose index is 1 modulo 5 are for tuning.
+    """
+    chosen = [name for place, name in enumerate(names) if (place % 5 == 1) == tuning]
+    kept = min(count or len(chosen), len(chosen))
+    return [chosen[place * len(chosen) // kept] for place in range(kept)]
+
+
+def one_thread() -> None:
+    """Run everything in this process on one thread, so that times can be compared."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+def parser(doc: str | None, name: str | None = None, scenes: bool = False) -> argparse.ArgumentParser:
+    """Return a parser that shows a script's docstring, with the name of its record (required if there is no default)."""
+    found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument(
+        "--name", default=name, required=name is None, help="of the record (default: %(default)s)"
+    )
+    if scenes:
+        found.add_argument(
+            "scenes", nargs="+", metavar="MAP:DATA", help="folder of a map, folder of its dataset"
+        )
+        found.add_argument(
+            "--frames", type=int, help="test frames of each scene, evenly spaced (default: all)"
+        )
+        found.add_argument(
+            "--tuning-frames", action="store_true", help="only frames that settings are tuned on"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A map and the dataset that it was made from."""
+
+    folder: Path
+    data: Path
+    map: Map
+    dataset: Dataset
+
+    @classmethod
+    def open(cls, pair: str) -> Scene:
+        """Open ``MAP:DATA``."""
+        folder, data = map(Path, pair.split(":", 1))
+        stored = load_map(folder)
+        return cls(folder, data, stored, open_dataset(data, stored.bounds.background))
+
+    @property
+    def name(self) -> str:
+        return self.data.name
+
+    @property
+    def key(self) -> list[Any]:
+        """What identifies the scene in a file of rows: its name, and the content of its map."""
+        info = self.map.info
+        return [self.name, info.weights, str(info.landmarks), str(info.surface)]
+
+    def views(self, tuning: bool = False, count: int | None = None) -> list[View]:
+        return self.dataset.views("test", held_out(self.dataset.frame_names("test"), tuning, count))
+
+
+def without_depth(view: View) -> View:
+    return replace(view, frame=replace(view.frame, depth=None))
+
+
+def modes(views: Sequence[View], wanted: Iterable[str] = ("RGB", "RGB-D")) -> dict[str, list[View]]:
+    """Return the views without their depth and, where they have any, with it."""
+    found = {"RGB": [without_depth(view) for view in views]}
+    if any(view.frame.has_depth for view in views):
+        found["RGB-D"] = list(views)
+    return {mode: some for mode, some in found.items() if mode in wanted}
+
+
+# Answers.
+
+
+def errors_of(found: Localization, truth: View | None) -> Row:
+    """Return an answer's errors, and the squared error that its covariance normalises; None for each that is not known."""
+    names = ("translation", "rotation_deg", "normalized_error_squared")
+    if truth is None or not bool(found.T_world_camera.matrix().isfinite().all()):
+        return dict.fromkeys(names)
+    error, squared = pose_error(found.T_world_camera, truth.T_ref_camera), None
+    if found.covariance is not None:
+        value = float(normalized_error_squared(found.T_world_camera, truth.T_ref_camera, found.covariance))
+        squared = value if 0 <= value < float("inf") else None
+    return dict(zip(names, (float(error.translation), float(error.rotation_deg), squared), strict=True))
+
+
+def answer(localize: Callable[[], Localization], truth: View | None) -> Row:
+    """Localize once; return the errors of the answer, whether it was accepted, and its CPU time."""
+    began = time.process_time()
+    found = localize()
+    seconds = time.process_time() - began
+    judged = {"converged": found.converged, "outcome": str(found.outcome), "cpu_seconds": seconds}
+    return errors_of(found, truth) | judged
+
+
+def within(row: Row, limits: str = RIGHT) -> bool:
+    """Return whether an answer is within the limits of its errors; an answer without a pose is not."""
+    metres, degrees = LIMITS[limits]
+    return row["translation"] is not None and row["translation"] < metres and row["rotation_deg"] < degrees
+
+
+def rates(rows: Sequence[Row]) -> dict[str, Any]:
+    """Return the successes with Wilson's 95 % intervals, and the median errors, None where half have no answer."""
+    found: dict[str, Any] = {
+        name: asdict(success_rate(sum(within(row, name) for row in rows), len(rows))) for name in LIMITS
+    }
+    for part in ("translation", "rotation_deg"):
+        middle = statistics.median(float("inf") if row[part] is None else row[part] for row in rows)
+        found[f"median_{part}"] = None if middle == float("inf") else middle
+    return found
+
+
+def judgement(rows: Sequence[Row]) -> dict[str, Any]:
+    """Return how well the answers judge themselves: accepted, wrong of these, right but rejected, inside their 95 % bounds."""
+    pairs = [(row["converged"], within(row)) for row in rows]
+    known = [row["normalized_error_squared"] for row in rows if row["converged"]]
+    covered = [value for value in known if value is not None]
+    return {
+        "converged": sum(said for said, _ in pairs),
+        "silent": sum(said and not good for said, good in pairs),
+        "right_but_rejected": sum(good and not said for said, good in pairs),
+        "inside_95_of_converged": [sum(value <= BOUND for value in covered), len(covered)],
+    }
+
+
+def cpu_seconds(rows: Sequence[Row]) -> dict[str, float]:
+    times = [row["cpu_seconds"] for row in rows]
+    return {"median_cpu_seconds": statistics.median(times), "slowest_cpu_seconds": max(times)}
+
+
+def line(name: str, rows: Sequence[Row]) -> str:
+    """Return the counts of some answers as a line of a table."""
+    j, inside = judgement(rows), judgement(rows)["inside_95_of_converged"]
+    return (
+        f"{name:52} n {len(rows):4}  right {sum(map(within, rows)):4}  strict {sum(within(r, STRICT) for r in rows):4}"
+        f"  converged {j['converged']:4}  silent {j['silent']:4}  rejected {j['right_but_rejected']:4}"
+        f"  inside {inside[0]}/{inside[1]}  {cpu_seconds(rows)['median_cpu_seconds']:.2f} s"
+    )
+
+
+# Comparisons, and records.
+
+
+def in_turn(names: Sequence[str], place: int) -> list[str]:
+    """Return names in the order in which they have their turn, which moves on by one with each frame."""
+    shift = place % len(names)
+    return [*names[shift:], *names[:shift]]
+
+
+def times_slower(rows: Sequence[Row], base: Sequence[Row], clock: str = "cpu_seconds") -> float:
+    """Return how many times longer some answers took than those of ``base`` in the same turns: the median of the ratios."""
+    return statistics.median(row[clock] / other[clock] for row, other in zip(rows, base, strict=True))
+
+
+def record(name: str, results: dict[str, Any], seed: int = 0, folder: Path = RESULTS) -> Path:
+    """Write a summary with its provenance, in five digits, and say where. Rows of single answers do not belong into it."""
+    path = write_record(folder / f"{name}.json", _rounded(results), seed)
+    print(path)
+    if path.stat().st_size > 60_000:
+        print(f"{path}: {path.stat().st_size} bytes, more than a summary should have")
+    return path
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.5g}")
+    if isinstance(value, dict):
+        return {key: _rounded(part) for key, part in value.items()}
+    return [_rounded(part) for part in value] if isinstance(value, (list, tuple)) else value
