@@ -14,7 +14,6 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import depth_rays_of
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization, Outcome, by_depth, settings_of
 from bidnerf_core.localization.auto_config import LEAST_POINTS
@@ -28,6 +27,7 @@ from bidnerf_core.scenes.demo import demo_room
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from problems import FieldMap, localize
+from tiny import depth_rays_of
 
 QUICK = AutoConfig(points=1000, hypotheses=128, refine_steps=0)
 """The field of these tests does not show the toy."""

@@ -10,13 +10,13 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import depth_rays_of
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import settings_of
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.results.errors import pose_error
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap, localize, single
+from tiny import depth_rays_of
 
 FEW = {
     "poses": 8, "search_rays": 64, "coarse_poses": 3, "coarse_rays": 64, "middle_rays": 128, "fine_rays": 512, "blur": 2,

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bidnerf_core.depth.images import DepthReader, depth_image, read_depth
+from bidnerf_core.depth.images import DepthReader, depth_image, read_depth_image
 from bidnerf_core.errors import InputError, InputWarning
 
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
@@ -99,7 +99,7 @@ def test_files_of_every_kind_agree(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", steps)
     expected = torch.from_numpy(steps.astype(np.float32) * 0.001)
     for name in ("a.png", "a.tif", "a.npy"):
-        torch.testing.assert_close(read_depth(tmp_path / name, 0.001), expected)
+        torch.testing.assert_close(read_depth_image(tmp_path / name, 0.001).metres, expected)
     torch.testing.assert_close(
         depth_image(torch.from_numpy(steps), 0.001, "depth").metres, expected
     )  # also as torch's uint16

@@ -17,7 +17,6 @@ import baked
 import tiny
 from bidnerf_core import InputError, Localizer, Outcome, View
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.frames.pixels import depth_rays_of
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import METHODS, AutoConfig, pose_from_matrix, settings_of
 from bidnerf_core.localization.tracking.clock import Clock
@@ -26,6 +25,7 @@ from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from bidnerf_hashgrid import backend as hashgrid
 from blob_images import BOUNDS, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap
+from tiny import depth_rays_of
 
 MAP = FieldMap(FIELD, BOUNDS)
 START = perturb(TRUTH, 0.1, 3.0, seed=2)

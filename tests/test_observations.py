@@ -17,7 +17,6 @@ from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render, render_image
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import depth_rays_of
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import window
 from bidnerf_core.localization.costs.sampled import SampledLoss
@@ -34,6 +33,7 @@ from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 from problems import localize, single
+from tiny import depth_rays_of
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 CAMERA = Intrinsics(50.0, 50.0, 24.0, 20.0, 48, 40)

@@ -7,13 +7,13 @@ import torch
 from torch import Generator
 
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.frames.pixels import depth_rays_of
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.weighted_rays import RayCounts, blurred, draw_weighted_rays
 from bidnerf_core.localization.method_settings import ColourSettings, DepthSettings, objective_of
 from bidnerf_core.localization.problem import rig
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap, single
+from tiny import depth_rays_of
 
 
 @pytest.mark.parametrize("size", [2, 3, 7, 100])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.fields.contract import Rays
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.pixels import all_pixels, observe
 from bidnerf_core.scenes.closed_form import views as seen_from
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.trajectories import orbit
@@ -103,3 +105,9 @@ def _millimetres(view: View) -> np.ndarray:
 def _write_png(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     iio.imwrite(path, pixels)
+
+
+def depth_rays_of(views: Sequence[View]) -> Observations:
+    """Return all pixels with measured depth as rays without colour, in the views' reference frame; float64."""
+    parts = [observe(view, all_pixels(view.frame), torch.float64, "cpu") for view in views]
+    return Observations.joined(parts).without_colour()

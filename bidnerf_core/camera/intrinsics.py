@@ -12,7 +12,7 @@ from functools import lru_cache
 from numbers import Integral, Real
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
@@ -114,6 +114,23 @@ class Intrinsics:
         x = (pixels[..., 0] - self.cx) / self.fx
         y = (pixels[..., 1] - self.cy) / self.fy
         return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+    def rays(self, pixels: Float[Tensor, "*p 2"]) -> tuple[Float[Tensor, "*p 3"], Float[Tensor, "*p"]]:
+        """Return unit directions in the camera frame, and the distance along each at which z is 1."""
+        ray = self.unproject(pixels)
+        length = torch.linalg.vector_norm(ray, dim=-1)
+        return ray / length[..., None], length
+
+    def cells(
+        self, points: Float[Tensor, "n 3"]
+    ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Bool[Tensor, "n"]]:
+        """Return row and column of the pixels into which points (camera frame) fall, and which points fall into the image.
+
+        Row and column are 0 for the others.
+        """
+        column, row = self.project(points).nan_to_num(-1.0, -1.0, -1.0).floor().unbind(-1)
+        inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
+        return torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long(), inside
 
     def project(self, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 2"]:
         """Return the pixels (u, v) of points in the camera frame; not finite for points at or behind the camera."""

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bidnerf_core.fields.contract import crossed_box
 from bidnerf_core.frames.frame import View
 
 Corner: TypeAlias = tuple[float, float, float]
@@ -30,10 +31,8 @@ def grown(
 
 
 def met(box: AxisBox, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> float:
-    """Return the fraction of the rays that meet the box (slab method)."""
-    slope = 1 / torch.where(directions == 0, torch.finfo(directions.dtype).tiny, directions)
-    first, second = (box[0] - origins) * slope, (box[1] - origins) * slope
-    near, far = torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
+    """Return the fraction of the rays that meet the box ."""
+    near, far = crossed_box(origins, directions, *box)
     return (far >= near.clamp(min=0)).double().mean().item()
 
 

@@ -66,8 +66,5 @@ def _votes(views: Sequence[View], points: Float[Tensor, "n 3"]) -> Int[Tensor, "
 def _shows_something(view: View, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
     camera, alpha = view.frame.intrinsics, view.frame.alpha
     seen = view.T_ref_camera.to(torch.float64).inverse().apply(points).float()
-    column, row = camera.project(seen).nan_to_num(-1.0, -1.0, -1.0).floor().unbind(-1)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    if alpha is None:
-        return inside
-    return inside & (alpha[torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long()] > 0)
+    row, column, inside = camera.cells(seen)
+    return inside if alpha is None else inside & (alpha[row, column] > 0)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.datasets.colmap_files import ModelImage, ModelPoints, read_model
+from bidnerf_core.depth.registration import nearest_depth
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import View
@@ -118,12 +119,7 @@ class SparsePoints:
         points = self.seen(view.frame.name, split)
         if view.frame.has_depth or len(points) == 0:
             return view
-        camera = view.frame.intrinsics
-        column, row = camera.project(points).nan_to_num(-1.0, -1.0, -1.0).floor().long().unbind(-1)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        pixel, z = (row * camera.width + column)[inside], points[inside, 2].float()
-        depth = torch.full((camera.height * camera.width,), torch.inf).scatter_reduce(0, pixel, z, "amin")
-        depth = torch.where(depth.isfinite(), depth, 0).reshape(camera.height, camera.width)
+        depth = nearest_depth(points, view.frame.intrinsics)
         return View(replace(view.frame, depth=depth), view.T_ref_camera)
 
     def _measured(self, places: Sequence[tuple[str, SE3]], split: str) -> Unit:

@@ -68,11 +68,6 @@ class DepthImage:
         return f"counted as not measured: {found}" if found else None
 
 
-def read_depth(path: Path, unit: float) -> Float[Tensor, "h w"]:
-    """Read planar z in metres, ``unit`` metres per step; 0 where nothing was measured (see ``depth_image``)."""
-    return read_depth_image(path, unit).metres
-
-
 def read_depth_image(path: Path, unit: float | None) -> DepthImage:
     """Read a grey image of whole or floating-point numbers, or the ``.npy`` of an array; see ``depth_image``.
 

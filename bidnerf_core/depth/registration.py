@@ -85,13 +85,16 @@ def register_depth(
     measured = depth > 0
     rays = depth_camera.unproject(depth_camera.pixel_centres(torch.float64)[measured])
     points = T_colour_depth.apply(rays * depth[measured].double()[:, None])
-    column, row = colour_camera.project(points).nan_to_num(-1.0, -1.0, -1.0).floor().unbind(-1)
-    width, height = colour_camera.width, colour_camera.height
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & _ahead(points, colour_camera)
-    place = (row * width + column)[inside].long()
-    empty = torch.full((height * width,), torch.inf)
+    return nearest_depth(points[_ahead(points, colour_camera)], colour_camera)
+
+
+def nearest_depth(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Float[Tensor, "h w"]:
+    """Return planar z (metres) of the nearest of the points (camera frame) in each pixel, 0 where none falls."""
+    row, column, inside = camera.cells(points)
+    empty = torch.full((camera.height * camera.width,), torch.inf)
+    place = (row * camera.width + column)[inside]
     nearest = empty.scatter_reduce(0, place, points[inside, 2].float(), "amin")
-    return torch.where(nearest.isfinite(), nearest, 0).reshape(height, width)
+    return torch.where(nearest.isfinite(), nearest, 0).reshape(camera.height, camera.width)
 
 
 def _ahead(points: Float[Tensor, "n 3"], camera: Intrinsics) -> Bool[Tensor, "n"]:

@@ -164,7 +164,9 @@ class SceneBounds:
             if self.contracted:
                 near = torch.full_like(origins[..., 0], self.near)
                 return Rays(origins, directions, near, torch.full_like(near, self.far))
-            enter, leave = self._crossed(origins, directions, self.lower, self.upper)
+            enter, leave = crossed_box(
+                origins, directions, constant(self.lower, origins), constant(self.upper, origins)
+            )
             near = enter.clamp(self.near, self.far)
             far = leave.clamp(max=self.far)
         return Rays(origins, directions, near, torch.maximum(near, far))
@@ -177,19 +179,21 @@ class SceneBounds:
             return RaySpacing(torch.zeros_like(rays.near), float("inf"))
         half = self.side / 2
         lower, upper = (tuple(c + sign * half for c in self.centre) for sign in (-1, 1))
-        enter, leave = self._crossed(origins, directions, lower, upper)
+        enter, leave = crossed_box(origins, directions, constant(lower, origins), constant(upper, origins))
         return RaySpacing(torch.where(leave > enter, leave, 0).clamp(min=0), half)
 
-    def _crossed(
-        self, origins: Tensor, directions: Tensor, lower: tuple[float, ...], upper: tuple[float, ...]
-    ) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
-        """Return the distances (metres) at which the lines through rays enter and leave a box; they miss it where these
-        are not in order.
-        """
-        tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
-        slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
-        first, second = ((constant(corner, origins) - origins) * slope for corner in (lower, upper))
-        return torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
+
+def crossed_box(
+    origins: Float[Tensor, "*r 3"],
+    directions: Float[Tensor, "*r 3"],
+    lower: Float[Tensor, "3"],
+    upper: Float[Tensor, "3"],
+) -> tuple[Float[Tensor, "*r"], Float[Tensor, "*r"]]:
+    """Return the distances (metres) at which lines enter and leave a box (slab method); they miss it where these are not in order."""
+    tiny = torch.full_like(directions, torch.finfo(directions.dtype).tiny)
+    slope = 1 / torch.where(directions.abs() < tiny, tiny, directions)
+    first, second = (lower - origins) * slope, (upper - origins) * slope
+    return torch.minimum(first, second).amax(-1), torch.maximum(first, second).amin(-1)
 
 
 def widened(rays: Rays, factor: float) -> Rays:

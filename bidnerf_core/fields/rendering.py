@@ -148,14 +148,13 @@ def render_image(
     ``motion`` is that of the camera from the first row to the last, see ``rolling_shutter``; without it, the camera is at rest.
     """
     pixels = intrinsics.pixel_centres().reshape(-1, 2)
-    ray = intrinsics.unproject(pixels)
-    length = torch.linalg.vector_norm(ray, dim=-1)
+    ray, length = intrinsics.rays(pixels)
     device = device_of(field)
     T = T_world_camera.to(dtype=torch.float32, device=device)
     motion = motion if motion is not None and bool(motion.any()) else None
     times = exposure_times(pixels, intrinsics).to(T.translation).split(chunk)
     parts = []
-    for directions, when in zip((ray / length[:, None]).to(device).split(chunk), times, strict=True):
+    for directions, when in zip(ray.to(device).split(chunk), times, strict=True):
         at = T if motion is None else T @ poses_of_rows(when, motion)
         turned = at.rotate(directions)
         rendering = render(field, bounds.rays(at.translation.expand_as(turned), turned), bounds.background)

@@ -57,15 +57,14 @@ def observe(
     """
     frame = view.frame
     columns, rows = pixels.to(frame.rgb.device).unbind(-1)
-    ray = frame.intrinsics.unproject(pixels.double() + 0.5)  # z = 1
-    length = torch.linalg.vector_norm(ray, dim=-1)
+    ray, length = frame.intrinsics.rays(pixels.double() + 0.5)
     depth = torch.zeros_like(length)
     if frame.depth is not None:
         depth = frame.depth[rows.to(frame.depth.device), columns.to(frame.depth.device)].to(length)
     T = view.T_ref_camera.to(length)
     if view.motion is not None and bool(view.motion.any()):
         T = T @ poses_of_rows(exposure_times(pixels.to(ray) + 0.5, frame.intrinsics), view.motion)
-    directions = T.rotate(ray / length[:, None])
+    directions = T.rotate(ray)
     origins = T.translation.expand_as(directions)
     there = frame.rgb.device if device is None else device
     coloured = torch.full((len(length),), frame.has_colour, device=length.device)
@@ -89,16 +88,6 @@ def draw(
     share = max(1, count // len(views))
     parts = [observe(view, drawer(view.frame, share, generator), dtype, device) for view in views]
     return Observations.stacked(parts)
-
-
-def depth_rays_of(views: Sequence[View]) -> Observations:
-    """Return all pixels with measured depth as rays without colour, in the views' reference frame; float64.
-
-    This is for depth images with few points, such as those from structure from motion, which random pixels would miss.
-    Raises ``InputError`` where nothing was measured.
-    """
-    parts = [observe(view, all_pixels(view.frame), torch.float64, "cpu") for view in views]
-    return Observations.joined(parts).without_colour()
 
 
 MOST_FOR_MIDDLE = 200_000
