@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import logging
 import os
 import sys
@@ -150,10 +151,17 @@ def _failed(name: str, message: str, status: int, more: str = "") -> int:
 
 
 def _open_streams() -> None:
-    """Replace streams that the shell closed (``>&-``), which are None in Python, by ones that discard everything."""
+    """Make stdout and stderr accept every character.
+
+    Streams that the shell closed (``>&-``), which are None in Python, are replaced by ones that discard everything; a character
+    that a stream's encoding lacks is written as a backslash escape.
+    """
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
+        stream = getattr(sys, name)
+        if stream is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _discard(stream: TextIO) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from bidnerf_core.cli.evaluate import read_sizes
+from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.options import Flag, Names, option, parse, wrong_usage
 from bidnerf_core.cli.output import print_json, say, show
@@ -73,6 +74,7 @@ def run(arguments: list[str]) -> None:
         if out is None:
             found = run_comparison(plan, maps, progress=_say)
         else:
+            check_folder(out, (*maps, data))
             with output_folder(out, overwrite):
                 found = run_comparison(plan, maps, progress=_say)
                 found.save(out / "compare.json")

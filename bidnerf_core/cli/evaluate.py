@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from bidnerf_core.cli.folders import require_outside_maps
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.options import Device, Names, option, parse, require, wrong_usage
 from bidnerf_core.cli.output import show
@@ -98,6 +99,7 @@ def run(arguments: list[str]) -> None:
             require("--shard", shard, 0, shards - 1)
             if dask is not None and workers is not None:
                 raise UsageError("--workers and --dask contradict each other: a cluster has its own workers")
+        require_outside_maps(out.parent, out)
         with Display() as display, stopped_by_ctrl_c(STOPPING) as cancel:
             found = run_plan(
                 plan, shard=shard, shards=shards, workers=workers, dask=dask, out=out,

@@ -18,7 +18,7 @@ from bidnerf_core.cli.camera_options import (
     RegisterDepth,
     depth_registration,
 )
-from bidnerf_core.cli.folders import check_pose_file, make_folder
+from bidnerf_core.cli.folders import check_output, check_pose_file, make_folder
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.method_options import Preset, chosen_settings
 from bidnerf_core.cli.options import LARGEST_SEED, Flag, MapFolder, Names, option, parse, require
@@ -140,16 +140,20 @@ def run(arguments: list[str]) -> None:
         require_start(method, begin.given)
         if depth_points is not None:
             require_use_of_depth(method)
+        inputs = (*query, *depth, camera, start, depth_points, register_depth)
         if out is not None:
-            check_pose_file(out)
+            check_pose_file(out, inputs)
         if draw is not None:
-            make_folder(draw)
+            make_folder(draw, inputs)
         stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
         photos = replace(photos, assumed=_assumed_cameras(stored.landmarks, method, config))
         source = open_queries(query, photos, frames, stored.bounds.background, points)
         if perturb is not None and isinstance(source, Photos):
             raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")
+        if draw is not None:
+            for name in source.names:
+                check_output(_picture_file(draw, name), inputs)
         localizer = Localizer(stored, method, config, warm_up=len(source.names) > 1)
         _localize(source, localizer, begin, seed, _Output(stored, out, draw, json, len(source.names)))
 
@@ -211,7 +215,7 @@ class _Output:
         elif not self._json:
             _show_in_short(answer)
         if self._draw is not None:
-            self._write_picture(self._draw / f"overlay-{query.name}.png", query, answer, start)
+            self._write_picture(_picture_file(self._draw, query.name), query, answer, start)
 
     def _write_picture(self, file: Path, query: Query, answer: Answer, start: SE3 | None) -> None:
         """Draw an answer. A picture that cannot be written does not end the run."""
@@ -248,6 +252,10 @@ class _Output:
             return
         answers.save(out)
         say(f"{out}: written after {len(answers)} of {self._total} images")
+
+
+def _picture_file(folder: Path, name: str) -> Path:
+    return folder / f"overlay-{name}.png"
 
 
 def _show_in_full(answer: Answer, start: SE3 | None) -> None:

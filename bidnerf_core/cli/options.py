@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import math
+import os
 import shutil
 import sys
 from collections import Counter
@@ -23,6 +24,8 @@ _T = TypeVar("_T")
 
 DEFAULT_BACKEND = "hashgrid"
 LARGEST_SEED = 2**31 - 1
+LEAST_WIDTH = 40
+"""Characters in a line of help, even where the terminal has fewer."""
 
 
 def option(metavar: str | None, help: str, default: str | None = None) -> Any:
@@ -60,10 +63,29 @@ def parse(command: str, function: Callable[..., _T], arguments: list[str], confi
 def _called(command: str, function: Callable[..., _T], arguments: list[str]) -> _T:
     odd = any(printable(word) != word for word in arguments)
     # The parser repeats the arguments in its messages, which may be coloured, but must not let them control the terminal.
-    with contextlib.redirect_stderr(PrintableStream(sys.stderr)) if odd else contextlib.nullcontext():
+    with (
+        contextlib.redirect_stderr(PrintableStream(sys.stderr)) if odd else contextlib.nullcontext(),
+        _wide_enough(),
+    ):
         return tyro.cli(
             function, args=arguments, prog=f"bidnerf {command}", config=(tyro.conf.OmitArgPrefixes,)
         )
+
+
+@contextlib.contextmanager
+def _wide_enough() -> Iterator[None]:
+    """Give the parser's help and messages a least width: in narrower terminals it never ends to break lines."""
+    before = os.environ.get("COLUMNS")
+    width = shutil.get_terminal_size().columns
+    if width < LEAST_WIDTH:
+        os.environ["COLUMNS"] = str(LEAST_WIDTH)
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["COLUMNS"] = before
+        elif width < LEAST_WIDTH:
+            del os.environ["COLUMNS"]
 
 
 def _show_help(command: str, function: Callable[..., _T], hidden: int) -> _T:
@@ -74,7 +96,7 @@ def _show_help(command: str, function: Callable[..., _T], hidden: int) -> _T:
     finally:
         if hidden:
             page.write(f"\n{hidden} settings for experts are not shown; --help-all shows them.\n")
-        sys.stdout.write(page.wrapped(shutil.get_terminal_size().columns))
+        sys.stdout.write(page.wrapped(max(LEAST_WIDTH, shutil.get_terminal_size().columns)))
 
 
 def _of_finite_settings(function: Callable[..., _T]) -> Callable[..., _T]:

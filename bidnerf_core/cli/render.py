@@ -13,6 +13,7 @@ import torch
 from rich.text import Text
 
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
+from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import DataFolder, Flag, MapFolder, Names, option, parse
 from bidnerf_core.cli.output import console, read_views, say, show
 from bidnerf_core.datasets import open_dataset
@@ -49,6 +50,7 @@ def _render(
     Writes NAME.png (8-bit RGB) and NAME.depth.png (16-bit, planar z in mm, 0 where nothing was met) per frame into --out,
     and prints PSNR and depth error against the dataset's images.
     """
+    check_folder(out, (map, data))
     with output_folder(out, overwrite):
         scene = load_map(map)
         names = [name for group in frame for name in group]

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import option, parse, wrong_usage
 from bidnerf_core.cli.output import console, show
 from bidnerf_core.errors import InputError, UsageError
@@ -46,6 +47,7 @@ def report(
         raise InputError(f"{', '.join(map(str, results))}: no finished trial in it, nothing to report")
     with wrong_usage():
         chosen = chosen_criterion(criterion, table.groups)
+    check_folder(out, results)
     runs = [(path.name, read_runs(path)) for path in results]
     with console.status("drawing"):
         page = write_report(table, out, title, chosen, runs)

@@ -21,7 +21,7 @@ from bidnerf_core.cli.camera_options import (
     RegisterDepth,
     depth_registration,
 )
-from bidnerf_core.cli.folders import check_pose_file
+from bidnerf_core.cli.folders import check_plot, check_pose_file
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.options import Flag, MapFolder, option, parse, require
 from bidnerf_core.cli.output import print_json, print_table, say
@@ -101,12 +101,14 @@ def run(arguments: list[str]) -> None:
             raise UsageError("--split is for datasets, expected none with --follow")
         if out is None and not follow:
             raise UsageError("no --out, expected the name of a file of poses")
+        inputs = (sequence, camera, start, register_depth)
         if out is not None:
-            check_pose_file(out)
+            check_pose_file(out, inputs)
         if plot is not None:
             require_matplotlib()
+            check_plot(plot, inputs)
         if video is not None:
-            check_video(video)
+            check_video(video, inputs)
         registration = depth_registration(register_depth)
         sensor = ReadOptions(register_depth=registration).sensor(sequence) if follow else None
         begin, settings = (

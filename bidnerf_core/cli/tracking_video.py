@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from pathlib import Path
 from types import TracebackType
 
@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from bidnerf_core.cli.folders import check_output
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization import Localization
@@ -28,7 +29,7 @@ WHITE_DEPTH = 5.0
 """Depth (metres) that is drawn white, where only depth was recorded."""
 
 
-def check_video(file: Path) -> None:
+def check_video(file: Path, inputs: Iterable[Path | str | None]) -> None:
     """Raise ``InputError``, before any work is done, where a video cannot be written."""
     try:
         import imageio_ffmpeg  # noqa: F401
@@ -39,6 +40,7 @@ def check_video(file: Path) -> None:
     if file.suffix.lower() not in WRITTEN_SUFFIXES or not file.parent.is_dir():
         endings = ", ".join(WRITTEN_SUFFIXES)
         raise InputError(f"{file}: expected a name that ends with {endings}, in a folder that exists")
+    check_output(file, inputs)
 
 
 class TrackingVideo:

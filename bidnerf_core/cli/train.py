@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from bidnerf_core.backend import load_backend
 from bidnerf_core.captures.training_views import RefinementChoice
 from bidnerf_core.cli.camera_options import DatasetCamera, RegisterDepth, depth_registration
+from bidnerf_core.cli.folders import check_folder
 from bidnerf_core.cli.options import (
     DEFAULT_BACKEND,
     DataFolder,
@@ -88,6 +89,7 @@ def run(arguments: list[str]) -> None:
         if background is not None:
             with wrong_usage():
                 background_colour(background)
+        check_folder(out, (data,), may_be_map=True)
         working_device(device)
         begun: Background | None = background
         if resume:
