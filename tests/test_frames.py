@@ -58,7 +58,7 @@ WRONG = [
     ({"rgb": NO_VALUES[..., 0]}, "rgb has shape"),
     ({"depth": torch.zeros(16, 24, 1)}, "depth has shape"),
     ({"depth": np.zeros((16, 24))}, "depth is a ndarray"),
-    ({"depth": torch.full((16, 24), torch.nan)}, "depth has values that are NaN"),
+    ({"alpha": torch.full((16, 24), torch.nan)}, "alpha has values that are NaN"),
     ({"alpha": torch.zeros(24)}, "alpha has shape"),
     ({"hidden": [False]}, "hidden is a list"),
     ({"hidden": "all"}, "hidden is a str"),
@@ -80,3 +80,10 @@ def test_what_is_no_frame_is_refused_where_it_is_made(changed: dict[str, Any], s
 def test_real_lenses_have_rays() -> None:
     for distortion in ((-0.3, 0.1, 0.0, 0.0), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)):
         assert Frame("a", GOOD["rgb"], replace(LENS, distortion=distortion)).intrinsics.distortion
+
+
+def test_depth_that_is_no_number_was_not_measured() -> None:
+    depth = torch.tensor([1.0, torch.nan, torch.inf, -torch.inf]).repeat(16, 6)
+    found = Frame("a", GOOD["rgb"], LENS, depth).depth
+    assert found is not None
+    assert torch.equal(found, torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(16, 6))

@@ -30,7 +30,7 @@ BLACK = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB or RGB-D image. Depth is planar z in metres, 0 where nothing was measured."""
+    """One RGB or RGB-D image. Depth is planar z in metres, 0 where nothing was measured; NaN becomes 0."""
 
     name: str
     # rgb is in [0, 1], already over the background where there was an alpha channel; alpha is 1 where the scene covers
@@ -69,6 +69,8 @@ class Frame:
         ):
             if image is not None or what == "rgb":
                 _check_image(where, what, image, camera, channels)
+        if self.depth is not None and not _is_finite(self.depth):
+            object.__setattr__(self, "depth", self.depth.nan_to_num(0.0, 0.0, 0.0))
         if self.hidden is not None:
             self._hide(self.hidden)
 
@@ -233,9 +235,14 @@ def _check_image(where: str, what: str, image: object, camera: Intrinsics, chann
         raise InputError(f"{where}: {what} is of {str(image.dtype).removeprefix('torch.')}, expected {scale}")
     if image.requires_grad:
         raise InputError(f"{where}: {what} requires a gradient, expected measured values; detach() them")
-    # The sum is cheaper than a mask; on an accelerator, waiting for it would delay each frame.
-    if image.device.type == "cpu" and not math.isfinite(image.sum()) and not bool(image.isfinite().all()):
+    if what != "depth" and not _is_finite(image):
         raise InputError(f"{where}: {what} has values that are NaN or infinite, expected finite numbers")
+
+
+def _is_finite(image: Tensor) -> bool:
+    """Return whether all values are finite. On an accelerator this is not looked at: waiting for it would delay each frame."""
+    # The sum is cheaper than a mask, which is only made where the sum is not finite.
+    return image.device.type != "cpu" or math.isfinite(image.sum()) or bool(image.isfinite().all())
 
 
 def _require_rays(where: str, camera: Intrinsics) -> None:
