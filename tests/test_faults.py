@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,7 +22,6 @@ from bidnerf_core.scenes.closed_form import views as seen_from
 from bidnerf_core.scenes.demo import demo_object, demo_room
 from bidnerf_core.scenes.trajectories import look_at, orbit
 
-ROOT = Path(__file__).parents[1]
 CAMERA = Intrinsics(70.0, 72.0, 41.0, 29.5, 80, 60)
 LENS = dataclasses.replace(CAMERA, distortion=(0.05, -0.01, 0.001, 0.002))
 INSIDE = look_at((1.2, -0.9, 1.6), (-1.0, 0.5, 0.6))

@@ -344,17 +344,14 @@ def harmless(text: str) -> bool:
     return all(character.isprintable() or character == "\n" for character in text)
 
 
-@pytest.mark.filterwarnings("ignore:constrained_layout")  # such names are wider than the figure
+@pytest.mark.filterwarnings("error")
 def test_hostile_names_are_harmless_everywhere(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     file = write(tmp_path / "r.jsonl", *map(hostile_result, range(4)))
     run = provenance(HOSTILE[4], "\x1b]0;title\x07")
     for text in HOSTILE:
         note_run(file, dataclasses.replace(run, command=text, cpu=text, versions={text: text}))
     title = "<b>\x1b[2J\udcff\u202e$\\frac{$"
-    with pytest.warns(
-        UserWarning, match="constrained_layout"
-    ):  # a name of 5000 characters is wider than the figure
-        assert main(["report", str(file), "--out", str(tmp_path / "out"), "--title", title]) == 0
+    assert main(["report", str(file), "--out", str(tmp_path / "out"), "--title", title]) == 0
     said = capfd.readouterr()
     assert harmless(said.out)
     assert harmless(said.err)

@@ -6,6 +6,7 @@ In a report there is one panel per situation, and a condition has the same colou
 from __future__ import annotations
 
 import math
+import textwrap
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,6 +47,9 @@ from bidnerf_core.results.plot_style import (
 )
 
 COLUMNS, PANEL = 3, (3.6, 2.7)  # inches
+LABEL = 5.0  # inches: width of the labels of lines
+PER_INCH = 13
+"""Number of characters of an inch of text, on average."""
 MOST_LINES, MOST_PANELS = 150, 48
 """Maximum numbers of groups and of panels in a figure; larger pictures can neither be drawn nor read."""
 DrawPanel = Callable[[Any, list[Group]], None]
@@ -165,26 +169,30 @@ class Figures:
         shown = [group for group in shown if group.situation in places]
         columns = max(1, min(COLUMNS, len(places)))
         rows = max(1, math.ceil(len(places) / columns))
-        legend = 0.35 + 0.2 * len(self.labels)
+        width = max(columns, 1.6) * PANEL[0]
+        labels = {
+            label: _wrapped(label, width / (1 if len(self.labels) < 3 else 2) - 0.5) for label in self.labels
+        }
+        legend = 0.35 + 0.2 * sum(label.count("\n") + 1 for label in labels.values())
         with styled():
-            size = (max(columns, 1.6) * PANEL[0], rows * PANEL[1] + legend)
-            figure = new_figure(*size)
+            figure = new_figure(width, rows * PANEL[1] + legend)
             axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey)
             for panel, situation in zip(axes.flat, places, strict=False):
                 draw(panel, [group for group in shown if group.situation == situation])
-                panel.set_title(self.titles[situation], pad=title_pad)
+                panel.set_title(_wrapped(self.titles[situation], PANEL[0]), pad=title_pad)
             for panel in list(axes.flat)[len(places) :]:
                 panel.set_axis_off()
-            self._legend(figure, shown)
+            self._legend(figure, shown, labels)
             return save_figure(figure, self.folder, name)
 
-    def _legend(self, figure: Any, groups: Sequence[Group]) -> None:
+    def _legend(self, figure: Any, groups: Sequence[Group], labels: Mapping[str, str]) -> None:
         from matplotlib.lines import Line2D
 
         first = {group.label: group for group in reversed(groups)}
         named = [label for label in self.labels if label in first]
         handles = [Line2D([], [], **self._look(first[label])) for label in named]
-        figure.legend(handles, named, loc="outside lower left", ncols=1 if len(named) < 3 else 2)
+        shown = [labels[label] for label in named]
+        figure.legend(handles, shown, loc="outside lower left", ncols=1 if len(named) < 3 else 2)
 
     def _interval(self, panel: Any, group: Group, criterion: str, y: float) -> None:
         found = success_of(group.results, criterion)
@@ -218,7 +226,13 @@ class Figures:
         return line_look(self.labels.index(group.label))
 
     def _line_label(self, group: Group) -> str:
-        return f"{self.titles[group.situation]}  ·  {group.label}  (n = {len(group.results)})"
+        count = f"  (n = {len(group.results)})"
+        return _wrapped(f"{self.titles[group.situation]}  ·  {group.label}", LABEL, lines=2) + count
+
+
+def _wrapped(text: str, width: float, lines: int = 4) -> str:
+    """Return text in lines of a width (inches), cut where there are more than ``lines`` of them."""
+    return "\n".join(textwrap.wrap(text, int(width * PER_INCH), max_lines=lines, placeholder=" ...")) or text
 
 
 def _lines(groups: Sequence[Group]) -> list[float]:
@@ -304,7 +318,7 @@ def draw_faults(groups: Sequence[Group], folder: Path) -> Path | None:
         axes = figure.subplots(rows, COLUMNS, squeeze=False).flatten()
         for panel, curve in zip(axes, curves, strict=False):
             places = [titles[curve.situation]] + ([curve.label] if len(labels) > 1 else [])
-            _draw_curve(panel, curve, f"{curve.name}\n{', '.join(places)}")
+            _draw_curve(panel, curve, f"{curve.name}\n{_wrapped(', '.join(places), PANEL[0])}")
         for panel in axes[len(curves) :]:
             panel.set_axis_off()
         handles, names = axes[0].get_legend_handles_labels()

@@ -22,6 +22,8 @@ from bidnerf_core.results.errors import CRITERIA
 Key: TypeAlias = str
 """The identity of a trial, independent of where its folders are."""
 
+WIDEST_FIRST = 60
+"""Maximum number of characters of the first cell of a line of text that shares its line with the others."""
 RESULT_LINES = LineFormat(b'{"T_world_camera": ', "lines as 'bidnerf evaluate' writes")
 
 
@@ -92,10 +94,13 @@ def rate_text(success: Success | None) -> str:
 def aligned(lines: Sequence[Sequence[str]]) -> str:
     """Return lines of cells as text: the first column is flush left and the others are flush right.
 
-    A line of a single cell is a heading, which may be wider than its column. Characters that could control a terminal are
-    escaped.
+    A line of a single cell is a heading, which may be wider than its column; a very wide first cell takes a line of its own.
+    Characters that could control a terminal are escaped.
     """
-    cells = [[printable(cell) for cell in line] for line in lines]
+    cells: list[list[str]] = []
+    for line in lines:
+        first, *others = map(printable, line)
+        cells += [[first], ["", *others]] if others and len(first) > WIDEST_FIRST else [[first, *others]]
     columns = [[line[i] for line in cells if len(line) > max(i, 1)] for i in range(max(map(len, cells)))]
     widths = [max(map(len, column)) for column in columns]
     return "\n".join(
