@@ -20,6 +20,7 @@ from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.carving import has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
+from bidnerf_core.mapping.features import USUAL_FEATURES
 from bidnerf_core.mapping.keypoint_depth import depth_ratio
 from bidnerf_core.mapping.landmark_building import DEFAULT_LANDMARKS, TrackedViews, tracked_views
 from bidnerf_core.mapping.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
@@ -50,18 +51,18 @@ class TrainingViews:
 
 def prepared(
     views: Sequence[View], refinement: RefinementChoice = "auto",
-    progress: ProgressCallback | None = None, cancel: Cancel | None = None,
+    progress: ProgressCallback | None = None, cancel: Cancel | None = None, features: str = USUAL_FEATURES,
 ) -> TrainingViews:  # fmt: skip
     """Refine the poses of the views if requested, and find the landmarks that they show.
 
-    Raises ``InputError`` where poses or depth are plainly in another convention or unit.
+    ``features`` is the name of the detector of their keypoints. Raises ``InputError`` where poses or depth are plainly in another convention or unit.
     """
     if refinement == "never":
-        tracked, seeing = located(views, progress, cancel)
+        tracked, seeing = located(views, progress, cancel, features)
         return TrainingViews(
             seeing, tracked, stored_cameras(views), distances=shows_distances(views, tracked)
         )
-    tracked = _tracked(views, progress, cancel)
+    tracked = _tracked(views, progress, cancel, features)
     least = 0.0 if refinement == "always" else INCONSISTENT
     report = counter("poses", "image pairs", progress, cancel)
     found = training_poses(tracked, views, least, progress=report)
@@ -89,7 +90,10 @@ def prepared(
 
 
 def located(
-    views: Sequence[View], progress: ProgressCallback | None = None, cancel: Cancel | None = None
+    views: Sequence[View],
+    progress: ProgressCallback | None = None,
+    cancel: Cancel | None = None,
+    features: str = USUAL_FEATURES,
 ) -> tuple[TrackedViews | None, list[View]]:
     """Track the keypoints of the views, unless all have dense depth or a silhouette.
 
@@ -98,7 +102,7 @@ def located(
     """
     if not any(map(_lacks_distances, views)):
         return None, list(views)
-    tracked = _tracked(views, progress, cancel)
+    tracked = _tracked(views, progress, cancel, features)
     return tracked, _with_landmarks(views, tracked)
 
 
@@ -107,9 +111,11 @@ def _lacks_distances(view: View) -> bool:
     return not (view.frame.has_dense_depth or has_outline(view))
 
 
-def _tracked(views: Sequence[View], progress: ProgressCallback | None, cancel: Cancel | None) -> TrackedViews:
+def _tracked(
+    views: Sequence[View], progress: ProgressCallback | None, cancel: Cancel | None, features: str
+) -> TrackedViews:
     """Track the keypoints of the views. Raises ``InputError`` where poses or depth are plainly in another convention or unit."""
-    tracked = tracked_views(views, progress=counter("landmarks", "steps", progress, cancel))
+    tracked = tracked_views(views, features, progress=counter("landmarks", "steps", progress, cancel))
     if (other := other_convention(tracked.observations.images)) is not None:
         raise InputError(other.sentence)
     check_depth_unit(tracked)

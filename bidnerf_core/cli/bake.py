@@ -34,6 +34,10 @@ def bake(
     rendered_landmarks: Annotated[
         Flag, option(None, "replace landmarks of photos by landmarks of rendered images", "")
     ] = False,
+    landmark_features: Annotated[
+        str | None,
+        option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'", "the map's"),
+    ] = None,
     device: Device = "cpu",
     config: BakeConfig = BakeConfig(),
 ) -> None:
@@ -53,5 +57,11 @@ def bake(
         photos = open_dataset(data, scene.bounds.background, camera=camera, register_depth=registration)
     with stopped_by_ctrl_c() as cancel, Display() as progress:
         scene.bake(
-            photos, split, config, rendered_landmarks=rendered_landmarks, progress=progress, cancel=cancel
+            photos,
+            split,
+            config,
+            rendered_landmarks=rendered_landmarks,
+            features=landmark_features,
+            progress=progress,
+            cancel=cancel,
         )

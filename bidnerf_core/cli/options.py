@@ -37,6 +37,9 @@ def option(metavar: str | None, help: str, default: str | None = None) -> Any:
 MapFolder: TypeAlias = Annotated[
     Path, tyro.conf.Positional, option("MAP", "folder of a map, as 'bidnerf train' writes it")
 ]
+FeaturesName: TypeAlias = Annotated[
+    str, option("NAME", "detector of the landmarks, one of 'bidnerf plugins features'")
+]
 Device: TypeAlias = Annotated[str, option("NAME", "device on which the field computes: cpu, cuda ...")]
 DataFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, option("DATA", "folder of a dataset")]
 Flag: TypeAlias = Annotated[bool, tyro.conf.FlagCreatePairsOff]

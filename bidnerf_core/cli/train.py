@@ -13,6 +13,7 @@ from bidnerf_core.cli.options import (
     DEFAULT_BACKEND,
     DataFolder,
     Device,
+    FeaturesName,
     Flag,
     option,
     parse,
@@ -27,6 +28,7 @@ from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.io.images import background_colour
 from bidnerf_core.io.json import from_plain
+from bidnerf_core.mapping.features import USUAL_FEATURES
 from bidnerf_core.maps import training
 from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS
 from bidnerf_core.maps.description import MapInfo, load_info
@@ -70,6 +72,7 @@ def run(arguments: list[str]) -> None:
                 "refine the given poses by the keypoints that images share: always, never, or auto: if inconsistent",
             ),
         ] = "auto",
+        landmark_features: FeaturesName = USUAL_FEATURES,
         device: Device = "cpu",
         no_bake: Annotated[
             Flag, option(None, "leave the surface and the landmarks to 'bidnerf bake'", "")
@@ -96,6 +99,9 @@ def run(arguments: list[str]) -> None:
             info = training.interrupted(out, not no_bake)
             _check_unchanged(out, info, named, default, config)
             _check_refinement(out, info, refine_poses)
+            if landmark_features not in (USUAL_FEATURES, info.landmark_features):
+                began = f"--landmark-features {info.landmark_features}"
+                raise UsageError(f"{out}: was begun with {began}, got {landmark_features}; leave it out")
             begun = info.bounds.background if background is None else background
         dataset = open_dataset(data, begun, camera=camera, register_depth=depth_registration(register_depth))
         with stopped_by_ctrl_c() as cancel, Display() as progress:
@@ -105,7 +111,14 @@ def run(arguments: list[str]) -> None:
             }  # fmt: skip
             if not resume:
                 training.train(
-                    dataset, name, out, config, refine_poses=refine_poses, overwrite=overwrite, **same
+                    dataset,
+                    name,
+                    out,
+                    config,
+                    refine_poses=refine_poses,
+                    overwrite=overwrite,
+                    features=landmark_features,
+                    **same,
                 )
                 return
             try:

@@ -84,7 +84,7 @@ def bake_landmarks(
     noise = colour_noise(field, info.bounds, views) if views else info.colour_noise
     images = views or rendered_views(field, info.bounds, cameras_of(info))
     report = counter("landmarks", "steps", progress, cancel)
-    tracked = tracked_views(images, progress=report) if tracked is None else tracked
+    tracked = tracked_views(images, info.landmark_features, progress=report) if tracked is None else tracked
     if views and not info.distances:
         tracked = tracked.at_distance(info.bounds.side / 2)  # the directions are still informative
     trial, landmarks = HeldOutTrial(), None

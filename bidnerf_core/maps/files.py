@@ -26,7 +26,6 @@ from bidnerf_core.io.folders import output_folder
 from bidnerf_core.io.json import from_plain, read_json, to_plain
 from bidnerf_core.io.tensors import load_part, packed, read_tensors
 from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
-from bidnerf_core.mapping.features import USUAL_FEATURES
 from bidnerf_core.mapping.landmark_tensors import landmark_tensors, landmarks_from_tensors
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, LandmarkSource, MapInfo, load_info
@@ -59,7 +58,7 @@ def save_map(
         _check_features(landmarks, folder)
         parts["landmarks"] = lambda: tensors_to_bytes(landmark_tensors(landmarks))
     else:
-        info = replace(info, landmark_source=None, landmark_features=USUAL_FEATURES, colour_noise=None)
+        info = replace(info, landmark_source=None, colour_noise=None)
     if capture is not None:
         parts["capture"] = lambda: _json(capture)
     names = {part: _file_name(part, state.step) for part in parts}

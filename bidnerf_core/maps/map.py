@@ -24,6 +24,7 @@ from bidnerf_core.io.json import from_plain
 from bidnerf_core.io.tensors import read_tensors
 from bidnerf_core.localization.problem import on_device
 from bidnerf_core.mapping import BakeConfig, SurfaceMap
+from bidnerf_core.mapping.features import find_features
 from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.mapping.landmarks import LandmarkMap
 from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface
@@ -125,6 +126,7 @@ class Map:
         config: BakeConfig | None = None,
         *,
         rendered_landmarks: bool = False,
+        features: str | None = None,
         progress: ProgressCallback | None = None,
         cancel: Cancel | None = None,
     ) -> Map:
@@ -132,12 +134,22 @@ class Map:
 
         For the surface, views with measured depth replace rendered ones; landmarks are built from all views of ``data``
         (those of ``split``, where it is a dataset or the path to one). Without data, landmarks are built from images that the
-        field renders, unless the map has landmarks of photos: these are kept unless ``rendered_landmarks`` is set. Raises
-        ``InputError`` where the data is not usable or shows another scene, where nothing can be baked, and where another
+        field renders, unless the map has landmarks of photos: these are kept unless ``rendered_landmarks`` is set.
+        ``features`` is the name of another detector of landmarks than the map's. Raises ``InputError`` where the data is not usable or shows another scene, where nothing can be baked, and where another
         program writes into the folder; raises ``Cancelled`` once ``cancel`` returns True. Parts that are finished then stay.
         """
         if rendered_landmarks and data is not None:
             raise InputError("rendered_landmarks takes no photos, but data gives some; expected one of them")
+        if features is not None and features != self.info.landmark_features:
+            find_features(features)
+            if data is None and not rendered_landmarks and self.info.landmark_source == "photos":
+                raise InputError(
+                    f"{self._name}: its landmarks are of photos and detector {self.info.landmark_features!r}; for"
+                    f" {features!r} give the photos again (--data), or take --rendered-landmarks"
+                )
+            return replace(self, info=replace(self.info, landmark_features=features)).bake(
+                data, split, config, rendered_landmarks=rendered_landmarks, progress=progress, cancel=cancel
+            )
         with contextlib.nullcontext() if self.folder is None else locked(self.folder):
             views = list[View]()
             if data is not None:

@@ -24,6 +24,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.io.tensors import packed
 from bidnerf_core.mapping import BakeConfig
+from bidnerf_core.mapping.features import USUAL_FEATURES, find_features
 from bidnerf_core.mapping.landmark_building import TrackedViews
 from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS, Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info
@@ -70,6 +71,7 @@ def train(
     depth_points: str | Path | None = None,
     point_choice: SparseChoice | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    features: str = USUAL_FEATURES,
 ) -> Map:
     """Train a map on posed images: check and refine their poses, train the field, and bake a surface and landmarks.
 
@@ -84,11 +86,12 @@ def train(
     training as well; the map in the folder is then that of the last checkpoint, at most ``checkpoint_seconds`` old.
 
     ``background`` is the colour behind images with an alpha channel. Images without depth take that of the points of the COLMAP
-    sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones.
+    sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones. ``features`` is the name of the detector of the landmarks.
 
     Raises ``InputError`` where data, settings or folder are not usable; the folder must be empty unless ``overwrite`` is set.
     """
     chosen = load_backend(backend)
+    find_features(features)
     settings = _settings(chosen, backend, config)
     if refine_poses not in get_args(RefinementChoice):
         choices = ", ".join(get_args(RefinementChoice))
@@ -99,7 +102,7 @@ def train(
         source = read.source or "views in memory"
         if not any(view.frame.has_depth for view in read.views):
             log.info(f"{source}: no measured depth; training on colour only")
-        taken = prepared(read.views, refine_poses, progress, cancel)
+        taken = prepared(read.views, refine_poses, progress, cancel, features)
         if not taken.distances:
             log.info(
                 f"{source}: the photos are from one place and show no distances; the map's depth will be arbitrary, and"
@@ -110,6 +113,7 @@ def train(
         info = MapInfo(
             backend, to_plain(settings, "config"), bounds, 0, False, read.source, cameras=taken.cameras,
             pose_refinement=taken.refinement, distances=taken.distances, sparse_depth=read.sparse_depth,
+            landmark_features=features,
         )  # fmt: skip
         return _trained(chosen, info, taken.views, taken.tracked, work)
 
@@ -148,7 +152,9 @@ def resume(
             log.info(f"{out}: training is complete ({amount(info.step, 'step')}); baking its surface")
             scene = load_map(out, work.device, baked=False)
             return scene.with_baked_parts(views, work.bake or USUAL_BAKE, progress=progress, cancel=cancel)
-        tracked, views = located(views, progress, cancel)  # the same as when the training began
+        tracked, views = located(
+            views, progress, cancel, info.landmark_features
+        )  # the same as when the training began
         return _trained(load_backend(info.backend, str(out)), info, views, tracked, work)
 
 

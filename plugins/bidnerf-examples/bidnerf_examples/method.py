@@ -1,0 +1,53 @@
+"""A method: the pose by the landmarks of the map alone, without depth, renderings or a second look."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+
+from bidnerf_core import InputError, Localization
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import Method, Outcome
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.settings import Settings
+
+
+@dataclass(frozen=True)
+class LandmarksAloneConfig(Settings):
+    """Each field becomes an option of ``bidnerf localize --method landmarks-alone``."""
+
+    least_inliers: int = 12  # least number of landmarks that must agree on an accepted pose
+
+
+def solve(problem: Problem, config: LandmarksAloneConfig, seed: int) -> Localization:
+    """Return the pose of the last image. Raises ``InputError`` for a map without landmarks."""
+    if problem.matcher is None:
+        raise InputError("method 'landmarks-alone' needs a map with landmarks, which 'bidnerf bake' makes")
+    began = time.perf_counter()
+    found = propose(problem.matcher, problem.views, seed=seed)
+    agreeing = 0 if found is None else found.agreeing
+    accepted = found is not None and agreeing >= config.least_inliers
+    return Localization(
+        T_world_camera=SE3.identity() if found is None else found.T_world_camera,
+        outcome=Outcome.CONVERGED if accepted else Outcome.TOO_FEW_MATCHES,
+        reason=f"{agreeing} landmarks agree, {config.least_inliers} are needed",
+        steps=0,
+        seconds=time.perf_counter() - began,
+        loss=0.0 if found is None else float(found.residuals.square().mean()),
+        method="landmarks-alone",
+        poses=SE3.stack([SE3.identity() if found is None else found.T_world_camera]),
+        losses=torch.zeros(0, dtype=torch.float64),
+    )
+
+
+method = Method(
+    solve,
+    LandmarksAloneConfig,
+    needs_start=False,
+    uses_depth=False,
+    uses_landmarks=True,
+    summary="the pose by landmarks alone, accepted if enough of them agree",
+)
