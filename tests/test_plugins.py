@@ -46,16 +46,17 @@ def run_tests(source: Path, environment: dict[str, str]) -> str:
     return quietly([*pytest_, str(source / "tests")], cwd=source, env=environment)
 
 
-def declared(source: Path) -> dict[str, str]:
-    project = tomllib.loads((source / "pyproject.toml").read_text())["project"]
-    return dict(project["entry-points"]["bidnerf.backends"])
+def declared(source: Path) -> set[tuple[str, str]]:
+    """Return the group and the name of each entry point."""
+    groups = tomllib.loads((source / "pyproject.toml").read_text())["project"]["entry-points"]
+    return {(group.removeprefix("bidnerf."), name) for group, names in groups.items() for name in names}
 
 
-def offered(environment: dict[str, str]) -> dict[str, str]:
-    """Name and distribution of every backend that is found."""
-    program = "from bidnerf_core.cli import main; main(['backends', '--json'])"
+def offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
+    """Return the distribution of every plugin that is found and has no fault, by group and name."""
+    program = "from bidnerf_core.cli import main; main(['plugins', '--json'])"
     listed = json.loads(quietly([sys.executable, "-c", program], env=environment))
-    return {entry["name"]: entry["distribution"] for entry in listed}
+    return {(e["group"], e["name"]): e["distribution"] for e in listed if e["fault"] is None}
 
 
 @every_plugin
@@ -63,7 +64,7 @@ def test_a_plugin_is_found_and_keeps_its_own_tests(plugin: Path, tmp_path: Path)
     source = copied(plugin, tmp_path)
     environment = installed(source, tmp_path / "site")
     found = offered(environment)
-    assert {name: found.get(name) for name in declared(source)} == dict.fromkeys(
+    assert {point: found.get(point) for point in declared(source)} == dict.fromkeys(
         declared(source), plugin.name
     )
     assert "passed" in run_tests(source, environment)
@@ -101,5 +102,5 @@ def test_the_template_can_be_renamed_as_it_says(tmp_path: Path) -> None:
     text = "".join(file.read_text() for file in mine.rglob("*") if file.suffix in (".py", ".toml"))
     assert "template" not in text.lower()
     environment = installed(mine, tmp_path / "site")
-    assert offered(environment)["mine"] == "bidnerf-mine"
+    assert offered(environment)["backends", "mine"] == "bidnerf-mine"
     assert "passed" in run_tests(mine, environment)

@@ -14,7 +14,16 @@ from bidnerf_core.cli import main
 @pytest.fixture(scope="module")
 def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "map"
-    words = ["--steps", "30", "--rays-at-most", "256", "--landmark-features", "orb", "--refine-poses", "never"]
+    words = [
+        "--steps",
+        "30",
+        "--rays-at-most",
+        "256",
+        "--landmark-features",
+        "orb",
+        "--refine-poses",
+        "never",
+    ]
     assert main(["train", str(capture), "--out", str(folder), *words]) == 0
     return folder
 
