@@ -36,7 +36,7 @@ def modules(monkeypatch: pytest.MonkeyPatch) -> Any:
 @pytest.fixture
 def sift(modules: Any) -> ModuleType:
     pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    return modules("sift_pnp")
+    return modules("sift")
 
 
 class Seen:
@@ -78,7 +78,7 @@ def test_triangulated_points_are_those_of_the_scene_and_locate_an_image(
     sift: ModuleType, modules: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = Points(300, noise=0.2)
-    views, made = ring(scene, 8), modules("sift_points")
+    views, made = ring(scene, 8), modules("sift")
     monkeypatch.setattr(made, "SiftDetector", lambda: Seen(scene))
     monkeypatch.setattr(sift, "SiftDetector", lambda: Seen(scene))
     points = made.sift_points(views, tmp_path)
@@ -103,11 +103,14 @@ def test_triangulated_points_are_those_of_the_scene_and_locate_an_image(
 
 
 def row(error: float | None, accepted: bool | None = True, seconds: float = 1.0) -> dict[str, Any]:
-    return {"translation": error, "rotation_deg": error, "accepted": accepted, "cpu_seconds": seconds}
+    return {
+        "translation": error, "rotation_deg": error, "converged": accepted, "cpu_seconds": seconds,
+        "normalized_error_squared": None,
+    }  # fmt: skip
 
 
 def test_answers_are_counted_alone_and_in_pairs(modules: Any) -> None:
-    counts = modules("peer_summary")
+    counts = modules("landmark_peers")
     ours = [row(0.001), row(0.03), row(1.0), row(0.001, accepted=False)]
     theirs = [row(0.03, seconds=3), row(None, accepted=False), row(0.001, seconds=2), row(9.0)]
     found = counts.summary(ours)
@@ -119,4 +122,4 @@ def test_answers_are_counted_alone_and_in_pairs(modules: Any) -> None:
     assert paired["cpu_seconds_against_auto"] == 1.5
     assert counts.summary([row(None, None), row(None, None), row(0.1, None)])["median_translation"] is None
     assert counts.summary([row(0.1, None)])["silent"] is None
-    assert "only auto, only this: right 2, 1" in counts.line(counts.summary(theirs) | {"paired": paired})
+    assert "only auto, only this: 2, 1" in counts.line(counts.summary(theirs) | {"paired": paired})

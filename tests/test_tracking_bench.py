@@ -22,8 +22,7 @@ CAMERA = Intrinsics(8.0, 8.0, 4.0, 3.0, 8, 6)
 def importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     yield
-    for name in ("tracking", "tracking_runs", "tracking_baselines", "tracking_memory"):
-        sys.modules.pop(name, None)
+    sys.modules.pop("tracking", None)
 
 
 def recording(count: int, photo_every: int = 1) -> list[TimedFrame]:
@@ -44,7 +43,7 @@ def recording(count: int, photo_every: int = 1) -> list[TimedFrame]:
 
 
 def test_a_sequence_goes_back_and_forth_in_time_that_goes_on() -> None:
-    from tracking_memory import back_and_forth
+    from tracking import back_and_forth
 
     shown = list(back_and_forth(recording(5), 17))
     assert [timed.frame.name for timed in shown] == list("01234321012343210")
@@ -55,7 +54,7 @@ def test_a_sequence_goes_back_and_forth_in_time_that_goes_on() -> None:
 
 
 def test_covered_frames_are_the_blind_ones_and_sight_returns_after_them() -> None:
-    from tracking_runs import FIRST, covered, without_depth_frames
+    from tracking import FIRST, covered, without_depth_frames
 
     run = covered(recording(90, photo_every=3))
     dark = [float(timed.frame.rgb.max()) < 0.1 for timed in run.frames]
@@ -70,7 +69,7 @@ def test_covered_frames_are_the_blind_ones_and_sight_returns_after_them() -> Non
 
 
 def test_depth_that_stops_takes_the_frames_of_depth_alone_with_it() -> None:
-    from tracking_runs import depth_stops
+    from tracking import depth_stops
 
     shown = depth_stops(recording(12, photo_every=3)).frames
     assert [timed.frame.name for timed in shown] == ["0", "1", "2", "3", "4", "5", "6", "9"]
@@ -78,7 +77,7 @@ def test_depth_that_stops_takes_the_frames_of_depth_alone_with_it() -> None:
 
 
 def test_carrying_leaves_no_trace_in_the_times() -> None:
-    from tracking_runs import FIRST, carried
+    from tracking import FIRST, carried
 
     run = carried(recording(200))
     assert run.returns == FIRST
