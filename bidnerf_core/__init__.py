@@ -20,6 +20,7 @@ except Exception:
     os.environ.setdefault("TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 if TYPE_CHECKING:
+    from bidnerf_core.backend import RecipeBackend as RecipeBackend
     from bidnerf_core.backend import load_backend as load_backend
     from bidnerf_core.camera.intrinsics import Intrinsics as Intrinsics
     from bidnerf_core.datasets import Dataset as Dataset
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from bidnerf_core.fields.observations import Observations as Observations
     from bidnerf_core.fields.rendering import render as render
     from bidnerf_core.fields.rendering import render_image as render_image
+    from bidnerf_core.fields.residuals import DEPTH_RESIDUALS as DEPTH_RESIDUALS
+    from bidnerf_core.fields.sampling import Stratified as Stratified
     from bidnerf_core.frames.frame import Frame as Frame
     from bidnerf_core.frames.frame import View as View
     from bidnerf_core.geometry.se3 import SE3 as SE3
@@ -77,6 +80,10 @@ if TYPE_CHECKING:
     from bidnerf_core.results.pose_files import write_poses as write_poses
     from bidnerf_core.results.tracked_path import TrackedPath as TrackedPath
     from bidnerf_core.results.tracked_path import track as track
+    from bidnerf_core.scenes.closed_form_data import closed_form_data as closed_form_data
+    from bidnerf_core.scenes.closed_form_data import closed_form_map as closed_form_map
+    from bidnerf_core.training import Supervision as Supervision
+    from bidnerf_core.training import SupervisionConfig as SupervisionConfig
 
 HOMES = {
     "AutoConfig": "localization",
@@ -84,6 +91,7 @@ HOMES = {
     "Cancelled": "errors",
     "Comparison": "evaluation.comparison",
     "Corrector": "localization.corrector",
+    "DEPTH_RESIDUALS": "fields.residuals",
     "Dataset": "datasets",
     "FieldValues": "fields.contract",
     "Frame": "frames.frame",
@@ -105,28 +113,34 @@ HOMES = {
     "RaySampler": "fields.contract",
     "RaySamples": "fields.contract",
     "Rays": "fields.contract",
-    "ResultTable": "evaluation.results",
+    "RecipeBackend": "backend",
     "RenderingScores": "maps.rendering",
+    "ResultTable": "evaluation.results",
     "SE3": "geometry.se3",
     "SceneBounds": "fields.contract",
+    "Stratified": "fields.sampling",
+    "Supervision": "training",
+    "SupervisionConfig": "training",
     "TrackedPath": "results.tracked_path",
     "Tracker": "localization",
     "TrackerConfig": "localization",
     "View": "frames.frame",
+    "closed_form_data": "scenes.closed_form_data",
+    "closed_form_map": "scenes.closed_form_data",
     "compare": "evaluation.evaluate",
     "evaluate": "evaluation.evaluate",
     "levels": "fields.contract",
     "list_plugins": "registry",
     "load_backend": "backend",
-    "load_plugin": "registry",
-    "register": "registry",
     "load_map": "maps.map",
+    "load_plugin": "registry",
     "open_dataset": "datasets",
     "open_sequence": "datasets",
     "overlay": "results.overlays",
     "perturb": "evaluation.protocols",
     "pose_error": "results.errors",
     "read_pose": "results.pose_files",
+    "register": "registry",
     "render": "fields.rendering",
     "render_image": "fields.rendering",
     "rendering_scores": "maps.rendering",

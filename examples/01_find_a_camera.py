@@ -4,15 +4,8 @@ python examples/01_find_a_camera.py [--backend hashgrid] [--steps 600]
 """
 
 import argparse
-import dataclasses
 
-from bidnerf_core import Intrinsics, Localizer, Map, load_backend
-from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.localization import settings_of
-from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.results.errors import pose_error
-from bidnerf_core.scenes.demo import demo_object, orbit, views
-from bidnerf_core.training import Silent
+import bidnerf_core as bn
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--backend", default="hashgrid")
@@ -20,23 +13,16 @@ parser.add_argument("--steps", type=int, default=600)
 parser.add_argument("--descent", type=int, default=120, help="steps of the localizer")
 given = parser.parse_args()
 
-# A scene in closed form stands in for your own images: open_dataset(...).views("train") gives the same kind of list.
-scene, camera = demo_object(), Intrinsics(fx=90.0, fy=90.0, cx=32.0, cy=32.0, width=64, height=64)
-seen = views(scene, camera, orbit(radius=3.5, count=40))
-(unseen,) = views(scene, camera, orbit(radius=3.5, count=1, elevation=(20, 40), seed=1))
+# A scene in closed form stands in for your own images, which open_dataset("FOLDER") opens.
+data = bn.closed_form_data("demo:object")
+scene = bn.train(
+    data, given.backend, config={"steps": given.steps}, bake=False
+)  # load_map loads a stored one
 
-backend = load_backend(given.backend)
-config = dataclasses.replace(backend.config_type(), steps=given.steps)
-field = backend.build(config, scene.bounds)
-backend.train(field, seen, config, Silent())
-field.requires_grad_(False)
-
-# load_map(folder) gives the same for a map that 'bidnerf train' stored.
-map = Map(MapInfo(given.backend, {}, scene.bounds, given.steps, complete=True), field)
-localizer = Localizer(map, "bid", settings_of("bid", {"rays": 512, "max_steps": given.descent}))
-start = perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
+(unseen,) = data.views("test", ["0003"])
+start = bn.perturb(unseen.T_ref_camera, translation=0.4, rotation_deg=10, seed=0)
+localizer = bn.Localizer(scene, "bid", bn.settings_of("bid", {"rays": 512, "max_steps": given.descent}))
 found = localizer(unseen.frame, start)
 
 for what, pose in (("start", start), ("found", found.T_world_camera)):
-    error = pose_error(pose, unseen.T_ref_camera)
-    print(f"{what}: off by {float(error.translation):.3f} m and {float(error.rotation_deg):.2f} degrees")
+    print(f"{what}: off by {bn.pose_error(pose, unseen.T_ref_camera)}")

@@ -44,7 +44,7 @@ from bidnerf_core.maps.same_scene import check_same_scene
 from bidnerf_core.maps.summary import MapSummary, summarized
 from bidnerf_core.maps.views import Images, read_views
 from bidnerf_core.maps.weights import checked_weights
-from bidnerf_core.progress import Cancel, ProgressCallback
+from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
 from bidnerf_core.training import TrainingState
 
 log = logging.getLogger("bidnerf")
@@ -170,6 +170,7 @@ class Map:
 
         ``tracked`` holds the views' keypoints if they were tracked already.
         """
+        check_cancelled(cancel, "baking")
         surface = bake_surface(self.info, self.field, views, config, self._name, progress, cancel)
         scene = self._with_surface(surface)
         if not views and not rendered_landmarks and (kept := self._photo_landmarks()) is not None:
@@ -177,6 +178,7 @@ class Map:
                 f"{self._name}: the landmarks of its photos are kept; --rendered-landmarks replaces them"
             )
             return replace(scene, landmarks=kept)
+        check_cancelled(cancel, "baking")
         found = bake_landmarks(self.info, self.field, views, self._name, tracked, progress, cancel)
         return scene._with_landmarks(found)
 

@@ -24,6 +24,15 @@ class PoseError:
     def __getitem__(self, index: Any) -> PoseError:
         return PoseError(self.translation[index], self.rotation_deg[index])
 
+    def __str__(self) -> str:
+        shown = (
+            (float(v.median()), "median ") if v.ndim else (float(v), "")
+            for v in (self.translation, self.rotation_deg)
+        )
+        return " and ".join(
+            f"{note}{v:.3g} {unit}" for (v, note), unit in zip(shown, ("m", "deg"), strict=True)
+        )
+
     def plain(self) -> dict[str, float] | None:
         """Return the error of one pose as JSON values, or None where it is not finite."""
         values = {"translation": float(self.translation), "rotation_deg": float(self.rotation_deg)}

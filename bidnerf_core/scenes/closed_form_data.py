@@ -2,7 +2,7 @@
 
 ``demo:blobs`` is both a dataset and a map: coloured clouds whose field is known exactly, with images rendered from it.
 ``demo:object`` and ``demo:room`` are the scenes of ``bidnerf demo`` and ``bidnerf_core.scenes`` with exact depth, as datasets
-for maps that were trained on them.
+to train maps on and to localize in them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from bidnerf_core.scenes.trajectories import look_around, orbit
 
 PREFIX = "demo:"
 DEMO_CAMERA = Intrinsics(175.0, 175.0, 64.0, 64.0, 128, 128)
-FRAMES = 24
+FRAMES, TRAINING_FRAMES = 24, 40
 BLOBS = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.1, 12.0, (1.0, 1.0, 1.0))
 FRAME_NAME = re.compile(r"(?P<place>\d{4})(?:@(?P<angle>-?\d+(?:\.\d+)?))?")
 """A frame's name: its number and, in a sequence, the angle in degrees by which it is turned."""
@@ -43,13 +43,17 @@ Render = Callable[[SE3, str], Frame]
 
 @dataclass(frozen=True, eq=False)
 class ClosedFormData:
-    """A ``Dataset`` with the single split "test". Frame "0003@15" is frame 0003 turned by 15 degrees about the middle."""
+    """A ``Dataset`` with split "test", and split "train" where ``training`` has poses.
+
+    Frame "0003@15" is frame 0003 turned by 15 degrees about the middle.
+    """
 
     name: str
     poses: tuple[SE3, ...]  # T_world_camera
     render: Render
     background: tuple[float, float, float]
     middle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres, world
+    training: tuple[SE3, ...] = ()  # T_world_camera
 
     @property
     def path(self) -> Path:
@@ -59,13 +63,16 @@ class ClosedFormData:
     @property
     def splits(self) -> tuple[str, ...]:
         """The names of all splits."""
-        return ("test",)
+        return ("train", "test") if self.training else ("test",)
 
     def frame_names(self, split: str) -> list[str]:
         """Return the names of the frames of ``split``."""
-        if split != "test":
-            raise InputError(f"{self.path}: no split {split!r}, expected test")
-        return [f"{place:04d}" for place in range(len(self.poses))]
+        return [f"{place:04d}" for place in range(len(self._poses(split)))]
+
+    def _poses(self, split: str) -> tuple[SE3, ...]:
+        if split not in self.splits:
+            raise InputError(f"{self.path}: no split {split!r}, expected {' or '.join(self.splits)}")
+        return self.poses if split == "test" else self.training
 
     def views(
         self, split: str, names: Sequence[str] | None = None, progress: ReadingProgress | None = None
@@ -73,7 +80,7 @@ class ClosedFormData:
         """Render the frames with these names, by default all of the split."""
         asked, views = self.frame_names(split) if names is None else names, []
         for done, name in enumerate(asked, start=1):
-            pose = self._pose(name)
+            pose = self._pose(name, split)
             views.append(View(self.render(pose, name), pose))
             if progress is not None:
                 progress(done, len(asked))
@@ -83,12 +90,12 @@ class ClosedFormData:
         """Return the names of ``count`` frames, ``angle`` degrees apart, that end with frame ``name``."""
         return (*(f"{name}@{k * angle:g}" for k in range(count - 1, 0, -1)), name)
 
-    def _pose(self, name: str) -> SE3:
-        found = FRAME_NAME.fullmatch(name)
-        if found is None or int(found["place"]) >= len(self.poses):
-            last = len(self.poses) - 1
+    def _pose(self, name: str, split: str) -> SE3:
+        found, poses = FRAME_NAME.fullmatch(name), self._poses(split)
+        if found is None or int(found["place"]) >= len(poses):
+            last = len(poses) - 1
             raise InputError(f"{self.path}: no frame {name!r}, expected 0000 to {last:04d} or one as 0000@15")
-        pose, up = self.poses[int(found["place"])], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        pose, up = poses[int(found["place"])], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         return turned_about(
             pose, torch.tensor(self.middle, dtype=torch.float64), up, float(found["angle"] or 0)
         )
@@ -123,8 +130,13 @@ def _found(name: str, known: dict[str, Callable[[], Scene]], what: str) -> Calla
 def _object() -> ClosedFormData:
     scene = demo_object()
     poses = tuple(orbit(3.5, FRAMES, elevation=(15.0, 50.0), seed=1))
+    training = tuple(orbit(3.5, TRAINING_FRAMES))
     return ClosedFormData(
-        "object", poses, lambda T, name: scene.render(DEMO_CAMERA, T, name), scene.bounds.background
+        "object",
+        poses,
+        lambda T, name: scene.render(DEMO_CAMERA, T, name),
+        scene.bounds.background,
+        training=training,
     )
 
 
@@ -132,8 +144,14 @@ def _room() -> ClosedFormData:
     scene = demo_room()
     middle = (0.0, 0.0, 1.25)
     poses = tuple(look_around(scene.bounds, FRAMES, seed=1))
+    training = tuple(look_around(scene.bounds, TRAINING_FRAMES))
     return ClosedFormData(
-        "room", poses, lambda T, name: scene.render(DEMO_CAMERA, T, name), scene.bounds.background, middle
+        "room",
+        poses,
+        lambda T, name: scene.render(DEMO_CAMERA, T, name),
+        scene.bounds.background,
+        middle,
+        training,
     )
 
 
