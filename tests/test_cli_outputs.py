@@ -318,7 +318,7 @@ def test_commands_refuse_outputs_that_replace_what_they_read(
     bidnerf: Run, files: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     if "--video" in words:
-        pytest.importorskip("imageio_ffmpeg")
+        pytest.importorskip("av")
     (files / "overlay-photo.png").write_text("kept")
     monkeypatch.chdir(files)
     before = sorted(str(file) for file in files.rglob("*"))

@@ -2,24 +2,59 @@
 
 from __future__ import annotations
 
-import subprocess
+import struct
 import sys
+from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 
-import imageio_ffmpeg
+import av
 import numpy as np
 import pytest
+import torch
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import FrameSequence, TimedFrame, open_sequence
 from bidnerf_core.errors import InputError
 
 WIDTH, HEIGHT, COUNT, RATE = 64, 48, 20, 25
-FFMPEG = imageio_ffmpeg.get_ffmpeg_exe()
+TURNS = {
+    90: (0, -1, 1, 0),
+    180: (-1, 0, 0, -1),
+    270: (0, 1, -1, 0),
+}
+"""The upper left of the display matrix of videos that are shown turned counterclockwise, by degrees."""
 
 
-def ffmpeg(*arguments: str) -> None:
-    subprocess.run([FFMPEG, "-loglevel", "error", "-y", *arguments], check=True)
+def encode(path: Path, times: Sequence[int]) -> None:
+    """Write a video of frames that become lighter by 12 each, with noise on the right that does not compress.
+
+    Frame n is shown at ``times[n]`` (in units of 1 / ``RATE`` seconds).
+    """
+    generator = np.random.default_rng(0)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=RATE, options={"crf": "15"})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for number, time in enumerate(times):
+            image = np.full((HEIGHT, WIDTH, 3), 12 * number, np.uint8)
+            image[:, WIDTH // 2 :] = generator.integers(0, 255, (HEIGHT, WIDTH // 2, 3))
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture.pts, picture.time_base = time, Fraction(1, RATE)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+
+
+def copied(path: Path, to: Path, earlier: int = 0, **options: str) -> Path:
+    """Copy the packets of a video into another file, shown ``earlier`` (in units of 1 / ``RATE`` seconds)."""
+    with av.open(str(path)) as source, av.open(str(to), "w", options=options) as target:
+        stream = source.streams.video[0]
+        copy = target.add_stream_from_template(stream)
+        for packet in source.demux(stream):
+            if packet.dts is not None and packet.pts is not None:
+                shift = round(earlier / RATE / packet.time_base)
+                packet.pts, packet.dts, packet.stream = packet.pts - shift, packet.dts - shift, copy
+                target.mux(packet)
+    return to
 
 
 def grey(frame: TimedFrame) -> float:
@@ -28,16 +63,9 @@ def grey(frame: TimedFrame) -> float:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twenty frames that become lighter by 12 each, with noise on the right that does not compress."""
+    """Twenty frames at a constant rate."""
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
-    generator = np.random.default_rng(0)
-    writer = imageio_ffmpeg.write_frames(str(path), (WIDTH, HEIGHT), fps=RATE)
-    writer.send(None)
-    for number in range(COUNT):
-        image = np.full((HEIGHT, WIDTH, 3), 12 * number, np.uint8)
-        image[:, WIDTH // 2 :] = generator.integers(0, 255, (HEIGHT, WIDTH // 2, 3))
-        writer.send(image)
-    writer.close()
+    encode(path, range(COUNT))
     return path
 
 
@@ -71,29 +99,36 @@ def test_an_iteration_may_end_early(clip: Path) -> None:
         break
 
 
-def test_times_of_a_varying_rate(clip: Path, tmp_path: Path) -> None:
-    """Every third frame is dropped and the others keep their times, which count from the first of them."""
-    varying = tmp_path / "varying.mkv"
-    ffmpeg("-i", str(clip), "-vf", "select=mod(n\\,3)", "-fps_mode", "passthrough", str(varying))
-    times = [timed.time for timed in open_sequence(varying, focal=50)]
-    assert times == pytest.approx([(n - 1) / RATE for n in range(COUNT) if n % 3], abs=0.0011)
+def test_times_of_a_varying_rate(tmp_path: Path) -> None:
+    """Times are those of the file, counted from the first of them."""
+    varying, times = tmp_path / "varying.mkv", [n for n in range(COUNT) if n % 3]
+    encode(varying, times)
+    found = [timed.time for timed in open_sequence(varying, focal=50)]
+    assert found == pytest.approx([(n - 1) / RATE for n in times], abs=0.0011)
 
 
 def test_frames_that_were_cut_off_are_not_shown(clip: Path, tmp_path: Path) -> None:
-    trimmed = tmp_path / "trimmed.mp4"
-    ffmpeg("-ss", "0.4", "-i", str(clip), "-c", "copy", str(trimmed))
+    trimmed = copied(clip, tmp_path / "trimmed.mp4", earlier=10, avoid_negative_ts="disabled")
     sequence = open_sequence(trimmed, focal=50)
     frames = list(sequence)
     assert len(frames) == len(sequence) == COUNT - 10
+    assert [timed.time for timed in frames] == pytest.approx([n / RATE for n in range(COUNT - 10)])
     assert grey(frames[0]) == pytest.approx(120, abs=4)
 
 
-def test_a_rotated_video_is_upright(clip: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("degrees", TURNS)
+def test_a_rotated_video_is_upright(clip: Path, tmp_path: Path, degrees: int) -> None:
+    """The matrix by which a file says how it is shown is that of its track header."""
+    content = bytearray(clip.read_bytes())
+    matrix = content.index(b"tkhd") + 44
+    for place, value in zip((0, 4, 12, 16), TURNS[degrees], strict=True):
+        content[matrix + place : matrix + place + 4] = struct.pack(">i", value << 16)
     rotated = tmp_path / "rotated.mp4"
-    ffmpeg("-display_rotation", "90", "-i", str(clip), "-c", "copy", str(rotated))
+    rotated.write_bytes(content)
     frame = next(iter(open_sequence(rotated, hfov=60))).frame
-    assert frame.rgb.shape == (WIDTH, HEIGHT, 3)
-    assert (frame.intrinsics.width, frame.intrinsics.height) == (HEIGHT, WIDTH)
+    stored = next(iter(open_sequence(clip, hfov=60))).frame
+    assert torch.equal(frame.rgb, stored.rgb.rot90(degrees // 90))
+    assert (frame.intrinsics.width, frame.intrinsics.height) == frame.rgb.shape[1::-1]
 
 
 def test_a_camera_of_another_size_is_scaled(clip: Path) -> None:
@@ -112,8 +147,7 @@ def test_no_camera_is_an_error(clip: Path) -> None:
 
 def test_a_video_that_breaks_off(clip: Path, tmp_path: Path) -> None:
     """The index is at the beginning, so the file opens; the frames before the break are given."""
-    whole = tmp_path / "whole.mp4"
-    ffmpeg("-i", str(clip), "-c", "copy", "-movflags", "+faststart", str(whole))
+    whole = copied(clip, tmp_path / "whole.mp4", movflags="+faststart")
     broken = tmp_path / "broken.mp4"
     content = whole.read_bytes()
     broken.write_bytes(content[: len(content) // 2])
@@ -136,6 +170,6 @@ def test_files_that_are_no_video(content: bytes, tmp_path: Path) -> None:
 
 
 def test_a_missing_extra_is_named(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"needs the extra 'video' \(pip install 'bidnerf\[video\]'\)"):
         open_sequence(clip, focal=50)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable
+from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +27,8 @@ RATES = 1.0, 60.0
 """Minimum and maximum number of frames per second."""
 USUAL_RATE = 30.0
 """Frames per second of sequences without time stamps."""
+QUALITY = "20"
+"""Constant rate factor of the encoder, which is nearly without visible loss."""
 WHITE_DEPTH = 5.0
 """Depth (metres) that is drawn white, where only depth was recorded."""
 
@@ -32,7 +36,7 @@ WHITE_DEPTH = 5.0
 def check_video(file: Path, inputs: Iterable[Path | str | None]) -> None:
     """Raise ``InputError``, before any work is done, where a video cannot be written."""
     try:
-        import imageio_ffmpeg  # noqa: F401
+        import av  # noqa: F401
     except ImportError as error:
         raise InputError(
             f"{file}: writing a video needs the extra 'video' (pip install 'bidnerf[video]')"
@@ -49,7 +53,8 @@ class TrackingVideo:
     def __init__(self, file: Path, scene: SceneMap) -> None:
         self._file, self._scene = file, scene
         self._partial = file.with_name(f".{file.stem}.partial{file.suffix}")
-        self._writer: Generator[None, bytes | None, None] | None = None
+        self._file_out: Any = None
+        self._stream: Any = None
         self._first: tuple[UInt8[np.ndarray, "h w 3"], float | None] | None = None
 
     def __enter__(self) -> TrackingVideo:
@@ -59,10 +64,11 @@ class TrackingVideo:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Finish the file, which gets its final name only then."""
-        if self._writer is None and self._first is not None:
-            self._writer = self._opened(self._first[0], USUAL_RATE)
-        if self._writer is not None:
-            self._writer.close()
+        if self._stream is None and self._first is not None:
+            self._open(self._first[0], USUAL_RATE)
+        if self._stream is not None:
+            self._file_out.mux(self._stream.encode())
+            self._file_out.close()
             self._partial.replace(self._file)
 
     def add(self, frame: Frame, answer: Answer) -> None:
@@ -72,25 +78,32 @@ class TrackingVideo:
             self._first = picture, time
             return
         first, began = self._first
-        if self._writer is None:
+        if self._stream is None:
             apart = 0.0 if time is None or began is None else abs(time - began)
             rate = min(RATES[1], max(RATES[0], 1 / apart)) if apart else USUAL_RATE
-            self._writer = self._opened(first, rate)
+            self._open(first, rate)
         if picture.shape != first.shape:
             size = (first.shape[1], first.shape[0])
             picture = np.asarray(Image.fromarray(picture).resize(size))
-        self._writer.send(picture.tobytes())
+        self._write(picture)
 
-    def _opened(self, first: UInt8[np.ndarray, "h w 3"], rate: float) -> Generator[None, bytes | None, None]:
-        from imageio_ffmpeg import write_frames
+    def _open(self, first: UInt8[np.ndarray, "h w 3"], rate: float) -> None:
+        """Open the file for pictures of the size of the first one, which is written."""
+        import av
 
-        size = (first.shape[1], first.shape[0])
-        writer: Generator[None, bytes | None, None] = write_frames(
-            str(self._partial), size, fps=rate, macro_block_size=2, quality=7
+        codec = "libvpx-vp9" if self._file.suffix.lower() == ".webm" else "libx264"
+        self._file_out = av.open(str(self._partial), "w")
+        self._stream = self._file_out.add_stream(
+            codec, rate=Fraction(rate).limit_denominator(1000), options={"crf": QUALITY}
         )
-        writer.send(None)
-        writer.send(first.tobytes())
-        return writer
+        self._stream.height, self._stream.width = first.shape[:2]
+        self._stream.pix_fmt = "yuv420p"
+        self._write(first)
+
+    def _write(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+        from av import VideoFrame
+
+        self._file_out.mux(self._stream.encode(VideoFrame.from_ndarray(picture, format="rgb24")))
 
     def _drawn(self, frame: Frame, found: Localization) -> UInt8[np.ndarray, "h w 3"]:
         painter = Painter(self._scene, found.frame_as_taken(frame))
