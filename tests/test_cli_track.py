@@ -199,7 +199,7 @@ def test_the_path_is_drawn(bidnerf: Run, data: Path, tmp_path: Path) -> None:
         (["--out", "nowhere/path.txt"], 1, "no folder nowhere"),
         ([], 2, "no --out"),
         (["--out", "path.txt", "--every", "0"], 2, "--every is 0"),
-        (["--out", "path.txt", "--window", "0"], 2, "window"),
+        (["--out", "path.txt", "--points", "0"], 2, "points"),
     ],
 )
 def test_wrong_options_are_refused_before_any_work(

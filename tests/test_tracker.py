@@ -195,10 +195,10 @@ def test_a_changed_image_size_is_no_obstacle() -> None:
 
 
 def test_a_saved_state_continues_bit_for_bit(tmp_path: Path) -> None:
-    tracker = Tracker(localizer(), TrackerConfig(window=3))
+    tracker = Tracker(localizer())
     tracked(flight()[:6], tracker)
     tracker.save(tmp_path / "state")
-    other = Tracker(localizer(), TrackerConfig(window=3))
+    other = Tracker(localizer())
     other.restore(tmp_path / "state")
     one, two = tracked(flight()[6:9], tracker), tracked(flight()[6:9], other)
     for a, b in zip(one, two, strict=True):
@@ -282,19 +282,6 @@ def test_a_map_that_cannot_be_searched_asks_for_a_start() -> None:
         Tracker(Localizer(bare))(flight()[0][1], 0.0)
 
 
-@pytest.mark.parametrize("window", [2, 4])
-def test_a_window_reduces_the_error_of_noisy_depth(window: int) -> None:
-    """Frames whose depth is noisy are aligned together."""
-    generator = torch.Generator().manual_seed(3)
-    frames = []
-    for t, frame, T in flight()[:8]:
-        assert frame.depth is not None
-        noise = 1 + 0.05 * torch.randn(frame.depth.shape, generator=generator)
-        frames.append((t, replace(frame, depth=frame.depth * noise), T))
-    answers = tracked(frames, Tracker(localizer(), TrackerConfig(window=window)))
-    assert_right(answers, frames)
-
-
 def test_the_estimate_of_an_approximate_focal_length_is_kept() -> None:
     """It stands in the state, and corrects later frames whose focal length is approximate; calibrated ones stay as they are."""
     frames = flight()[:4]
@@ -353,13 +340,12 @@ def test_corrections_of_intrinsics_follow_one_another(tmp_path: Path) -> None:
 
 def test_the_state_does_not_grow(tmp_path: Path) -> None:
     """Neither in memory nor as a file, however long the sequence."""
-    tracker, sizes = Tracker(localizer(), TrackerConfig(window=3)), []
+    tracker, sizes = Tracker(localizer()), []
     to_and_fro = [flight()[n] for n in (*range(8), *range(6, 0, -1))]
     for lap in range(3):
         for place, (_, frame, _) in enumerate(to_and_fro):
             tracker(frame, INTERVAL * (lap * len(to_and_fro) + place))
         tracker.save(tmp_path / "state")
         sizes.append((tmp_path / "state").stat().st_size)
-        assert len(tracker._state.window) <= 2
         assert len(tracker._state.points) <= tracker.config.points
     assert max(sizes) < 1.25 * min(sizes)

@@ -249,7 +249,7 @@ class Tracker:
         camera = state.camera
         if found.intrinsics is not None:
             frame, camera = after_search(frame, found.intrinsics, camera)
-        state = replace(state, points=FollowedPoints.none(), window=(), motion=motion, camera=camera)
+        state = replace(state, points=FollowedPoints.none(), motion=motion, camera=camera)
         measured = self._measured(frame, image, state, state.points, motion)
         if measured is not None and measured.verdict.accepted:
             state = measured.state
@@ -271,7 +271,6 @@ class Tracker:
             state,
             motion=motion,
             points=corners,
-            window=(),
             lost=state.lost + 1,
             searchable=state.searchable + (image is not None and is_searchable(frame)),
         )

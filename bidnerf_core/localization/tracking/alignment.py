@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -39,14 +38,6 @@ ALIGNED_STEP = 1e-4
 """Length of a step (metres and radians) below which an alignment ends."""
 
 
-@dataclass(frozen=True, eq=False)
-class CloudInCamera:
-    """A frame's measured points, and the pose that was found for this frame by itself."""
-
-    cloud: PointCloud
-    T_world_camera: SE3
-
-
 def measured_cloud(
     frame: Frame,
     count: int,
@@ -73,30 +64,17 @@ def measured_cloud(
     return cloud if scale == 1 else replace(cloud, points=scale * cloud.points)
 
 
-def joined_clouds(now: CloudInCamera, before: Sequence[CloudInCamera]) -> PointCloud:
-    """Return the points of a window of frames in the camera of the last, placed by the frames' relative poses."""
-    clouds = [now.cloud]
-    for past in before:
-        T_now_past = (now.T_world_camera.inverse() @ past.T_world_camera).to(torch.float32)
-        cloud = past.cloud
-        clouds.append(
-            replace(cloud, points=T_now_past.apply(cloud.points), origins=T_now_past.apply(cloud.origins))
-        )
-    parts = ("points", "rgb", "origins", "coloured")
-    return PointCloud(*(torch.cat([getattr(cloud, part) for cloud in clouds]) for part in parts))
-
-
 def fused_with_surface(
-    pose: PoseEstimate, surface: SurfaceMap, cloud: PointCloud, steps: int, views: int = 1
+    pose: PoseEstimate, surface: SurfaceMap, cloud: PointCloud, steps: int
 ) -> PoseEstimate:
-    """Fuse a pose with measured points on the surface, which count as ``DEPTH_MEASUREMENTS`` per view.
+    """Fuse a pose with measured points on the surface, which count as ``DEPTH_MEASUREMENTS``.
 
     A share ``SURFACE_BIAS`` of the variance that the points contribute is bias, as in ``aligned``.
     """
     about = cloud.pivot
     cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
     here, variance = cost.with_variance(pose.T_world_camera[None])
-    weight = DEPTH_MEASUREMENTS * views / max(float(variance[0]), LEAST_VARIANCE)
+    weight = DEPTH_MEASUREMENTS / max(float(variance[0]), LEAST_VARIANCE)
     at_camera = about.update_at_camera(pose.T_world_camera)
     prior = at_camera.T @ torch.linalg.inv(pose.covariance) @ at_camera
     T, moved = pose.T_world_camera, torch.zeros(6, dtype=torch.float64)
@@ -139,7 +117,6 @@ def aligned(
     predicted: SE3,
     covariance: Float[Tensor, "6 6"],
     spread: float,
-    views: int = 1,
 ) -> Alignment:
     """Align measured points with the surface from a predicted pose; ``spread`` (metres) is how far off they may be.
 
@@ -149,12 +126,12 @@ def aligned(
     prior, T = GaussianPrior(predicted, covariance, about), predicted
     for distance in (spread, finest) if spread > 1.5 * finest else (finest,):
         cost = SurfaceCost(surface, cloud, PointScales(distance))
-        term = surface_term(cost, T, views)
+        term = surface_term(cost, T, 1)
         T = (
             descend(Sum((prior, term.scaled)), T[None], ALIGNMENT_STEPS, about.moved, stop=ALIGNED_STEP)
             .T[0]
             .normalized()
         )
     judge = SurfaceCost(surface, cloud, PointScales(JUDGED * surface.extent))
-    found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, views, EXACT)
+    found = surface_covariance(SurfaceCost(surface, cloud, PointScales(finest)), T, 1, EXACT)
     return Alignment(T, found, surface_diagnostics(judge, T, torch.inf))

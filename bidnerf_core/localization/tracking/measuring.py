@@ -25,10 +25,8 @@ from bidnerf_core.localization.search.landmark_query import pixel_threshold
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.tracking.alignment import (
     SURFACE_BIAS,
-    CloudInCamera,
     aligned,
     fused_with_surface,
-    joined_clouds,
     measured_cloud,
 )
 from bidnerf_core.localization.tracking.detection import (
@@ -71,7 +69,7 @@ class Measurement:
     pose: PoseEstimate
     verdict: Verdict
     loss: float
-    state: TrackerState  # with the points and the window of this frame
+    state: TrackerState  # with the points of this frame
     motion: Motion | None = None  # fused with the prediction, where the verdict needed that already
 
 
@@ -211,13 +209,10 @@ class ByLandmarks:
             verdict = replace(verdict, reason=f"{verdict.reason}, without depth: {scale.objection}")
             return Measurement(pose, verdict, found.noise, state)
         drawn = Generator().manual_seed(state.frames)
-        points = measured_cloud(frame, self.config.depth_points, scale.estimate, drawn, found.motion)
-        here = CloudInCamera(points, found.T_world_camera)
-        cloud = joined_clouds(here, state.window)
-        pose = fused_with_surface(pose, surface, cloud, self.config.depth_steps, 1 + len(state.window))
-        kept_clouds = (*state.window, here)[-(self.config.window - 1) :] if self.config.window > 1 else ()
+        cloud = measured_cloud(frame, self.config.depth_points, scale.estimate, drawn, found.motion)
+        pose = fused_with_surface(pose, surface, cloud, self.config.depth_steps)
         verdict = replace(verdict, reason=f"{verdict.reason}, fused with depth")
-        return Measurement(pose, verdict, found.noise, replace(state, window=kept_clouds))
+        return Measurement(pose, verdict, found.noise, state)
 
     def _estimate(self, found: LandmarkPose) -> PoseEstimate:
         """Split a pose's covariance into noise and bias: errors that an image's landmarks share recur in the next image."""
@@ -242,20 +237,13 @@ def by_surface(
 ) -> Measurement:
     """Return the pose by measured depth on the surface alone."""
     cloud = measured_cloud(frame, config.depth_points, 1.0, Generator().manual_seed(state.frames))
-    here = CloudInCamera(cloud, predicted.T_world_camera)
-    views = 1 + len(state.window)
     translation, rotation = predicted.noise[:6, :6].diagonal().split(3)
     off = math.sqrt(float(translation.mean() + rotation.mean() * predicted.reach**2))
-    found = aligned(
-        surface, joined_clouds(here, state.window), predicted.T_world_camera, predicted.covariance,
-        2 * off, views,
-    )  # fmt: skip
-    here = replace(here, T_world_camera=found.T_world_camera)
-    window = (*state.window, here)[-(config.window - 1) :] if config.window > 1 else ()
+    found = aligned(surface, cloud, predicted.T_world_camera, predicted.covariance, 2 * off)
     covariance = found.covariance
     pose = PoseEstimate(found.T_world_camera, (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance)
     loss = 1 - found.diagnostics.colour_inliers
-    return Measurement(pose, found.diagnostics.verdict(), loss, replace(state, window=window))
+    return Measurement(pose, found.diagnostics.verdict(), loss, state)
 
 
 def by_shape(

@@ -15,7 +15,6 @@ class TrackerConfig(Settings):
     # largest number of landmarks that are followed from image to image
     points: Annotated[int, Range(20, 10**4)] = 250
     depth_points: Annotated[int, Range(50, 10**6)] = 400  # largest number of measured pixels that are aligned
-    window: Annotated[int, Range(1, 64)] = 1  # number of frames whose measured depth is aligned together
     # number of keypoints of an image in which landmarks are sought
     keypoints: Annotated[int, Range(50, 10**5), EXPERT] = 600
     # share of the followed landmarks that is left when new ones are sought

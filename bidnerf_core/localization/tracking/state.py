@@ -16,17 +16,14 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import parse_json
 from bidnerf_core.io.tensors import read_tensors_and_metadata
-from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.search.miscalibration import Miscalibration
-from bidnerf_core.localization.tracking.alignment import CloudInCamera
 from bidnerf_core.localization.tracking.clock import Clock
 from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
 from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 4
-CLOUD = ("points", "rgb", "origins", "coloured")
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +45,6 @@ class TrackerState:
     calibrated: int | None = None  # the frame (of ``frames``) in which the intrinsics were last checked
     camera: CorrectedCamera | None = None  # found by searches; None while the given intrinsics are taken
     noise: float = 1.0  # pixels: of the points in the last image
-    window: tuple[CloudInCamera, ...] = ()
 
     @property
     def tracking(self) -> bool:
@@ -61,7 +57,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
     numbers = {
         "now": state.clock.now, "interval": state.clock.interval, "frames": state.frames, "lost": state.lost,
         "sought": state.sought, "age": state.age, "usual_distance": _written(state.usual_distance),
-        "noise": state.noise, "window": len(state.window),
+        "noise": state.noise,
         "reach": None if state.motion is None else state.motion.reach,
         "agility": None if state.motion is None else state.motion.agility, "searchable": state.searchable,
         "waited": state.waited,
@@ -76,9 +72,6 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
     if state.motion is not None:
         tensors |= _pose_tensors("motion", state.motion.T_world_camera)
         tensors |= {f"motion.{name}": getattr(state.motion, name) for name in ("velocity", "noise", "bias")}
-    for number, past in enumerate(state.window):
-        tensors |= _pose_tensors(f"window.{number}", past.T_world_camera)
-        tensors |= {f"window.{number}.{name}": getattr(past.cloud, name) for name in CLOUD}
     content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": numbers}
     metadata = {"bidnerf": json.dumps(content, allow_nan=False)}
     write_file(
@@ -116,13 +109,6 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
     if numbers["reach"] is not None:
         velocity, noise, bias = (tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias"))
         motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers["reach"], numbers["agility"])
-    window = tuple(
-        CloudInCamera(
-            PointCloud(*(tensors[f"window.{number}.{name}"] for name in CLOUD)),
-            _pose(f"window.{number}", tensors),
-        )
-        for number in range(numbers["window"])
-    )
     points = FollowedPoints(*(tensors[f"points.{f.name}"] for f in fields(FollowedPoints)))
     usual = numbers["usual_distance"]
     miscalibration = Miscalibration(*(tensors[f"miscalibration.{f.name}"] for f in fields(Miscalibration)))
@@ -131,7 +117,7 @@ def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
         numbers["searchable"], numbers["waited"], points,
         tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
         float("inf") if usual is None else usual, miscalibration, numbers["calibrated"],
-        None if numbers["camera"] is None else CorrectedCamera.from_plain(numbers["camera"]), numbers["noise"], window,
+        None if numbers["camera"] is None else CorrectedCamera.from_plain(numbers["camera"]), numbers["noise"],
     )  # fmt: skip
 
 
