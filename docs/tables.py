@@ -24,11 +24,11 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 BLOCK = re.compile(r"(<!-- generated: ([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 SCENES = {
-    "blender_lego": "Lego (NeRF-Synthetic)",
-    "room_living": "rendered room",
-    "tum_fr1_xyz": "TUM freiburg1_xyz (Kinect)",
-    "iphone_corridor": "corridor (iPhone scan)",
-    "phone_doll": "doll (phone photos)",
+    "blender_lego": "Lego",
+    "room_living": "room",
+    "tum_fr1_xyz": "TUM",
+    "iphone_corridor": "corridor",
+    "phone_doll": "doll",
 }
 """What the scenes of the records are called in the tables."""
 
@@ -423,15 +423,12 @@ SEQUENCES = {
 def tracking(records: Records) -> str:
     """The tracker on two sequences, unchanged and with faults."""
     rows = []
-    for (record, scene), title in {
-        ("tracking", "tum_fr1_xyz"): "TUM",
-        ("tracking_corridor", "iphone_corridor"): "corridor",
-    }.items():
+    for record, scene in {"tracking": "tum_fr1_xyz", "tracking_corridor": "iphone_corridor"}.items():
         runs = records[record][scene]
         for sequence, name in SEQUENCES.items():
             if f"RGB, {sequence}" in runs:
                 both = (runs[f"{sensor}, {sequence}"] for sensor in FAULTED)
-                rows.append((f"{title}, {name}", *(value for run in both for value in _tracked(run))))
+                rows.append((f"{SCENES[scene]}, {name}", *(value for run in both for value in _tracked(run))))
     columns = ("accepted", "of these wrong", "median error, m", "inside the 95 % bound")
     head = ("sequence", *(f"{sensor}: {column}" for sensor in FAULTED for column in columns))
     return _table(head, rows, records)
@@ -471,13 +468,13 @@ def tracking_baseline(records: Records) -> str:
 def maps(records: Records) -> str:
     """What ``bidnerf train`` makes of the scenes with default settings."""
     maps = {
-        "map_blender_lego": "Lego (NeRF-Synthetic)",
-        "map_room_living": "rendered room",
-        "map_room_living_rgb": "rendered room, depth withheld",
-        "map_tum_fr1_xyz": "TUM freiburg1_xyz (Kinect)",
-        "map_tum_without_motions": "TUM, camera motion during the readout ignored",
-        "map_iphone_corridor": "corridor (iPhone scan)",
-        "map_phone_doll": "doll (phone photos, no depth)",
+        "map_blender_lego": "Lego",
+        "map_room_living": "room",
+        "map_room_living_rgb": "room, depth withheld",
+        "map_tum_fr1_xyz": "TUM",
+        "map_tum_without_motions": "TUM, motion during the readout ignored",
+        "map_iphone_corridor": "corridor",
+        "map_phone_doll": "doll",
     }
     rows = [(title, *_map_quality(records[name])) for name, title in maps.items()]
     return _table(("scene", *MAP_COLUMNS), rows, records)
