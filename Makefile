@@ -19,7 +19,7 @@ PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
 INSTALL = $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test check lint format types arrows docs clean
+.PHONY: help demo test robustness check lint format types arrows docs clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
@@ -29,6 +29,9 @@ demo: $(VENV)/.installed-plots ## train a small scene, find poses in it, draw th
 
 test: $(VENV)/.installed-dev ## all tests; ARGS="-k se3" for some
 	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL) $(ARGS)
+
+robustness: $(VENV)/.installed-dev ## hostile inputs, kills, full disks and crowds, counted; takes half an hour; ARGS="--only fuzz"
+	@OMP_NUM_THREADS=1 $(BIN)/python tests/robustness/counts.py $(ARGS)
 
 check: lint types arrows ## everything that is checked without running the code
 
