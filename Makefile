@@ -74,5 +74,5 @@ $(VENV)/.installed-docs: $(REQUIREMENTS) | $(BIN)/pip
 
 $(VENV)/.installed-dev: $(REQUIREMENTS) | $(BIN)/pip
 	@echo "installing bidnerf, what it needs and what its tests need (minutes, the first time)"
-	@$(INSTALL) -e '.[dev]' | $(SHOW_LONG)
+	@$(INSTALL) -e '.[dev]' -e plugins/bidnerf-scanner-app | $(SHOW_LONG)
 	@touch $@ $(VENV)/.installed-plots $(VENV)/.installed-docs

@@ -85,7 +85,7 @@ def _defects(reader: Any) -> Iterator[str]:
     yield from interface_defects(reader, ("accepts", "expected"), methods)
 
 
-ORDER = ("transforms", "scanner-app", "tum", "seven-scenes", "colmap")
+ORDER = ("transforms", "tum", "seven-scenes", "colmap")
 """The bundled readers in the order in which they are asked; a folder may hold files of several formats."""
 
 READERS: Plugins[Reader] = Plugins("readers", _defects, first=ORDER)

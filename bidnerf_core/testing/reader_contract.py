@@ -161,4 +161,8 @@ class ReaderContract:
             return data.views(split, data.frame_names(split)[:MOST_VIEWS])
 
     def _tracked(self) -> TrackedViews:
-        return tracked_views(self._views())
+        """Return the keypoints of the images, joined into tracks; once for each test class."""
+        kept = type(self).__dict__.get("_kept")
+        if kept is None:
+            kept = type(self)._kept = tracked_views(self._views())  # type: ignore[attr-defined]
+        return kept

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets import Dataset, FileSequence, open_dataset, open_sequence
-from bidnerf_core.datasets.scanner_app import LARGEST_SIDE, RANGE, ScannerAppReader
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
+from bidnerf_scanner_app.reader import LARGEST_SIDE, RANGE, ScannerAppReader
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 960, 720, 800.0, (473.5, 363.25)
 """The photo's camera; ``CENTRE`` counts pixels from the centre of the upper left one, as ARKit does."""
@@ -390,9 +390,9 @@ def test_broken_depth_between_photos(break_it: Callable[[Path], Any], message: s
         list(open_sequence(scan))
 
 
-@pytest.mark.data
-def test_a_recorded_scan_in_the_order_of_time(data_dir: Path) -> None:
-    sequence = open_sequence(data_dir / "iphone_corridor")
+@pytest.mark.skipif(DATA is None, reason="BIDNERF_DATA is not set")
+def test_a_recorded_scan_in_the_order_of_time() -> None:
+    sequence = open_sequence(Path(str(DATA)) / "iphone_corridor")
     assert isinstance(sequence, FileSequence)
     assert len(sequence) == 436
     times = np.array(sequence.times, dtype=float)
