@@ -11,6 +11,7 @@ import imageio.v3 as iio
 import tyro
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.cli.camera_options import (
     CameraFile,
     FieldOfView,
@@ -130,7 +131,9 @@ def run(arguments: list[str]) -> None:
         require("--seed", seed, 0, LARGEST_SEED)
         if frame and not any(frame):
             raise UsageError("--frame names no frame, expected the stem of an image file")
-        photos = PhotoOptions(depth, camera, focal, hfov, depth_unit, depth_registration(register_depth))
+        photos = PhotoOptions(
+            depth, CameraSource(camera, focal, hfov), depth_unit, depth_registration(register_depth)
+        )
         frames = FrameOptions(split, tuple(name for group in frame for name in group), window)
         begin = StartSpec(None if start is None else read_pose(start), perturb)
         for part in (frames, begin):
@@ -147,7 +150,8 @@ def run(arguments: list[str]) -> None:
             make_folder(draw, inputs)
         stored = load_map(map)
         points = None if depth_points is None else _depth_points(depth_points, stored, model_points)
-        photos = replace(photos, assumed=_assumed_cameras(stored.landmarks, method, config))
+        assumed = _assumed_cameras(stored.landmarks, method, config)
+        photos = replace(photos, camera=replace(photos.camera, assumed=assumed))
         source = open_queries(query, photos, frames, stored.bounds.background, points)
         if perturb is not None and isinstance(source, Photos):
             raise UsageError("--perturb moves the true pose, which photos do not have; expected --start")

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.source import CameraSource
 from bidnerf_core.cli.options import require, require_different
 from bidnerf_core.datasets import DepthRegistration, ReadOptions, open_dataset
@@ -27,17 +26,14 @@ class PhotoOptions:
     """Options for reading photos."""
 
     depth: tuple[Path, ...] = ()
-    camera: Path | None = None
-    focal: float | None = None  # pixels of the image file
-    hfov: float | None = None  # degrees
+    camera: CameraSource = CameraSource()
     depth_unit: float | None = None  # metres per step
     registration: DepthRegistration | None = None
-    assumed: tuple[Intrinsics, ...] = ()  # cameras of which one probably took photos without a focal length
 
     @property
     def for_photos(self) -> list[str]:
         """The given options that do not apply to datasets, as written on the command line."""
-        values = {"--depth": self.depth or None, "--focal": self.focal, "--hfov": self.hfov,
+        values = {"--depth": self.depth or None, "--focal": self.camera.focal, "--hfov": self.camera.hfov,
                   "--depth-unit": self.depth_unit}  # fmt: skip
         return [option for option, value in values.items() if value is not None]
 
@@ -85,9 +81,8 @@ def open_queries(
     _check_points(points, len(files), "photos; expected one photo")
     depth = depth_files(files, photos.depth)
     photos.check_depth()
-    camera = CameraSource(photos.camera, photos.focal, photos.hfov, photos.assumed)
     sensor = ReadOptions(register_depth=photos.registration).sensor("--register-depth")
-    return Photos(files, camera, depth, photos.depth_unit, sensor, background, points)
+    return Photos(files, photos.camera, depth, photos.depth_unit, sensor, background, points)
 
 
 def _dataset(
@@ -101,7 +96,9 @@ def _dataset(
             f"{photos.for_photos[0]} is for photos, but {paths[0]} is a dataset, which has its own; to take its images as"
             " photos, name the files"
         )
-    dataset = open_dataset(paths[0], background, camera=photos.camera, register_depth=photos.registration)
+    dataset = open_dataset(
+        paths[0], background, camera=photos.camera.camera, register_depth=photos.registration
+    )
     source = DatasetFrames(dataset, frames.split, frames.names, frames.window, points)
     _check_points(points, len(source.names), "frames; name one by --frame")
     return source
