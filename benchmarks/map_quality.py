@@ -33,7 +33,7 @@ import torch
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
-from bidnerf_core.captures.cameras import RowMotion, at_stored_poses
+from bidnerf_core.captures.cameras import RowMotion, at_stored_poses, moved_cameras, pose_updates
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, levels
@@ -227,10 +227,10 @@ def main() -> None:
         results["at_landmark_poses"] = at_landmark_poses(stored, views)
         results["training_frames"] = on_training_frames(stored, given.data)
     if stored.info.pose_refinement is not None:
-        moved = [camera.moved for camera in stored.info.cameras if camera.moved is not None]
+        moved = moved_cameras(stored.info.cameras)
         results["pose_refinement"] = to_plain(stored.info.pose_refinement)
         results["pixels_moved_median"] = statistics.median(m.pixels for m in moved) if moved else 0.0
-        results["moved_median"] = moved_median([camera.update for camera in stored.info.cameras])
+        results["moved_median"] = moved_median(pose_updates(stored.info.cameras))
         results["motion_median"] = moved_median([camera.motion for camera in stored.info.cameras])
     if not given.test_frames_only and (compared := beside_dense(stored.field, stored.bounds, views)):
         results["beside_dense"] = compared

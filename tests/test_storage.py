@@ -24,6 +24,7 @@ from bidnerf_core.backend import load_backend
 from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.mapping import SurfaceMap, surface_tensors
@@ -431,3 +432,28 @@ def test_weights_that_no_training_gives_are_refused(tmp_path: Path, value: float
     )
     with pytest.raises(InputError, match="expected trained weights"):
         load_map(tmp_path)
+
+
+def test_noise_of_poses_that_no_image_has_is_refused(tmp_path: Path) -> None:
+    save_map(tmp_path, info(), state())
+    described = json.loads((tmp_path / "map.json").read_text())
+    described["pose_refinement"] = {"noise_before": 1e308, "noise_after": 0.3, "refined": False}
+    (tmp_path / "map.json").write_text(json.dumps(described))
+    with pytest.raises(
+        InputError, match=r"pose_refinement: noise of keypoints is 1e\+308, expected 0 to 1e\+06"
+    ):
+        load_info(tmp_path)
+
+
+def test_a_map_of_thousands_of_cameras_is_described_without_a_loop_of_tensors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many = tuple(
+        replace(CAMERAS[0], name=f"{i}", given_T_world_camera=CAMERAS[1].T_world_camera) for i in range(3000)
+    )
+    save_map(tmp_path, replace(info(complete=True), cameras=many), state())
+    counted = []
+    usual = SE3.from_matrix
+    monkeypatch.setattr(SE3, "from_matrix", lambda rows: counted.append(len(rows)) or usual(rows))
+    assert len(load_map(tmp_path).describe().moved) == 3000
+    assert len(counted) < 10

@@ -12,9 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 
+LARGEST_NOISE = 1e6  # pixels
 MOST_NAMED = 6
 """Largest number of images that a sentence names."""
 
@@ -41,34 +43,10 @@ class StoredCamera:
         """T_world_camera, float64."""
         return _pose(self.T_world_camera)
 
-    @property
-    def is_rigid(self) -> bool:
-        """Whether all poses are rigid transforms."""
-        rows = [
-            self.T_world_camera,
-            *([] if self.given_T_world_camera is None else [self.given_T_world_camera]),
-        ]
-        return all(len(part) == 4 and bool(_pose(part).is_rigid()) for part in rows)
-
     def posed(self, view: View) -> View:
         """Return the view at this pose, and with this motion."""
         motion = None if self.motion is None else torch.tensor(self.motion, dtype=torch.float64)
         return replace(view, T_ref_camera=self.pose, motion=motion)
-
-    @property
-    def update(self) -> Float[Tensor, "6"] | None:
-        """The right update (translation in metres first) from the given to the refined pose; None where the pose was kept."""
-        if self.given_T_world_camera is None:
-            return None
-        return (_pose(self.given_T_world_camera).inverse() @ self.pose).log()
-
-    @property
-    def moved(self) -> MovedCamera | None:
-        """How far refinement moved the camera; None where the given pose was kept."""
-        if (update := self.update) is None:
-            return None
-        metres, radians = (float(torch.linalg.vector_norm(part)) for part in update.split(3))
-        return MovedCamera(self.name, metres, math.degrees(radians), self.moved_pixels or 0.0, self.motion)
 
 
 @dataclass(frozen=True)
@@ -88,6 +66,11 @@ class PoseConsistency:
 
     noise_before: float  # pixels: standard deviation of the keypoints about their points at the given poses
     noise_after: float
+
+    def __post_init__(self) -> None:
+        for value in (self.noise_before, self.noise_after):
+            if not 0 <= value <= LARGEST_NOISE:
+                raise InputError(f"noise of keypoints is {value}, expected 0 to {LARGEST_NOISE:g} pixels")
 
     @property
     def inconsistency(self) -> float:
@@ -130,9 +113,50 @@ def moved_from(
     )
 
 
+def with_wrong_pose(cameras: Sequence[StoredCamera]) -> list[str]:
+    """Return the names of the cameras of which a pose, the given or the refined one, is not a rigid transform."""
+    poses = [
+        (c.name, rows)
+        for c in cameras
+        for rows in (c.T_world_camera, c.given_T_world_camera)
+        if rows is not None
+    ]
+    wrong = {name for name, rows in poses if len(rows) != 4}
+    if poses and not wrong:
+        rigid = _pose([rows for _, rows in poses]).is_rigid().tolist()
+        wrong = {name for (name, _), sound in zip(poses, rigid, strict=True) if not sound}
+    return [camera.name for camera in cameras if camera.name in wrong]
+
+
+def pose_updates(cameras: Sequence[StoredCamera]) -> list[Float[Tensor, "6"] | None]:
+    """Return the right update (translation in metres first) from each given to its refined pose; None for poses that were kept."""
+    pairs = [
+        (c.given_T_world_camera, c.T_world_camera) for c in cameras if c.given_T_world_camera is not None
+    ]
+    if not pairs:
+        return [None] * len(cameras)
+    given, refined = (_pose([pair[i] for pair in pairs]) for i in (0, 1))
+    updates = iter((given.inverse() @ refined).log())
+    return [None if camera.given_T_world_camera is None else next(updates) for camera in cameras]
+
+
+def moved_cameras(cameras: Sequence[StoredCamera]) -> list[MovedCamera]:
+    """Return how far refinement moved the cameras whose poses it changed."""
+    found = []
+    for camera, update in zip(cameras, pose_updates(cameras), strict=True):
+        if update is not None:
+            metres, radians = torch.linalg.vector_norm(update.reshape(2, 3), dim=-1).tolist()
+            found.append(
+                MovedCamera(
+                    camera.name, metres, math.degrees(radians), camera.moved_pixels or 0.0, camera.motion
+                )
+            )
+    return found
+
+
 def pose_sentences(cameras: Sequence[StoredCamera], found: PoseRefinement) -> list[str]:
     """Return a sentence or two on the consistency of the given poses and how far they were moved."""
-    moved = [camera.moved for camera in cameras if camera.moved is not None]
+    moved = moved_cameras(cameras)
     wrong = [m for m in moved if m.name in found.replaced]
     motions = [camera.motion for camera in cameras if camera.motion is not None]
     cause = "errors of the given poses and motions of the cameras" if motions else "errors of the given poses"
@@ -189,5 +213,5 @@ def _rows(T: SE3) -> MatrixRows:
     return tuple(tuple(row) for row in T.matrix().tolist())
 
 
-def _pose(rows: MatrixRows) -> SE3:
+def _pose(rows: MatrixRows | Sequence[MatrixRows]) -> SE3:
     return SE3.from_matrix(torch.tensor(rows, dtype=torch.float64))

@@ -6,6 +6,7 @@ Everything that reads JSON uses ``parse_json``, so that damaged text of any orig
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import sys
@@ -150,12 +151,23 @@ def from_plain(kind: type[_T], value: Any, where: str) -> _T:
             f"{where}: found {_shown(value)}, expected an object with the fields of {kind.__name__}"
         )
     _check_keys(kind, value, where)
-    hints = typing.get_type_hints(kind)
+    hints = _hints(typing.cast(Any, kind))
     fields = {key: converted(hints[key], item, f"{where}: {key}") for key, item in value.items()}
     try:
         return kind(**fields)
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}: {error}") from error
+
+
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
+
+
+@functools.cache
+def _form(kind: Any) -> tuple[Any, tuple[Any, ...], bool]:
+    """Return the origin and the arguments of a type, and whether it is a dataclass."""
+    return typing.get_origin(kind) or kind, typing.get_args(kind), dataclasses.is_dataclass(kind)
 
 
 def _check_keys(kind: type, value: dict[str, Any], where: str) -> None:
@@ -177,14 +189,16 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 
 def converted(kind: Any, value: Any, where: str) -> Any:
     """Convert ``value``, as read from JSON, to the type ``kind``. Errors begin with ``where``."""
-    origin, arguments = typing.get_origin(kind) or kind, typing.get_args(kind)
+    origin, arguments, is_dataclass = _form(kind)
     if kind is Any or (origin is typing.Literal and value in arguments):
         return value
-    if dataclasses.is_dataclass(kind):
+    if is_dataclass:
         return from_plain(typing.cast(type, kind), value, where)
     if origin in (typing.Union, types.UnionType):
         return _first_fit(arguments, value, where)
     if origin in (tuple, list) and isinstance(value, list | tuple):
+        if all(one is float for one in arguments) and len(arguments) == len(value) and _are_numbers(value):
+            return origin(value)  # the rows of matrices, of which a map may have a million
         kinds = _kinds_of_items(origin, arguments, len(value))
         if len(kinds) == len(value):
             return origin(converted(k, v, where) for k, v in zip(kinds, value, strict=True))
@@ -203,6 +217,10 @@ def converted(kind: Any, value: Any, where: str) -> Any:
     raise InputError(f"{where}: found {_shown(value)}, expected {_name(kind)}")
 
 
+def _are_numbers(values: list[Any] | tuple[Any, ...]) -> bool:
+    return all(type(value) is float and math.isfinite(value) for value in values)
+
+
 def _kinds_of_items(origin: type, arguments: tuple[Any, ...], count: int) -> tuple[Any, ...]:
     if not arguments:
         return (Any,) * count
@@ -210,6 +228,9 @@ def _kinds_of_items(origin: type, arguments: tuple[Any, ...], count: int) -> tup
 
 
 def _first_fit(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
+    records = [kind for kind in kinds if _form(kind)[2]]
+    if isinstance(value, dict) and len(records) == 1 and dict not in (_form(kind)[0] for kind in kinds):
+        return from_plain(records[0], value, where)  # whose message says what is wrong inside
     for kind in sorted(
         kinds, key=lambda kind: type(value) is not kind
     ):  # an exact match comes first: 1 is an int

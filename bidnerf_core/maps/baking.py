@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from bidnerf_core.captures.advice import summary
+from bidnerf_core.captures.cameras import pose_updates
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.captures.trial import tried_landmarks
@@ -110,5 +111,5 @@ def _tried(
     landmarks = tried_landmarks(tracked, views, report=report)
     # New poses are compared with others from the source of the given ones. If training kept those, except for some wrong
     # ones, their errors are negligible.
-    by_source = update_scatter([camera.update for camera in info.cameras])
+    by_source = update_scatter(pose_updates(info.cameras))
     return replace(landmarks, pose_covariance=landmarks.pose_covariance + by_source)

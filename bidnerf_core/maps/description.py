@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.captures.cameras import PoseRefinement, StoredCamera
+from bidnerf_core.captures.cameras import PoseRefinement, StoredCamera, with_wrong_pose
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.geometry.se3 import SE3
@@ -82,6 +82,6 @@ def load_info(folder: Path) -> MapInfo:
     for name in (info.weights, info.training, info.surface, info.landmarks, info.capture):
         if name is not None and (not name or Path(name).name != name):
             raise InputError(f"{path}: names {name!r}, expected the name of a file beside it")
-    for name in (camera.name for camera in info.cameras if not camera.is_rigid):
+    for name in with_wrong_pose(info.cameras):
         raise InputError(f"{path}: pose of camera {name!r} is not a rigid transform, expected 4x4 rows")
     return info

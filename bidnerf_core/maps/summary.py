@@ -9,7 +9,7 @@ from typing import Any
 from torch import nn
 
 from bidnerf_core.captures.advice import sentences
-from bidnerf_core.captures.cameras import MovedCamera, PoseRefinement, pose_sentences
+from bidnerf_core.captures.cameras import MovedCamera, PoseRefinement, moved_cameras, pose_sentences
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import amount
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
@@ -111,7 +111,6 @@ def summarized(
         files = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
     refinement = info.pose_refinement
     remarks = [] if refinement is None else pose_sentences(info.cameras, refinement)
-    moved = (camera.moved for camera in info.cameras)
     return MapSummary(
         map="" if folder is None else str(folder),
         backend=info.backend,
@@ -132,7 +131,7 @@ def summarized(
         bounds=info.bounds,
         config=info.config,
         bidnerf=info.bidnerf,
-        moved=tuple(camera for camera in moved if camera is not None),
+        moved=tuple(moved_cameras(info.cameras)),
         capture=capture,
         colour_noise=info.colour_noise,
         remarks=tuple(remarks if capture is None else [*remarks, *sentences(capture)]),
