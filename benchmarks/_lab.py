@@ -45,12 +45,15 @@ def one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def parser(doc: str | None, name: str | None = None, scenes: bool = False) -> argparse.ArgumentParser:
+def parser(
+    doc: str | None, name: str | None = None, scenes: bool = False, named: bool = True
+) -> argparse.ArgumentParser:
     """Return a parser that shows a script's docstring, with the name of its record (required if there is no default)."""
     found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument(
-        "--name", default=name, required=name is None, help="of the record (default: %(default)s)"
-    )
+    if named:
+        found.add_argument(
+            "--name", default=name, required=name is None, help="of the record (default: %(default)s)"
+        )
     if scenes:
         found.add_argument(
             "scenes", nargs="+", metavar="MAP:DATA", help="folder of a map, folder of its dataset"

@@ -13,16 +13,15 @@ has a file of results in FOLDER, which survives a kill at any moment: the same c
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from paper_tables import RESULTS, Settings, as_record, run_part, test_frames
+import _lab
+from paper_tables import Settings, as_record, run_part, test_frames
 
 from bidnerf_core.evaluation.bench import Plan, planned
-from bidnerf_core.evaluation.provenance import write_record
 
 WITHOUT_REACH: Settings = {"candidates": 1, "box_weight": 0.0}
 """The paper's objective alone; the defaults of ``bid`` add to it."""
@@ -91,12 +90,10 @@ def plans(group: str, base: Plan, names: list[str] | None, sizes: list[float] | 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__, named=False)
     parser.add_argument("data")
     parser.add_argument("--map", required=True)
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path, default=_lab.RESULTS)
     parser.add_argument("--group", nargs="+", choices=list(GROUPS), default=list(GROUPS))
     parser.add_argument("--variant", nargs="+", help="only these of the groups")
     parser.add_argument("--size", nargs="+", type=float, help="errors of the start; default: the group's")
@@ -120,7 +117,7 @@ def main() -> None:
         groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)
         common, variants, _ = GROUPS[group]
         results: dict[str, Any] = {"common_settings": common, "variants": variants, **as_record(groups)}
-        print(write_record(given.out / f"{name}.json", results, given.seed))
+        _lab.record(name, results, given.seed, given.out)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ without damage are real: what is reported for them already is listed separately,
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -24,6 +23,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import _lab
 import cv2
 import numpy as np
 import torch
@@ -35,13 +35,11 @@ from bidnerf_core.captures.coverage import horizontal_axes
 from bidnerf_core.captures.report import CaptureReport, Gap
 from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.features import SIFT, Keypoints
 from bidnerf_core.mapping.landmark_building import tracked_views
 
-RESULTS = Path(__file__).resolve().parent / "results"
 BLUR = 0.02
 """Length of the motion blur, as a share of the image's longer side."""
 TURN, SHIFT = 15.0, 0.3
@@ -280,22 +278,19 @@ def scene(views: list[View], others: list[View] | None, seed: int, only: Sequenc
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__, "capture_report")
     parser.add_argument("data", nargs="+", type=Path, metavar="DATA")
-    parser.add_argument("--name", default="capture_report", help="of the record")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=[], help="cases to run, by name")
     given = parser.parse_args()
-    torch.set_num_threads(1)
+    _lab.one_thread()
     captures = [open_dataset(data).views("train") for data in given.data]
     results = {}
     for place, (data, views) in enumerate(zip(given.data, captures, strict=True)):
         others = captures[(place + 1) % len(captures)] if len(captures) > 1 else None
         print(data.name, flush=True)
         results[data.name] = scene(views, others, given.seed, given.only)
-    print(write_record(RESULTS / f"{given.name}.json", results, seed=given.seed))
+    _lab.record(given.name, results, given.seed)
 
 
 if __name__ == "__main__":

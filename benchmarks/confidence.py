@@ -13,23 +13,21 @@ that it was not fitted to. ``--write`` fits to all examples and stores the weigh
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import _lab
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.localization import confidence
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
 from bidnerf_core.localization.result import Outcome
 
-RESULTS = Path(__file__).resolve().parent / "results"
 STORED = Path(confidence.__file__).with_suffix(".json")
 RIDGE = 0.005
 """Penalty of the squared weights of standardised features, relative to the mean log loss."""
@@ -166,12 +164,9 @@ def line(s: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__, "confidence")
     parser.add_argument("rows", nargs="+", type=Path)
     parser.add_argument("--write", action="store_true", help="store the weights in the package")
-    parser.add_argument("--name", default="confidence", help="of the record")
     given = parser.parse_args()
     everything, results, stored = examples(given.rows), {}, {}
     for kind in ("landmarks", "surface"):
@@ -192,10 +187,7 @@ def main() -> None:
             print(f"{kind}, tested on {name}: {line(found.get('all', found))}")
         for name, weight in zip(model.features, model.weights, strict=True):
             print(f"  {name:22} {weight:+.2f}")
-    record = write_record(
-        RESULTS / f"{given.name}.json", {"examples": len(everything), "held_out": results}, seed=0
-    )
-    print(record)
+    record = _lab.record(given.name, {"examples": len(everything), "held_out": results})
     if given.write:
         text = json.dumps({"source": record.name, "models": stored}, indent=1)
         STORED.write_text(text + "\n")

@@ -5,12 +5,12 @@ python benchmarks/fault_figure.py benchmarks/results/faults_rgb.json benchmarks/
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import _lab
 import numpy as np
 
 from bidnerf_core.results.errors import success_rate
@@ -56,9 +56,7 @@ def draw_panel(panel: Any, mode: str, cells: dict[str, dict[str, int]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__, named=False)
     parser.add_argument("records", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="of the figure, a PNG")
     given = parser.parse_args()

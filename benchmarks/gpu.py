@@ -15,30 +15,27 @@ done, the record ``gpu.json`` is written there. Without a GPU the script prints 
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import _lab
 import torch
-from paper_tables import RESULTS, test_frames
+from paper_tables import test_frames
 
 from bidnerf_core import Localizer
 from bidnerf_core.devices import without_waiting
 from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.protocols import perturb
-from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.fields.contract import levels
-from bidnerf_core.frames.frame import View
 from bidnerf_core.localization import METHODS
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.costs.weighted_rays import RayCounts
@@ -52,7 +49,6 @@ from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.cuda_graph import captured
-from bidnerf_core.results.errors import pose_error
 
 TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
 FRAMES = 40
@@ -167,20 +163,16 @@ def no_start_rows(folder: str, data: str, device: torch.device) -> dict[str, Any
     stored, dataset = opened(folder, data, str(device))
     views = dataset.views("test", test_frames(folder, data, tuning=False)[:FRAMES])
     localizer, found = Localizer(stored), {}
-    for name, problems in (("RGB-D", views), ("RGB", [_without_depth(view) for view in views])):
-        localizer(problems[0].frame)  # warm-up
-        times, right = [], 0
-        for view in problems:
+    for name, shown in _lab.modes(views).items():
+        localizer(shown[0].frame)  # warm-up
+        rows, times = [], []
+        for view in shown:
             began = time.perf_counter()
-            error = pose_error(localizer(view.frame).T_world_camera, view.T_ref_camera)
+            rows.append(_lab.answer(partial(localizer, view.frame), view))
             times.append(1000 * (time.perf_counter() - began))
-            right += bool(error.translation < 0.05) and bool(error.rotation_deg < 5)
+        right = sum(map(_lab.within, rows))
         found[name] = {"ms": statistics.median(times), "within 5 degrees, 0.05": right, "frames": len(views)}
     return found
-
-
-def _without_depth(view: View) -> View:
-    return replace(view, frame=replace(view.frame, depth=None))
 
 
 def table_rows(
@@ -207,12 +199,10 @@ def attempted(what: str, make: Callable[[], Any]) -> Any:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__, named=False)
     parser.add_argument("data")
     parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path, default=_lab.RESULTS)
     parts = ("training", "steps", "no_start", "tables")
     parser.add_argument("--part", nargs="+", choices=parts, default=list(parts))
     parser.add_argument(
@@ -251,7 +241,7 @@ def main() -> None:
                     results.setdefault(row, {})[name] = store.get(
                         key, partial(attempted, f"{name}: {row}", make)
                     )
-    print(write_record(given.out / "gpu.json", results, seed=0))
+    _lab.record("gpu", results, folder=given.out)
 
 
 if __name__ == "__main__":

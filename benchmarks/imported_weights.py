@@ -21,6 +21,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import _lab
 import imageio.v3 as iio
 import numpy as np
 import torch
@@ -29,7 +30,6 @@ from scipy.stats import binomtest
 
 from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.evaluation.json_lines import RowStore
-from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.summary import NEVER, steps_of, summarize
 from bidnerf_core.evaluation.trial import Trial, TrialResult
@@ -42,8 +42,6 @@ from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.errors import CRITERIA
 from bidnerf_core.results.overlays import depth_to_rgb, tile
 from bidnerf_nerf_pytorch.command import main as import_command
-
-RESULTS = Path(__file__).parent / "results"
 
 LEVELS = {"coarse": 0, "fine": 1}
 Cell = tuple[str, str]
@@ -125,11 +123,9 @@ def all_trials(folder: Path, dataset: Dataset, given: argparse.Namespace) -> dic
     Trials run start by start, so that an interrupted run has the same starts in every cell. Fine levels, which cost five
     times as much, are tried from the first few starts only.
     """
-    names = [
-        n for i, n in enumerate(dataset.frame_names("test")) if i % 5 != 1
-    ]  # settings were tuned on the others
+    names = _lab.held_out(dataset.frame_names("test"))
     cells: dict[Cell, list[TrialResult]] = {cell: [] for cell in CELLS}
-    with ResultsFile(RESULTS / f"{given.name}.partial.jsonl") as file:
+    with ResultsFile(_lab.RESULTS / f"{given.name}.partial.jsonl") as file:
         for number in range(given.trials):
             for cell in CELLS if number < given.fine_trials else CELLS[:2]:
                 trial = cell_trial(folder, given, cell, names[number % len(names)], given.seed + number)
@@ -145,13 +141,6 @@ def row_text(cell: Cell, row: TrialResult) -> str:
     error = row.error
     errors = f"{error.translation:.3f} units, {error.rotation_deg:.2f} deg" if error else "not finite"
     return f"{row.frame} {' '.join(cell)}: {errors}, {row.seconds:.0f} s"
-
-
-def final(cell: Cell, row: TrialResult) -> dict[str, Any]:
-    """Return a trial without its trace."""
-    kept = ("frame", "seed", "converged", "steps", "seconds", "loss")
-    error = {"translation": None, "rotation_deg": None} if row.error is None else asdict(row.error)
-    return {"level": cell[0], "sensor": cell[1], **{name: getattr(row, name) for name in kept}, **error}
 
 
 def difference(first: list[TrialResult], second: list[TrialResult]) -> dict[str, Any]:
@@ -172,12 +161,9 @@ def difference(first: list[TrialResult], second: list[TrialResult]) -> dict[str,
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--name", required=True, help="of the record")
     parser.add_argument("--frames", type=int, default=10, help="for PSNR, evenly among the test split")
     parser.add_argument("--trials", type=int, default=20, help="starts, tried with RGB-D and RGB")
     parser.add_argument("--fine-trials", type=int, default=20, help="of these, tried in full detail as well")
@@ -189,8 +175,8 @@ def main() -> None:
     )
     parser.add_argument("--picture", type=Path, help="file for a real image beside what the map shows")
     given = parser.parse_args()
-    torch.set_num_threads(1)
-    quality_rows = RESULTS / f"{given.name}.partial.rows.jsonl"
+    _lab.one_thread()
+    quality_rows = _lab.RESULTS / f"{given.name}.partial.rows.jsonl"
     with tempfile.TemporaryDirectory() as folder, RowStore(quality_rows) as kept:
         plain, quick = imported(given, Path(folder))
         dataset = open_dataset(given.data, plain.bounds.background)
@@ -207,11 +193,10 @@ def main() -> None:
         "start": f"bid:{given.size}", "localization_map": to_plain(quick.info), "settings": DESCENT,
         "cells": {" ".join(cell): asdict(summarize(found)) for cell, found in cells.items() if found},
         "differences": differences,
-        "rows": [final(cell, row) for cell, found in cells.items() for row in found],
     }  # fmt: skip
-    print(write_record(RESULTS / f"{given.name}.json", results, given.seed))
+    _lab.record(given.name, results, given.seed)
     print(json.dumps({"quality": quality, **results["cells"]}, indent=1))
-    for partial in (quality_rows, RESULTS / f"{given.name}.partial.jsonl"):
+    for partial in (quality_rows, _lab.RESULTS / f"{given.name}.partial.jsonl"):
         partial.unlink()
 
 

@@ -17,7 +17,6 @@ a ``transforms_train.json`` from the training, and uses that of the test split f
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 import statistics
@@ -29,13 +28,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import _lab
 import torch
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
 from bidnerf_core.captures.cameras import RowMotion, at_stored_poses, moved_cameras, pose_updates
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.evaluation.provenance import write_record
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, levels
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import View
@@ -48,7 +47,6 @@ from bidnerf_core.training import fitted_colours
 
 LEAST_LANDMARKS = 30
 """Minimum number of landmarks from which the pose of a test frame is refined."""
-RESULTS = Path(__file__).parent / "results"
 
 
 def train(data: Path, out: Path, options: list[str]) -> dict[str, float]:
@@ -183,12 +181,9 @@ def beside_dense(field: RadianceField, bounds: SceneBounds, views: list[View]) -
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--name", required=True, help="of the record")
     parser.add_argument("--keep", action="store_true", help="judge the map that is there already")
     parser.add_argument(
         "--without-depth", action="store_true", help="train on the colours of transforms_train.json alone"
@@ -198,7 +193,7 @@ def main() -> None:
         action="store_true",
         help="judge the levels on test frames at their given poses only",
     )
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the record")
+    parser.add_argument("--results", type=Path, default=_lab.RESULTS, help="folder of the record")
     parser.add_argument(
         "--device", default="cpu", help="where images are rendered; to train there too: -- --device"
     )
@@ -234,7 +229,7 @@ def main() -> None:
         results["motion_median"] = moved_median([camera.motion for camera in stored.info.cameras])
     if not given.test_frames_only and (compared := beside_dense(stored.field, stored.bounds, views)):
         results["beside_dense"] = compared
-    print(write_record(given.results / f"{given.name}.json", results, seed=stored.info.config.get("seed", 0)))
+    _lab.record(given.name, results, stored.info.config.get("seed", 0), given.results)
     print({k: v for k, v in results.items() if k != "config"})
 
 

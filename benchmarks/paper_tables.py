@@ -19,7 +19,6 @@ stopped. When a part is complete, its record is written next to it; ``bidnerf re
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +26,8 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import _lab
 
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
 from bidnerf_core.evaluation.bench import (
@@ -37,15 +38,13 @@ from bidnerf_core.evaluation.bench import (
     run_trials,
 )
 from bidnerf_core.evaluation.groups import Group, grouped
-from bidnerf_core.evaluation.provenance import note_run, provenance, script_command, write_record
+from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
 from bidnerf_core.evaluation.results import ResultsFile, key_of
 from bidnerf_core.evaluation.summary import pairwise_tests, summarize
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.evaluation.workers import local_processes
 from bidnerf_core.localization import METHODS
-
-RESULTS = Path(__file__).parent / "results"
 
 Settings = dict[str, Any]
 Common = Callable[[str], Settings]
@@ -121,8 +120,7 @@ def preset_settings(preset: str, others: Settings, method: str) -> Settings:
 def test_frames(map_folder: str, data: str, tuning: bool) -> tuple[str, ...]:
     """Return the test frames on which settings are tuned, or all others."""
     _, dataset = opened(map_folder, data)
-    names = enumerate(dataset.frame_names("test"))
-    return tuple(name for place, name in names if (place % 5 == 1) is tuning)
+    return tuple(_lab.held_out(dataset.frame_names("test"), tuning))
 
 
 def sequence_ends(plan: Plan) -> tuple[str, ...]:
@@ -172,12 +170,10 @@ def as_record(groups: Sequence[Group]) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__, named=False)
     parser.add_argument("data")
     parser.add_argument("--map", action="append", required=True, help="a folder; may be given again")
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path, default=_lab.RESULTS)
     parser.add_argument("--part", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--preset", choices=list(METHODS["bid"].presets), default="paper")
     parser.add_argument("--rays", type=int, default=2048)
@@ -202,7 +198,7 @@ def main() -> None:
             name = f"{part}_{trials[0].portable.map.replace(':', '_')}"
             groups = run_part(trials, given.out / f"{name}.jsonl", given.workers, given.stop_after)
             results = {"paper_percent": PAPER.get(part), "preset": given.preset, **as_record(groups)}
-            print(write_record(given.out / f"{name}.json", results, given.seed))
+            _lab.record(name, results, given.seed, given.out)
 
 
 def _json(settings: Settings) -> str:

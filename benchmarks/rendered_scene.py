@@ -10,10 +10,10 @@ alpha channel (0 where the map has no depth) and depth, which can be used for tr
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import _lab
 import imageio.v3 as iio
 import torch
 
@@ -39,9 +39,7 @@ def rendered(view: View, folder: Path) -> View:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _lab.parser(__doc__, named=False)
     parser.add_argument("renders", type=Path, help="folder with a folder of renderings for each split")
     parser.add_argument("data", type=Path, help="dataset whose poses were rendered")
     parser.add_argument("--out", type=Path, required=True)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+import importlib
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -24,14 +23,9 @@ FINE = Verdict(Outcome.CONVERGED, "fine")
 
 @pytest.fixture(scope="module")
 def learning() -> ModuleType:
-    path = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
-    spec = importlib.util.spec_from_file_location("confidence_benchmark", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+        return importlib.import_module("confidence")
 
 
 def test_a_good_pose_by_landmarks_is_accepted_and_a_poor_one_is_not() -> None:
