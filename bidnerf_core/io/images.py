@@ -8,14 +8,13 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin  # noqa: F401 (these register formats)
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
@@ -254,9 +253,8 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 def _formats() -> list[str]:
     """Return those of ``FORMATS`` that this installation of Pillow reads; each is registered by a module of its own."""
     Image.preinit()
-    for module in ("AvifImagePlugin", "TiffImagePlugin", "WebPImagePlugin"):
-        with contextlib.suppress(ImportError):
-            import_module(f"PIL.{module}")
+    with contextlib.suppress(ImportError):  # Pillow from 11.3 on
+        from PIL import AvifImagePlugin  # noqa: F401
     return [name for name in FORMATS if name in Image.OPEN]
 
 
