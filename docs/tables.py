@@ -94,8 +94,11 @@ def _table(head: Row, rows: Iterable[Row], records: Records) -> str:
 
 
 def _lines(head: Row, rows: Iterable[Row]) -> str:
+    """Return a table in Markdown. Raises ``ValueError`` for a row of another length than the head."""
     head = list(head)
-    first, *others = (f"| {' | '.join(map(str, row))} |\n" for row in [head, *rows])
+    first, *others = (
+        f"| {' | '.join(str(cell) for _, cell in zip(head, row, strict=True))} |\n" for row in [head, *rows]
+    )
     return f"{first}|{'---|' * len(head)}\n{''.join(others)}"
 
 
@@ -369,12 +372,7 @@ def conditions(records: Records) -> str:
         row: list[object] = [title]
         for scene in scenes:
             c = records["query_conditions"][scene][condition]
-            rate = c["5deg 0.05"]
-            row += [
-                f"{rate['successes']} of {rate['trials']}",
-                c["accepted_but_wrong"],
-                c["right_but_rejected"],
-            ]
+            row += [_of(c["5deg 0.05"]), c["accepted_but_wrong"]]
         rows.append(row)
     columns = ("right", "accepted but wrong")
     head = ("query", *(f"{scene.split('_')[1]}: {column}" for scene in scenes for column in columns))
