@@ -136,7 +136,7 @@ def prepared(views: list[View], points: Points, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(
         training_views,
         "tracked_views",
-        lambda given, progress: tracked_views(given, points, progress=progress),
+        lambda given, features, progress: tracked_views(given, points, progress=progress),
     )
     training_views.prepared(views)
 

@@ -185,7 +185,7 @@ def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         training_views,
         "tracked_views",
-        lambda given, progress: tracked_views(given, points, progress=progress),
+        lambda given, features, progress: tracked_views(given, points, progress=progress),
     )
     monkeypatch.setattr(
         training_views,
