@@ -27,6 +27,7 @@ from safetensors.torch import load_file, save_file
 import tiny
 from bidnerf_core.cli import COMMANDS, main
 from bidnerf_core.cli.progress import Display
+from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.methods import METHODS
 from bidnerf_core.maps.checkpoints import Checkpoints
@@ -747,15 +748,13 @@ def test_localize_prints_the_object_that_was_agreed_on(
 def test_every_frame_that_is_named_counts(
     bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bidnerf_core.cli import queries
-
     seen: list[list[str]] = []
 
-    def note(dataset: Any, split: str, names: Any) -> Any:
+    def note(dataset: TransformsDataset, split: str, names: Any) -> Any:
         seen.append(list(names))
         raise InputError("enough")
 
-    monkeypatch.setattr(queries, "read_views", note)
+    monkeypatch.setattr(TransformsDataset, "views", note)
     bidnerf("localize", shared / "map", shared / "data", "--no-start", "--frame", "a", "b", "--frame", "c")
     assert seen == [["a", "b", "c"]]
 
@@ -780,16 +779,14 @@ def test_a_frame_is_no_rig_by_being_named_twice(bidnerf: Run, shared: Path) -> N
 def test_a_window_is_the_frame_and_those_before_it(
     bidnerf: Run, shared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bidnerf_core.cli import queries
-
     asked: list[list[str]] = []
-    real = queries.read_views
+    real = TransformsDataset.views
 
-    def note(dataset: Any, split: str, names: Any) -> Any:
+    def note(dataset: TransformsDataset, split: str, names: Any) -> Any:
         asked.append(list(names))
         return real(dataset, split, names)
 
-    monkeypatch.setattr(queries, "read_views", note)
+    monkeypatch.setattr(TransformsDataset, "views", note)
     place = ["localize", shared / "map", shared / "data", *QUICK]
     for frame, size in (("t_0002", 2), ("t_0001", 3), ("t_0001", 1)):
         found = bidnerf(*place, "--frame", frame, "--window", size)
