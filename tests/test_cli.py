@@ -25,6 +25,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import tiny
+from bidnerf_core.backend import load_backend
 from bidnerf_core.cli import COMMANDS, main
 from bidnerf_core.cli.progress import Display
 from bidnerf_core.datasets.transforms import TransformsDataset
