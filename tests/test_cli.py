@@ -378,7 +378,7 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "missing weights": (
         lambda folder: (folder / load_info(folder).weights).unlink(),
-        ("weights-", "no such file, but map.json names it"),
+        ("weights-", "no such file, expected a safetensors file, without which the map is incomplete"),
     ),
     "weights elsewhere": (
         of_description(lambda content: content.update(weights="../x.safetensors")),
@@ -399,7 +399,7 @@ BAD_MAPS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "NaN in a weight": (
         of_weights(lambda tensors: tensors.update({BIAS: torch.full((16,), math.nan)})),
-        ("weights-", f"'{BIAS}' holds NaN", "expected finite numbers"),
+        ("weights-", f"'{BIAS}' holds NaN", "expected trained weights"),
     ),
 }
 

@@ -261,9 +261,9 @@ def test_landmarks_of_photos_are_built_once_for_training_and_baking(monkeypatch:
     photos = [replace(v, frame=replace(v.frame, depth=None, alpha=None)) for v in tiny.views(24)]
     built, seen = [], []
 
-    def tracked(views: Sequence[View], **options: Any) -> TrackedViews:
+    def tracked(views: Sequence[View], features: str, **options: Any) -> TrackedViews:
         built.append(len(views))
-        return tracked_views(views, **options)
+        return tracked_views(views, features, **options)
 
     def trained(field: Any, views: Sequence[View], *rest: Any) -> None:
         seen.append(sum(len(v.landmarks.distance) for v in views if v.landmarks is not None))

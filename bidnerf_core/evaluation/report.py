@@ -138,9 +138,12 @@ def page(
     criterion: str,
 ) -> str:
     """Return the HTML of a report."""
-    environment = Environment(autoescape=True, finalize=_printed, undefined=StrictUndefined)
+    environment = Environment(
+        autoescape=True, finalize=_printed, undefined=StrictUndefined, keep_trailing_newline=True
+    )
     environment.filters |= {"number": _number, "steps": _steps, "plain": _plain}
-    template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
+    source = files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8")
+    template = environment.from_string(source.strip() + "\n")
     groups = table.groups
     titles = {row.situation: row.start for row in table.summary}
     pairs = [

@@ -16,7 +16,7 @@ from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.captures.cameras import as_given, at_stored_poses, stored_cameras
 from bidnerf_core.captures.training_views import RefinementChoice, located, prepared
 from bidnerf_core.carving import estimate_bounds
-from bidnerf_core.datasets import Background, Dataset
+from bidnerf_core.datasets import Background
 from bidnerf_core.datasets.colmap import SparseChoice
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.errors import Cancelled, InputError, amount
@@ -99,13 +99,13 @@ def train(
     work = _work(out, bake, device, checkpoint_seconds, progress, cancel)
     with contextlib.nullcontext() if work.out is None else map_folder(work.out, overwrite):
         read = read_views(data, split, background, depth_points, point_choice, progress, cancel)
-        source = read.source or "views in memory"
+        part = f" in split {split!r}" if read.source else ""
         if not any(view.frame.has_depth for view in read.views):
-            log.info(f"{source}: no measured depth; training on colour only")
+            log.info(f"{read.place}: no measured depth{part}; training on colour only")
         taken = prepared(read.views, refine_poses, progress, cancel, features)
         if not taken.distances:
             log.info(
-                f"{source}: the photos are from one place and show no distances; the map's depth will be arbitrary, and"
+                f"{read.place}: the photos are from one place and show no distances; the map's depth will be arbitrary, and"
                 " localization in it will tell directions, never positions"
             )
         check_cancelled(cancel, "training")
@@ -146,7 +146,7 @@ def resume(
         if background is None and isinstance(data, str | Path):
             background = info.bounds.background
         read = read_views(data, split, background, depth_points, point_choice, progress, cancel)
-        _check_same_views(out, info, read, data, split)
+        _check_same_views(out, info, read, split)
         views = at_stored_poses(read.views, info.cameras)
         if info.complete:  # stopped between training and baking
             log.info(f"{out}: training is complete ({amount(info.step, 'step')}); baking its surface")
@@ -196,17 +196,16 @@ def _work(
     return _Work(place, config, working_device(device), seconds, progress, cancel)
 
 
-def _check_same_views(out: Path, info: MapInfo, read: ReadViews, data: Images, split: str) -> None:
+def _check_same_views(out: Path, info: MapInfo, read: ReadViews, split: str) -> None:
     """Raise ``InputError`` for views, or their depth or background, that the training was not begun with."""
     if read.source and read.background != info.bounds.background:
         raise OtherSettings(
             f"{out}: was begun over background {info.bounds.background}, got {read.background}"
         )
     if stored_cameras(read.views) != as_given(info.cameras):
-        place = data.path if isinstance(data, Dataset) else data if isinstance(data, str | Path) else "views"
         part = f"split {split!r} has" if read.source else "these have"
         raise InputError(
-            f"{place}: {part} other frames or poses than {out} was begun with, expected those of {info.data!r} unchanged"
+            f"{read.place}: {part} other frames or poses than {out} was begun with, expected those of {info.data!r} unchanged"
         )
     if read.sparse_depth != info.sparse_depth:
         raise OtherSettings(

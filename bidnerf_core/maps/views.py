@@ -27,6 +27,7 @@ class ReadViews:
 
     views: list[View]
     source: str  # name of the dataset's folder; empty for views from memory
+    place: str  # path of the dataset, or words for views from memory
     background: tuple[float, float, float]  # behind images with an alpha channel
     sparse_depth: int = 0  # pixels whose depth comes from the points of a COLMAP model
 
@@ -55,14 +56,14 @@ def read_views(
         if not data.frame_names(split):
             raise InputError(f"{data.path}: split {split!r} has no frames")
         views = data.views(split, None, counter("reading", "images", progress, cancel))
-        source, colour = data.path.resolve().name, data.background
+        source, place, colour = data.path.resolve().name, str(data.path), data.background
     else:
-        views, source = _checked(data), ""
+        views, source, place = _checked(data), "", "views in memory"
         colour = BLACK if background is None else background_colour(background)
     if depth_points is None:
-        return ReadViews(views, source, colour)
+        return ReadViews(views, source, place, colour)
     views, count = _with_depth(views, Path(depth_points), point_choice or SparseChoice(), split)
-    return ReadViews(views, source, colour, count)
+    return ReadViews(views, source, place, colour, count)
 
 
 def _checked(views: Sequence[View]) -> list[View]:
