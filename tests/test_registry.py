@@ -4,16 +4,32 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.errors import InputError
-from bidnerf_core.registry import UNREADABLE, PluginError, PluginInfo, list_plugins
+from bidnerf_core.datasets import Dataset, Reader, ReadOptions
+from bidnerf_core.datasets.reader import find_reader
+from bidnerf_core.errors import InputError, InputWarning
+from bidnerf_core.localization import find_method
+from bidnerf_core.mapping.features import FEATURES, find_features
+from bidnerf_core.registry import (
+    GROUPS,
+    UNREADABLE,
+    PluginError,
+    PluginInfo,
+    list_plugins,
+    load_plugin,
+    register,
+)
+from bidnerf_core.results.pose_files import write_poses
 
 GOOD = '''"""A field of {word}.
 
@@ -362,3 +378,195 @@ def test_the_backport_may_answer_in_place_of_the_library() -> None:
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert {"adanerf", "hashgrid", "vanilla"} <= set(shown.split())
+
+
+every_group = pytest.mark.parametrize("group", GROUPS)
+ANYTHING = '"""Something that is registered."""\n\nthing = object()\n'
+
+
+@every_group
+def test_every_group_is_listed_and_loaded_alike(site: Site, group: str) -> None:
+    site.module("stranger_thing.py", ANYTHING)
+    site.metadata("stranger", "1.0", f"[bidnerf.{group}]\nthing = stranger_thing:thing\n")
+    (info,) = [info for info in list_plugins(group) if info.name == "thing"]
+    assert (info.summary, info.fault) == ("Something that is registered.", None)
+    assert "stranger_thing" not in sys.modules
+    assert type(load_plugin(group, "thing")) is object
+
+
+@every_group
+def test_bundled_plugins_are_registered_as_a_strangers_are(group: str) -> None:
+    infos = [info for info in list_plugins(group) if info.is_bundled]
+    assert infos
+    for info in infos:
+        assert (info.fault, info.distribution) == (None, "bidnerf")
+        assert info.summary
+        assert load_plugin(group, info.name) is not None
+
+
+@every_group
+def test_who_takes_a_bundled_name_is_refused_by_both_names(site: Site, group: str) -> None:
+    bundled = next(info.name for info in list_plugins(group) if info.is_bundled)
+    site.module("stranger_thing.py", ANYTHING)
+    site.metadata("stranger", "1.0", f"[bidnerf.{group}]\n{bundled} = stranger_thing:thing\n")
+    with pytest.raises(PluginError) as caught:
+        load_plugin(group, bundled)
+    assert re.search(r"\bbidnerf \d", str(caught.value))
+    assert "stranger 1.0" in str(caught.value)
+    assert "stranger_thing" not in sys.modules
+
+
+@every_group
+def test_a_broken_plugin_names_itself_and_the_cause(site: Site, group: str) -> None:
+    site.module("stranger_broken.py", "raise RuntimeError('no driver')")
+    site.metadata("stranger", "1.0", f"[bidnerf.{group}]\nbroken = stranger_broken:thing\n")
+    with pytest.raises(PluginError, match=r"'broken' .*stranger_broken:thing, from stranger 1\.0.*no driver"):
+        load_plugin(group, "broken")
+
+
+@pytest.mark.parametrize("kind", ["SystemExit", "GeneratorExit", "type('Odd', (BaseException,), {})"])
+def test_whatever_an_import_raises_is_an_error_of_that_plugin(site: Site, kind: str) -> None:
+    site.module("stranger_rude.py", f"raise ({kind})('goodbye')")
+    site.plugin("rude", "stranger_rude:backend")
+    assert "goodbye" in refusal("rude")
+
+
+def test_ctrl_c_during_an_import_stays_an_interruption(site: Site) -> None:
+    site.module("stranger_slow.py", "raise KeyboardInterrupt")
+    site.plugin("slow", "stranger_slow:backend")
+    with pytest.raises(KeyboardInterrupt):
+        load_backend("slow")
+
+
+@pytest.fixture
+def nothing_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bidnerf_core.registry.registered", {})
+
+
+@pytest.mark.usefixtures("nothing_registered")
+def test_a_script_registers_what_it_has() -> None:
+    detector = find_features("sift")
+    register("features", "mine", detector)
+    assert find_features("mine") is detector
+    (info,) = [info for info in list_plugins("features") if info.name == "mine"]
+    assert str(info) == "detector 'mine' (Sift, registered in this process)"
+    assert "mine" in FEATURES
+    register("features", "mine", detector)  # the same cell of a notebook, run again
+
+
+@pytest.mark.usefixtures("nothing_registered")
+def test_a_taken_name_is_replaced_on_purpose_only() -> None:
+    mine = replace(find_method("auto"), summary="mine")
+    with pytest.raises(InputError, match=r"taken by method 'auto' .* from bidnerf .* replace=True"):
+        register("methods", "auto", mine)
+    register("methods", "auto", mine, replace=True)
+    assert find_method("auto") is mine
+    assert [info.summary for info in list_plugins("methods") if info.name == "auto"] == ["mine"]
+    with pytest.raises(InputError, match="registered in this process"):
+        register("methods", "auto", replace(mine, summary="another"))
+
+
+@pytest.mark.usefixtures("nothing_registered")
+def test_what_is_registered_is_checked_when_it_is_asked_for() -> None:
+    register("methods", "three", 3)
+    with pytest.raises(
+        PluginError, match=r"method 'three' \(int, registered .*\): not a method: it is a int"
+    ):
+        find_method("three")
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "says"),
+    [
+        ("method", "mine", r"no group of plugins 'method', did you mean 'methods'\?"),
+        ("methods", "a b", "name is 'a b', expected letters"),
+        ("methods", "", "name is '', expected letters"),
+        ("methods", 3, "name is 3, expected letters"),
+    ],
+)
+def test_an_unusable_registration_is_refused(group: str, name: Any, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        register(group, name, object())
+
+
+def test_summaries_come_from_what_the_entry_point_names(site: Site) -> None:
+    source = '"""A module."""\n\ndef f():\n    """A function.\n\n    More."""\n\n\nclass C:\n    """A class."""\n\n\nmade = C()\n"""Made."""\n'
+    site.module("stranger_four.py", source + "called = C(summary='called')\nbare = C()\n")
+    points = "\n".join(f"{name} = stranger_four:{name}" for name in ("f", "C", "made", "called", "bare"))
+    site.metadata("stranger", "1.0", f"[bidnerf.faults]\n{points}\n")
+    found = {i.name: i.summary for i in list_plugins("faults") if i.distribution == "stranger"}
+    assert found == {
+        "f": "A function.",
+        "C": "A class.",
+        "made": "Made.",
+        "called": "called",
+        "bare": "A module.",
+    }
+
+
+def test_metadata_without_the_bundled_plugins_is_to_be_renewed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bidnerf_core.registry._declared", lambda group: ())
+    with pytest.raises(PluginError, match="names no methods; install bidnerf anew"):
+        find_method("auto")
+
+
+class Claiming(Reader):
+    """A reader that claims every folder, or fails at it."""
+
+    expected = "anything"
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.error = error
+
+    def recognises(self, path: Path) -> bool:
+        if self.error is not None:
+            raise self.error
+        return True
+
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
+        raise NotImplementedError
+
+
+@pytest.mark.usefixtures("nothing_registered")
+def test_two_readers_that_claim_a_folder_are_named(tmp_path: Path) -> None:
+    register("readers", "first", Claiming())
+    assert find_reader(tmp_path) is load_plugin("readers", "first")
+    register("readers", "second", Claiming())
+    with pytest.raises(InputError, match="is recognised by the readers first and second"):
+        find_reader(tmp_path)
+
+
+@pytest.mark.usefixtures("nothing_registered")
+def test_bundled_readers_come_before_others(tmp_path: Path) -> None:
+    register("readers", "first", Claiming(RuntimeError("must not be asked")))
+    (tmp_path / "transforms.json").write_text("{}")
+    assert find_reader(tmp_path) is load_plugin("readers", "transforms")
+
+
+@pytest.mark.usefixtures("nothing_registered")
+def test_a_reader_that_fails_is_named_and_passed_over(site: Site, tmp_path: Path) -> None:
+    site.module("stranger_broken.py", "raise RuntimeError('no driver')")
+    site.metadata("stranger", "1.0", "[bidnerf.readers]\nbroken = stranger_broken:reader\n")
+    register("readers", "failing", Claiming(OSError("no disk")))
+    with pytest.warns(InputWarning) as told:
+        assert find_reader(tmp_path) is None
+    said = " ".join(str(warning.message) for warning in told)
+    assert "reader 'failing' fails to look at it: OSError: no disk" in said
+    assert "reader 'broken' (stranger_broken:reader, from stranger 1.0): cannot be imported" in said
+    register("readers", "sound", Claiming())
+    with pytest.warns(InputWarning):
+        assert find_reader(tmp_path) is load_plugin("readers", "sound")
+
+
+@pytest.mark.usefixtures("nothing_registered")
+def test_a_registered_writer_is_chosen_by_the_ending(tmp_path: Path) -> None:
+    def write(path: Path, images: Any) -> None:
+        path.write_text(f"{len(images)} poses")
+
+    register("writers", ".poses.json", write)
+    write_poses(tmp_path / "a.poses.json", [])
+    write_poses(tmp_path / "a.json", [])
+    assert (tmp_path / "a.poses.json").read_text() == "0 poses"
+    assert json.loads((tmp_path / "a.json").read_text()) == []
+    with pytest.raises(InputError, match=r"expected a name that ends with .*\.poses\.json"):
+        write_poses(tmp_path / "a.csv", [])

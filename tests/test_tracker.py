@@ -349,3 +349,15 @@ def test_the_state_does_not_grow(tmp_path: Path) -> None:
         sizes.append((tmp_path / "state").stat().st_size)
         assert len(tracker._state.points) <= tracker.config.points
     assert max(sizes) < 1.25 * min(sizes)
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (textured_map(), r"Tracker: got a MapWithLandmarks, expected a Localizer; Localizer\(map\)"),
+        (3, "got a int"),
+    ],
+)
+def test_a_tracker_takes_a_localizer(given: Any, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        Tracker(given)
