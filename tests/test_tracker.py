@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.io.tensors import read_tensors_and_metadata
 from bidnerf_core.localization.tracking.answers import METHOD
 from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
@@ -229,6 +233,37 @@ def test_files_that_hold_no_state_are_refused(tmp_path: Path) -> None:
             tracker.restore(tmp_path / name)
     with pytest.raises(InputError, match="missing"):
         tracker.restore(tmp_path / "missing")
+
+
+def test_a_state_with_damaged_numbers_or_tensors_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    tracker = Tracker(localizer())
+    tracked(flight()[:3], tracker)
+    path = tmp_path / "state"
+    tracker.save(path)
+    tensors, metadata = read_tensors_and_metadata(path, "a state")
+    content = json.loads(metadata["bidnerf"])
+
+    def refused(tensors: dict[str, torch.Tensor], numbers: dict[str, Any], said: str) -> None:
+        save_file(tensors, path, {"bidnerf": json.dumps(content | {"state": numbers})})
+        with pytest.raises(InputError, match=said):
+            tracker.restore(path)
+        assert tracker.tracking
+
+    whole = content["state"]
+    for name, value in (
+        ("frames", "3"),
+        ("age", -1),
+        ("interval", 0),
+        ("reach", 0.0),
+        ("reach", None),
+        ("noise", []),
+    ):
+        refused(tensors, whole | {name: value}, name)
+    for name in (n for n in tensors if n.startswith(("points.", "motion."))):
+        refused(tensors | {name: tensors[name][None].contiguous()}, whole, name)
+    refused(tensors | {"motion.noise": -tensors["motion.noise"]}, whole, "variance")
+    refused(tensors | {"motion.rotation": 2 * tensors["motion.rotation"]}, whole, "not rigid")
+    refused({n: t for n, t in tensors.items() if n != "points.pixels"}, whole, "pixels")
 
 
 def test_trackers_in_threads_share_a_localizer() -> None:

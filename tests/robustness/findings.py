@@ -157,7 +157,7 @@ def poses_lost(work: Work) -> Checks:
         out = here / f"{name}.json"
         reading, writing = os.pipe()
         os.close(reading)
-        found = work.run([*words, out, *more], before=lambda file=writing: os.dup2(file, 1))
+        found = work.run([*words, out, *more], out=writing)
         os.close(writing)
         yield kept(name, found, 1, out)
     found = work.run([*words, here / "full.json"], out=Path("/dev/full"))

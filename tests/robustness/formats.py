@@ -94,7 +94,7 @@ def states(content: bytes) -> Iterator[tuple[str, bytes]]:
 def tracker_states(sound: Path, work: Path) -> Checks:
     """Restore a tracker from each damaged state, and track two frames more."""
     frames = list(open_sequence(sound / "data"))[:6]
-    before, path = tracker(sound), work / "state"
+    before, path = tracker(sound, frames[0].truth), work / "state"  # a start, so that there is a motion
     for timed in frames[:4]:
         before(timed.frame, timed.time)
     before.save(path)

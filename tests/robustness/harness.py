@@ -132,8 +132,9 @@ def localized(folder: Path, frame: Frame | None = None, **options: Any) -> objec
     return localizer(photo(folder) if frame is None else frame, **options)
 
 
-def tracker(folder: Path) -> Tracker:
-    return Tracker(Localizer(load_map(folder / "map"), "auto", settings_of("auto", AUTO_SETTINGS)))
+def tracker(folder: Path, start: Any = None) -> Tracker:
+    localizer = Localizer(load_map(folder / "map"), "auto", settings_of("auto", AUTO_SETTINGS))
+    return Tracker(localizer, start=start)
 
 
 def views_of(folder: Path) -> object:
@@ -165,10 +166,14 @@ TRACEBACK = 70
 
 
 def begin(
-    door: Door, log: Path, memory: int = MEMORY, before: Callable[[], object] = lambda: None, out: Path | None = None,
+    door: Door, log: Path, memory: int = MEMORY, before: Callable[[], object] = lambda: None, out: Path | int | None = None,
     nobody: bool = False,
 ) -> int:  # fmt: skip
-    """Run a case in a child of its own group, whose process id is returned; what it prints goes to ``log``.out and .err."""
+    """Run a case in a child of its own group, whose process id is returned; what it prints goes to ``log``.out and .err,
+    or to the file or descriptor ``out``.
+    """
+    for suffix in (".out", ".err"):
+        log.with_suffix(suffix).unlink(missing_ok=True)  # what an earlier case said
     child = os.fork()
     if child:
         return child
@@ -176,8 +181,12 @@ def begin(
         os.setsid()
         for number, handler in ((2, signal.default_int_handler), (15, signal.SIG_DFL), (1, signal.SIG_DFL)):
             signal.signal(number, handler)
-        for file, path in ((1, out or log.with_suffix(".out")), (2, log.with_suffix(".err"))):
-            os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644), file)
+        for file, place in (
+            (1, log.with_suffix(".out") if out is None else out),
+            (2, log.with_suffix(".err")),
+        ):
+            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+            os.dup2(place if isinstance(place, int) else os.open(place, flags, 0o644), file)
         for name, file, errors in (("stdout", 1, "strict"), ("stderr", 2, "backslashreplace")):
             setattr(sys, name, open(file, "w", 1, errors=errors, closefd=False))  # noqa: SIM115
         status = Path("/proc/self/status").read_text().splitlines()

@@ -148,7 +148,7 @@ def poses(folder: Path) -> list[dict[str, Any]]:
 def pages(folder: Path) -> int:
     page = folder / "report" / "index.html"
     text = page.read_text() if page.exists() else "Unfinished report"
-    if "Unfinished report" not in text and not text.endswith("</html>\n"):
+    if "Unfinished report" not in text and not text.rstrip().endswith("</html>"):
         raise Broken("half of a page")
     return int("Unfinished report" not in text)
 
@@ -294,7 +294,7 @@ def read_only(sound: Path, work: Path) -> Checks:
         "evaluate --resume": ["evaluate", map_folder, data, "--out", work / "r.jsonl", "--trials", "1", "--workers", "1", *QUICK],
         "report": ["report", sound / "results.jsonl", "--out", work / "report"],
         "render": ["render", map_folder, data, "--out", work / "images"],
-        "demo": ["demo", "--out", work / "demo", "--frames", "0"],
+        "demo": ["demo", "--out", work / "demo"],
         "info": ["info", work / "map"],
     }  # fmt: skip
     for name, words in commands.items():

@@ -12,9 +12,10 @@ from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.fields.contract import LARGEST_LENGTH
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
-from bidnerf_core.io.json import parse_json
+from bidnerf_core.io.json import from_plain, parse_json, to_plain
 from bidnerf_core.io.tensors import read_tensors_and_metadata
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.tracking.clock import Clock
@@ -22,8 +23,22 @@ from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
 from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
+from bidnerf_core.mapping.tensors import Kinds, check_kinds, check_range
 
 STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 5
+KINDS: Kinds = {
+    "points.pixels": ((-1, 2), torch.float32), "points.positions": ((-1, 3), torch.float64),
+    "points.deviations": ((-1, 2), torch.float64), "points.directions": ((-1, 3), torch.float64),
+    "points.landmark": ((-1,), torch.int64), "miscalibration.alternative_probability": ((), torch.float64),
+} | {
+    f"miscalibration.{name}": ((4,), torch.float64)
+    for name in ("apparent", "noise", "probability", "unresolved", "alternative")
+}  # fmt: skip
+MOTION_KINDS: Kinds = {
+    "motion.rotation": ((3, 3), torch.float64), "motion.translation": ((3,), torch.float64),
+    "motion.velocity": ((6,), torch.float64), "motion.noise": ((12, 12), torch.float64), "motion.bias": ((6, 6), torch.float64),
+}  # fmt: skip
+"""Shapes and dtypes of the tensors in a state's file, -1 for any length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +67,45 @@ class TrackerState:
         return self.motion is not None and self.lost == 0
 
 
+@dataclass(frozen=True)
+class StoredNumbers:
+    """The numbers of a state, as its file holds them."""
+
+    now: float | None
+    interval: float
+    frames: int
+    lost: int
+    searchable: int
+    waited: float
+    sought: int
+    age: int
+    usual_distance: float | None  # None for infinity, which JSON does not have
+    noise: float
+    reach: float | None  # of the motion; None where there is none
+    agility: float | None
+    calibrated: int | None
+    camera: list[Any] | None  # as ``CorrectedCamera.plain`` returns it
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "lost", "searchable", "waited", "sought", "age"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} is {getattr(self, name)}, expected 0 or more")
+        if self.interval <= 0 or self.noise <= 0:
+            raise InputError("an interval or a noise of 0 or less, expected positive numbers")
+        if (self.reach is None) != (self.agility is None):
+            raise InputError("half of a motion, expected both reach and agility, or neither")
+        if self.reach is not None and not 0 < self.reach <= LARGEST_LENGTH:
+            raise InputError(f"reach is {self.reach}, expected a distance")
+
+
 def save_state(path: Path, state: TrackerState, key: str) -> None:
     """Write a state as safetensors, atomically; ``key`` identifies the map."""
-    numbers = {
-        "now": state.clock.now, "interval": state.clock.interval, "frames": state.frames, "lost": state.lost,
-        "sought": state.sought, "age": state.age, "usual_distance": _written(state.usual_distance),
-        "noise": state.noise,
-        "reach": None if state.motion is None else state.motion.reach,
-        "agility": None if state.motion is None else state.motion.agility, "searchable": state.searchable,
-        "waited": state.waited,
-        "calibrated": state.calibrated, "camera": None if state.camera is None else state.camera.plain(),
-    }  # fmt: skip
+    motion = state.motion
+    numbers = StoredNumbers(
+        state.clock.now, state.clock.interval, state.frames, state.lost, state.searchable, state.waited, state.sought, state.age,
+        _written(state.usual_distance), state.noise, None if motion is None else motion.reach,
+        None if motion is None else motion.agility, state.calibrated, None if state.camera is None else state.camera.plain(),
+    )  # fmt: skip
     tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
     tensors |= {
         f"miscalibration.{f.name}": getattr(state.miscalibration, f.name) for f in fields(Miscalibration)
@@ -72,7 +115,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
     if state.motion is not None:
         tensors |= _pose_tensors("motion", state.motion.T_world_camera)
         tensors |= {f"motion.{name}": getattr(state.motion, name) for name in ("velocity", "noise", "bias")}
-    content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": numbers}
+    content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": to_plain(numbers)}
     metadata = {"bidnerf": json.dumps(content, allow_nan=False)}
     write_file(
         path,
@@ -89,7 +132,7 @@ def load_tracker_state(path: Path, key: str) -> TrackerState:
         raise InputError(f"{path}: not a whole state of a tracker ({error}), save it anew") from error
 
 
-def _read(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _read(path: Path, key: str) -> tuple[StoredNumbers, dict[str, Tensor]]:
     expected = "a file that Tracker.save wrote"
     tensors, metadata = read_tensors_and_metadata(path, expected)
     found = parse_json(metadata.get("bidnerf", "null"), str(path), expected)
@@ -101,24 +144,43 @@ def _read(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
         )
     if found.get("map") != key:
         raise InputError(f"{path}: belongs to map {found.get('map')!r}, the tracker's is {key!r}")
-    return found["state"], tensors
+    return from_plain(StoredNumbers, found.get("state"), str(path)), tensors
 
 
-def _state(numbers: dict[str, Any], tensors: dict[str, Tensor]) -> TrackerState:
+def _state(numbers: StoredNumbers, tensors: dict[str, Tensor]) -> TrackerState:
+    _check_tensors(tensors, numbers.reach is not None)
     motion = None
-    if numbers["reach"] is not None:
+    if numbers.reach is not None and numbers.agility is not None:
         velocity, noise, bias = (tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias"))
-        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers["reach"], numbers["agility"])
+        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers.reach, numbers.agility)
     points = FollowedPoints(*(tensors[f"points.{f.name}"] for f in fields(FollowedPoints)))
-    usual = numbers["usual_distance"]
     miscalibration = Miscalibration(*(tensors[f"miscalibration.{f.name}"] for f in fields(Miscalibration)))
     return TrackerState(
-        Clock(numbers["now"], numbers["interval"]), motion, numbers["frames"], numbers["lost"],
-        numbers["searchable"], numbers["waited"], points,
-        tensors["image"].numpy() if "image" in tensors else None, numbers["sought"], numbers["age"],
-        float("inf") if usual is None else usual, miscalibration, numbers["calibrated"],
-        None if numbers["camera"] is None else CorrectedCamera.from_plain(numbers["camera"]), numbers["noise"],
+        Clock(numbers.now, numbers.interval), motion, numbers.frames, numbers.lost, numbers.searchable, numbers.waited, points,
+        tensors["image"].numpy() if "image" in tensors else None, numbers.sought, numbers.age,
+        float("inf") if numbers.usual_distance is None else numbers.usual_distance, miscalibration, numbers.calibrated,
+        None if numbers.camera is None else CorrectedCamera.from_plain(numbers.camera), numbers.noise,
     )  # fmt: skip
+
+
+def _check_tensors(tensors: dict[str, Tensor], moving: bool) -> None:
+    """Raise ``KeyError`` or ``ValueError`` for tensors that no state has; ``moving``: whether there is a motion."""
+    check_kinds(tensors, KINDS | (MOTION_KINDS if moving else {}))
+    if len({len(tensors[f"points.{f.name}"]) for f in fields(FollowedPoints)}) > 1:
+        raise ValueError(
+            "expected equally many pixels, positions, deviations, directions and landmarks of points"
+        )
+    check_range(tensors, "points.positions", -LARGEST_LENGTH, LARGEST_LENGTH)
+    check_range(tensors, "points.deviations", 0.0, LARGEST_LENGTH)
+    if "image" in tensors and (tensors["image"].dim() != 2 or tensors["image"].dtype != torch.uint8):
+        raise ValueError("image is not a grey image of 8 bits")
+    if not moving:
+        return
+    check_range(tensors, "motion.velocity", -LARGEST_LENGTH, LARGEST_LENGTH)
+    if not bool(_pose("motion", tensors).is_rigid()):
+        raise ValueError("the pose of the motion is not rigid")
+    if any(bool((tensors[f"motion.{name}"].diagonal() < 0).any()) for name in ("noise", "bias")):
+        raise ValueError("a variance of the motion is negative")
 
 
 def _written(number: float) -> float | None:
