@@ -321,7 +321,7 @@ def two_at_once(job: Job, work: Path, times: int) -> Checks:
     for number in range(times):
         folder = work / f"two{number}"
         folder.mkdir(parents=True)
-        logs = [folder.with_suffix(f".{i}") for i in range(2)]
+        logs = [folder.with_name(f"{folder.name}-{i}") for i in range(2)]
         words = job.words(folder)
         children = [begin(words, log) for log in logs]
         found = [end(child, log, 120) for child, log in zip(children, logs, strict=True)]
