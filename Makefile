@@ -9,7 +9,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 REQUIREMENTS := pyproject.toml constraints.txt
 DEMO_OUT := demo-out
-PARALLEL := -n logical --dist loadfile # a process a core, of one thread each
+SHAPES := tests/test_contract.py::TestHashGrid tests/test_examples.py tests/test_cli_bake.py::test_a_baked_map_needs_no_start
+# A process a core, of one thread each; a file's tests share fixtures, and conftest.py puts the longest files first.
+PARALLEL := -n logical --dist loadfile --no-loadscope-reorder
+PYTEST = OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL)
 
 # The first interpreter that runs and is recent enough; override with `make PYTHON=...`.
 PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
@@ -19,7 +22,7 @@ PYTHON ?= $(shell for python in python3.11 python3 python3.13 python3.12; do \
 INSTALL = $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 SHOW_LONG = { grep --line-buffered -E 'Downloading .*(MB|GB)|^Installing collected' | cut -c1-100 || true; }
 
-.PHONY: help demo test robustness check lint format types arrows docs clean
+.PHONY: help demo test robustness shapes check lint format types arrows docs clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/^([a-z]+):[^#]*## /  make \1\t/' | expand -t 18
@@ -28,7 +31,10 @@ demo: $(VENV)/.installed-plots ## train a small scene, find poses in it, draw th
 	@$(BIN)/bidnerf demo --out $(DEMO_OUT) --overwrite
 
 test: $(VENV)/.installed-dev ## all tests; ARGS="-k se3" for some
-	@OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest $(PARALLEL) $(ARGS)
+	@$(PYTEST) $(ARGS)
+
+shapes: $(VENV)/.installed-dev ## a backend's contract, the examples and a map, with checks of all annotated shapes
+	@BIDNERF_SHAPES=1 $(PYTEST) $(SHAPES) $(ARGS)
 
 robustness: $(VENV)/.installed-dev ## hostile inputs, kills, full disks and crowds, counted; takes half an hour; ARGS="--only fuzz"
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/robustness/counts.py $(ARGS)

@@ -82,6 +82,7 @@ def test_measured_points_do_not_tell_an_approximate_focal_length() -> None:
     assert found_for(lidar).converged
 
 
+@pytest.mark.slow
 def test_a_rejection_says_that_the_map_has_no_landmarks() -> None:
     view = baked.unseen()[0]
     noise = torch.rand(view.frame.rgb.shape, generator=torch.Generator().manual_seed(0))

@@ -193,6 +193,7 @@ def test_blobs_are_localized() -> None:
 # Resuming.
 
 
+@pytest.mark.slow
 def test_an_evaluation_killed_at_random_moments_equals_one_never_killed(
     tmp_path: Path, evaluate: Evaluate
 ) -> None:

@@ -73,6 +73,7 @@ def names(report: CaptureReport, problem: str) -> list[str]:
     return [photo.name for photo in report.with_problem(problem)]  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_nothing_is_named_of_sound_photos() -> None:
     report = survey(list(photos()))
     assert [photo.problems for photo in report.photos] == [()] * 16

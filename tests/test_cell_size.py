@@ -73,6 +73,7 @@ def test_few_points_make_cells_coarser_but_no_coarser_than_their_spacing(generat
     assert chosen_grid(few[:1], baked.BOUNDS, 0.02, 0.1, 200.0).cell == 0.1
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_and_a_warning_says_so(generator: Generator) -> None:
     points = scattered(200_000, generator)
     with warnings.catch_warnings():

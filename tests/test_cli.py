@@ -1084,6 +1084,7 @@ def whole(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_resuming_loses_nothing(
     bidnerf: Run, shared: Path, whole: Path, tmp_path: Path
 ) -> None:
@@ -1121,6 +1122,7 @@ for line in sys.stdin:
 """
 
 
+@pytest.mark.slow
 def test_a_training_that_is_killed_again_and_again_still_comes_to_its_end(
     shared: Path, whole: Path, tmp_path: Path
 ) -> None:

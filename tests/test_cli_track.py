@@ -127,6 +127,7 @@ def test_a_file_that_cannot_be_read_is_left_out(bidnerf: Run, tmp_path: Path) ->
     assert read_trajectory(tmp_path / "path.txt").times.tolist() == [0, 4]
 
 
+@pytest.mark.slow
 def test_frames_of_another_scene_are_doubted(bidnerf: Run, tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     (tmp_path / "images").mkdir()

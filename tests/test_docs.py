@@ -282,6 +282,7 @@ def test_tables_follow_their_records(tables: Any, tmp_path: Path) -> None:
     assert "of another scene | 400 | 17 |" in changed
 
 
+@pytest.mark.slow
 def test_site_builds_strictly_and_needs_no_network(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="the documentation's tools are not installed")
     command = [

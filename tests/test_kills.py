@@ -74,6 +74,7 @@ def test_files_of_others_and_of_whole_maps_are_not_overwritten(
         assert "exists already and is not empty" in err
 
 
+@pytest.mark.slow
 def test_a_report_killed_before_its_page_begins_anew(bidnerf: Run, shared: Path, tmp_path: Path) -> None:
     out = tmp_path / "report"
     out.mkdir()

@@ -113,6 +113,7 @@ def test_only_the_inner_half_of_contracted_space_is_carved() -> None:
     assert float(judged[inner].float().mean()) < 0.8
 
 
+@pytest.mark.slow
 def test_training_learns_what_lies_beyond_the_box() -> None:
     """Photos of a toy before white, without alpha: rays past the box become white, though the background is black."""
     config = tiny.config(steps=150, samples_per_step=8192, carve=False)

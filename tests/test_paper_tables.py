@@ -40,6 +40,7 @@ def test_the_cells_of_a_part_can_be_tried_from_the_same_starts(
         assert len({(trial.frame, trial.size, trial.seed) for trial in same}) == 1
 
 
+@pytest.mark.slow
 def test_a_part_is_recorded(tmp_path: Path) -> None:
     few = ("--trials", "1", "--rays", "8", "--steps", "1", "--workers", "1", "--part", "inerf")
     subprocess.run(

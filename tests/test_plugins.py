@@ -1,4 +1,4 @@
-"""Each distribution under plugins/ is installed as a stranger's would be, and keeps its own tests."""
+"""Each distribution under plugins/ is installed as a stranger's would be, is found, and its own tests run there."""
 
 from __future__ import annotations
 
@@ -42,8 +42,10 @@ def copied(plugin: Path, folder: Path) -> Path:
 
 
 def run_tests(source: Path, environment: dict[str, str]) -> str:
+    """Run those of a distribution's own tests that train nothing; ``.ci/wheels`` runs all, beside the installed wheel."""
     pytest_ = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(source)]
-    return quietly([*pytest_, str(source / "tests")], cwd=source, env=environment)
+    untrained = ["-k", "not training and not query and not samples and not renders"]
+    return quietly([*pytest_, *untrained, str(source / "tests")], cwd=source, env=environment)
 
 
 def declared(source: Path) -> set[tuple[str, str]]:
@@ -59,8 +61,9 @@ def offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
     return {(e["group"], e["name"]): e["distribution"] for e in listed if e["fault"] is None}
 
 
+@pytest.mark.slow
 @every_plugin
-def test_a_plugin_is_found_and_keeps_its_own_tests(plugin: Path, tmp_path: Path) -> None:
+def test_a_plugin_is_found_and_its_own_tests_run(plugin: Path, tmp_path: Path) -> None:
     source = copied(plugin, tmp_path)
     environment = installed(source, tmp_path / "site")
     found = offered(environment)
@@ -90,6 +93,7 @@ def imported(file: Path) -> set[str]:
     }
 
 
+@pytest.mark.slow
 def test_the_template_can_be_renamed_as_it_says(tmp_path: Path) -> None:
     """The commands of its README, word for word."""
     if shutil.which("perl") is None:

@@ -36,6 +36,7 @@ from flights import (
 CHI2_99 = 16.8  # of six degrees of freedom
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [True, False], ids=["rgb-d", "rgb"])
 def test_a_sequence_is_tracked_with_honest_covariances(depth: bool) -> None:
     frames = [(t, frame if depth else without_depth(frame), T) for t, frame, T in flight()]
@@ -96,6 +97,7 @@ def test_frames_that_show_nothing_do_not_delay_the_search(count: int) -> None:
     assert [answer.converged for answer in answers[3:]] == [False] * count + [True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 5])
 def test_frames_that_come_slowly_are_all_searched(count: int) -> None:
     """Lost for more frames than are all searched, by images of another place."""
