@@ -104,6 +104,19 @@ def raising(error: BaseException) -> Callable[[], None]:
     return act
 
 
+@pytest.fixture
+def no_signal_ignored() -> Iterator[None]:
+    """Signals as in a terminal, also where the tests run in the background, which ignores some of them."""
+    usual = {
+        signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL
+    }  # fmt: skip
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("no_signal_ignored")
 @pytest.mark.parametrize("command", ["localize", "track"])
 @pytest.mark.parametrize(
     ("end", "status"),
