@@ -163,6 +163,10 @@ def _cells(records: Records, sensor: str) -> dict[str, dict[str, Record]]:
     }
 
 
+CLEAN = {"RGB": "no_start_rgb", "RGB-D": "no_start_rgbd"}
+"""Records of method ``auto`` on images without faults."""
+
+
 @table
 def no_start(records: Records) -> str:
     """Unchanged images, localized by ``auto`` without a start."""
@@ -172,8 +176,8 @@ def no_start(records: Records) -> str:
     )  # fmt: skip
     rows = []
     for scene, title in SCENES.items():
-        for sensor in FAULTED:
-            if cell := _cells(records, sensor).get(scene, {}).get("none"):
+        for sensor, record in CLEAN.items():
+            if cell := records[record]["cells"].get(scene, {}).get(sensor, {}).get("none"):
                 c = Counts.of(cell)
                 inside = f"{c.inside} of {c.bounded}"
                 time = _seconds(cell["median_cpu_seconds"])
@@ -185,8 +189,8 @@ def no_start(records: Records) -> str:
 def headline(records: Records) -> str:
     """README's sentence about localization without a start."""
     found, times = {}, []
-    for sensor in FAULTED:
-        clean = [cells["none"] for cells in _cells(records, sensor).values()]
+    for sensor, record in CLEAN.items():
+        clean = [cells[sensor]["none"] for cells in records[record]["cells"].values()]
         found[sensor] = (_total(map(Counts.of, clean)), len(clean))
         times += [cell["median_cpu_seconds"] for cell in clean]
     rgb, rgbd = found["RGB"], found["RGB-D"]
