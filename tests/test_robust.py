@@ -7,9 +7,10 @@ from typing import get_args
 
 import pytest
 import torch
+from scipy.stats import chi2
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.robust import Robust, RobustName
+from bidnerf_core.geometry.robust import Robust, RobustName, chi_squared_quantile
 
 NAMES = get_args(RobustName)
 SCALE = 0.3
@@ -75,3 +76,9 @@ def test_barrons_general_form(name: RobustName, alpha: float) -> None:
 def test_a_scale_that_is_none_is_told(scale: float) -> None:
     with pytest.raises(InputError, match="positive"):
         Robust("huber", scale)
+
+
+@pytest.mark.parametrize("count", [1, 2, 6, 7])
+def test_quantiles_of_chi_squared_are_those_of_scipy(count: int) -> None:
+    for probability in (0.01, 0.5, 0.95, 0.999):
+        assert chi_squared_quantile(probability, count) == chi2.ppf(probability, count)

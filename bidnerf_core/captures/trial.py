@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
-from scipy.stats import chi2
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.robust import chi_squared_quantile
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
@@ -135,7 +135,7 @@ def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
     """Return the ``correlation`` with which the errors are as large as the covariances of the fits predict."""
     updates = torch.stack([answer.update for answer in answers])
     covariances = torch.stack([answer.found.covariance for answer in answers])
-    expected = float(chi2.ppf(QUANTILE, 6))
+    expected = chi_squared_quantile(QUANTILE, 6)
     low, high = CORRELATIONS
     for _ in range(30):  # bisection, geometrically
         middle = (low * high) ** 0.5
@@ -149,7 +149,7 @@ def _correlation(answers: Sequence[_Answer], landmarks: LandmarkMap) -> float:
 def _unexplained(answers: Sequence[_Answer]) -> Float[Tensor, "6 6"]:
     """Return the covariance of independent errors along each axis as large as those of the answers."""
     squared = torch.stack([answer.update for answer in answers]).square()
-    return torch.diag(squared.quantile(QUANTILE, dim=0) / float(chi2.ppf(QUANTILE, 1)))
+    return torch.diag(squared.quantile(QUANTILE, dim=0) / chi_squared_quantile(QUANTILE, 1))
 
 
 def _factors(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "n"]:
@@ -169,6 +169,6 @@ def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> 
     for _ in range(30):
         middle = (low * high).sqrt()
         squared = apparent.square() / (explained + middle.square())
-        above = squared.quantile(QUANTILE, dim=0) > float(chi2.ppf(QUANTILE, 1))
+        above = squared.quantile(QUANTILE, dim=0) > chi_squared_quantile(QUANTILE, 1)
         low, high = torch.where(above, middle, low), torch.where(above, high, middle)
     return (low * high).sqrt()

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
-from scipy.stats import chi2
 from torch import Tensor
 
+from bidnerf_core.geometry.robust import chi_squared_quantile
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
 from bidnerf_core.mapping.observed_points import ObservedPoints
@@ -85,9 +85,9 @@ def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
     covariance = torch.diag(scale)
     for _ in range(WEIGHT_ROUNDS):
         squared = (values @ torch.linalg.inv(covariance) * values).sum(-1).clamp(min=1e-12)
-        squared = squared * (float(chi2.ppf(0.5, channels)) / float(squared.median()))
+        squared = squared * (chi_squared_quantile(0.5, channels) / float(squared.median()))
         weight = 1 / (1 + squared / channels)
         covariance = (values.mT * weight) @ values / weight.sum() + 1e-9 * torch.diag(scale)
     squared = (values @ torch.linalg.inv(covariance) * values).sum(-1)
-    covariance = covariance * (float(squared.median()) / float(chi2.ppf(0.5, channels)))
+    covariance = covariance * (float(squared.median()) / chi_squared_quantile(0.5, channels))
     return (covariance + covariance.mT) / 2

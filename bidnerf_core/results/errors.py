@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
+from bidnerf_core.geometry.robust import chi_squared_quantile
 from bidnerf_core.geometry.se3 import SE3
 
 
@@ -74,9 +75,7 @@ def within(
     The bound is the quantile of the chi-squared distribution with 6 degrees of freedom, 12.59 for 0.95. A consistent covariance
     has that share of its errors within. False where the covariance has no inverse.
     """
-    from scipy.special import chdtri  # here, because importing scipy takes longer than any help page should
-
-    return normalized_error_squared(found, true, covariance) <= float(chdtri(6, 1 - probability))
+    return normalized_error_squared(found, true, covariance) <= chi_squared_quantile(probability, 6)
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
