@@ -89,6 +89,8 @@ def working_device(device: torch.device | str) -> torch.device:
     """
     try:
         found = torch.device(device)
+        if found.type == "cpu" and found.index:  # torch ignores the number
+            raise RuntimeError("there is one CPU")
         torch.ones((), device=found).item()
     except (RuntimeError, AssertionError, TypeError) as error:  # which one depends on the build of torch
         raise InputError(

@@ -150,7 +150,7 @@ def test_a_tensor_that_is_forgotten_is_named(part: str) -> None:
         assert elsewhere_of(there, DEVICE) == [f"map.{part}"]
 
 
-@pytest.mark.parametrize("device", ["mars", "cuda:99", "meta", ""])
+@pytest.mark.parametrize("device", ["mars", "cuda:99", "cpu:5", "meta", ""])
 def test_a_device_that_does_not_work_is_named(device: str) -> None:
     message = re.escape(f"device {str(device)!r} does not work here")
     stored = whole_map("vanilla")
