@@ -21,12 +21,11 @@ from bidnerf_core.cli.camera_options import (
     RegisterDepth,
     depth_registration,
 )
-from bidnerf_core.cli.folders import check_plot, check_pose_file
+from bidnerf_core.cli.folders import check_output, check_plot, check_pose_file
 from bidnerf_core.cli.interruptions import uninterrupted
 from bidnerf_core.cli.options import Flag, MapFolder, option, parse, require
 from bidnerf_core.cli.output import print_json, print_table, say
 from bidnerf_core.cli.progress import counted
-from bidnerf_core.cli.tracking_video import TrackingVideo, check_video
 from bidnerf_core.cli.watch_folder import STDIN, requests
 from bidnerf_core.datasets import FileSequence, FrameSequence, ReadOptions
 from bidnerf_core.depth.registration import DepthCamera
@@ -38,6 +37,7 @@ from bidnerf_core.results import tracked_path as library
 from bidnerf_core.results.plot_style import require_matplotlib
 from bidnerf_core.results.pose_files import read_pose
 from bidnerf_core.results.tracked_path import TrackedPath, opened_for
+from bidnerf_core.results.tracking_video import TrackingVideo, check_video
 
 
 def run(arguments: list[str]) -> None:
@@ -108,7 +108,8 @@ def run(arguments: list[str]) -> None:
             require_matplotlib()
             check_plot(plot, inputs)
         if video is not None:
-            check_video(video, inputs)
+            check_video(video)
+            check_output(video, inputs)
         registration = depth_registration(register_depth)
         sensor = ReadOptions(register_depth=registration).sensor(sequence) if follow else None
         begin, settings = (

@@ -1,8 +1,7 @@
-"""``bidnerf track --video``: the camera's images next to the map as rendered from the poses found."""
+"""The video of a tracked sequence: the camera's images next to the map as rendered from the poses found."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -14,7 +13,6 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from bidnerf_core.cli.folders import check_output
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.localization import Localization
@@ -33,7 +31,7 @@ WHITE_DEPTH = 5.0
 """Depth (metres) that is drawn white, where only depth was recorded."""
 
 
-def check_video(file: Path, inputs: Iterable[Path | str | None]) -> None:
+def check_video(file: Path) -> None:
     """Raise ``InputError``, before any work is done, where a video cannot be written."""
     try:
         import av  # noqa: F401
@@ -44,7 +42,6 @@ def check_video(file: Path, inputs: Iterable[Path | str | None]) -> None:
     if file.suffix.lower() not in WRITTEN_SUFFIXES or not file.parent.is_dir():
         endings = ", ".join(WRITTEN_SUFFIXES)
         raise InputError(f"{file}: expected a name that ends with {endings}, in a folder that exists")
-    check_output(file, inputs)
 
 
 class TrackingVideo:
