@@ -131,7 +131,7 @@ def _with_twin(
     seen = replace(query.seen_by(cameras), prior=FIXED, evidence=NO_EVIDENCE)
     twin = twin_of(seen, matcher, found)
     clock.lap("twin")
-    return replace(found, twin=twin)
+    return found.with_twin(twin)
 
 
 def _calibration_prior(views: Sequence[View]) -> CalibrationPrior:
