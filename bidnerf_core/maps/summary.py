@@ -74,7 +74,7 @@ class MapSummary:
         place = f"{self.map}, {(self.bytes or 0) / 2**20:.1f} MiB" if self.map else "in memory"
         return {
             "map": f"{place}, written by bidnerf {self.bidnerf}",
-            "made from": f"{self.data or 'unnamed data'}, {photos}",
+            "made from": f"{self.data or 'views in memory'}, {photos}",
             "training": f"{self.step} steps of backend {self.backend} in {time}, {state}",
             "field": self._field_line(),
             "scene": _scene_line(self.bounds),

@@ -243,7 +243,7 @@ def _trained(
         scene = _baked(scene, views, tracked, work.bake, work)
     if work.out is not None:
         size = sum(file.stat().st_size for file in work.out.iterdir()) / 2**20
-        log.info(f"{where}: map of {info.data}, {size:.1f} MiB")
+        log.info(f"{where}: map of {info.data or 'views in memory'}, {size:.1f} MiB")
     return scene
 
 
