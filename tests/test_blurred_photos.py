@@ -16,7 +16,7 @@ from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.testing.textured_field import ground
-from bidnerf_core.training import Progress, Silent, Supervision, SupervisionConfig, supervised_loss
+from bidnerf_core.training import Silent, Supervision, SupervisionConfig, TrainingStep, supervised_loss
 from landmark_scene import looking_in
 from test_supervision import BACKENDS
 
@@ -88,7 +88,7 @@ class FirstLoss(Silent):
 
     loss: float = float("nan")
 
-    def step(self, progress: Progress) -> None:
+    def step(self, progress: TrainingStep) -> None:
         if progress.step == 1:
             self.loss = progress.loss
 

@@ -36,7 +36,7 @@ from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.map import load_map
 from bidnerf_core.registry import list_plugins
 from bidnerf_core.scenes.demo import demo_object
-from bidnerf_core.training import Progress
+from bidnerf_core.training import TrainingStep
 from commands import CommandResult, Run
 
 LOCALIZE_KEYS = {
@@ -108,7 +108,7 @@ def test_a_line_of_progress_leaves_out_what_the_recipe_does_not_tell(
 ) -> None:
     info = MapInfo("fog", {}, demo_object().bounds, 0, complete=False)
     with Display() as display:
-        Checkpoints(info, progress=display).step(Progress(5, 5, 0.25, 6.0, samples))
+        Checkpoints(info, progress=display).step(TrainingStep(5, 5, 0.25, 6.0, samples))
     line = f"training: 5/5 steps, loss 0.25000  PSNR 6.00 dB{shown}, 0 s left\n"
     assert capsys.readouterr().err == line
 

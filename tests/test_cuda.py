@@ -25,7 +25,7 @@ from bidnerf_core.localization.solvers import adam
 from bidnerf_core.localization.solvers.cuda_graph import captured
 from bidnerf_core.maps.map import load_map
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views
-from bidnerf_core.training import Progress, Silent, TrainingState, TrainingStopped
+from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped
 from problems import FieldMap
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")
@@ -122,7 +122,7 @@ class LossRecorder(Silent):
     def __init__(self) -> None:
         self.losses: list[float] = []
 
-    def step(self, progress: Progress) -> None:
+    def step(self, progress: TrainingStep) -> None:
         self.losses.append(progress.loss)
 
 
@@ -136,7 +136,7 @@ class Interrupted(Silent):
     def resume(self) -> TrainingState | None:
         return self.begin
 
-    def step(self, progress: Progress) -> None:
+    def step(self, progress: TrainingStep) -> None:
         self.stopping = progress.step == self.stop
 
     def save(self, state: TrainingState) -> None:

@@ -20,13 +20,13 @@ from bidnerf_core.frames.pixels import all_pixels, observe
 from bidnerf_core.scenes.trajectories import orbit
 from bidnerf_core.testing.simulated_device import DEVICE, Elsewhere
 from bidnerf_core.training import (
-    Progress,
     RayBank,
     Report,
     Silent,
     StepOutcome,
     TrainingBatch,
     TrainingState,
+    TrainingStep,
     TrainingStopped,
     cosine,
     fit,
@@ -44,12 +44,12 @@ class Kept(Silent):
         self.stop, self.begin = stop, begin
         self.stopping = False
         self.saved: list[TrainingState] = []
-        self.told: list[Progress] = []
+        self.told: list[TrainingStep] = []
 
     def resume(self) -> TrainingState | None:
         return self.begin
 
-    def step(self, progress: Progress) -> None:
+    def step(self, progress: TrainingStep) -> None:
         self.told.append(progress)
         self.stopping = progress.step == self.stop
 

@@ -13,8 +13,7 @@ from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.files import save_map
 from bidnerf_core.progress import Cancel, Progress, ProgressCallback
-from bidnerf_core.training import Progress as TrainingStep
-from bidnerf_core.training import TrainingState
+from bidnerf_core.training import TrainingState, TrainingStep
 
 CHECKPOINT_SECONDS = 60.0
 

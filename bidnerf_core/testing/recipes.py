@@ -19,7 +19,7 @@ from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import View
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.scene import BOUNDS, DIMMED_BOUNDS, camera_rays, exposed_views, rgbd_views
-from bidnerf_core.training import Progress, TrainingState, TrainingStopped
+from bidnerf_core.training import TrainingState, TrainingStep, TrainingStopped
 
 LEARNED = 0.8
 """Factor by which the squared error of colour must have fallen."""
@@ -38,14 +38,14 @@ class Recorder:
     def __init__(
         self, due: Sequence[int] = (), stop: int | None = None, state: TrainingState | None = None
     ) -> None:
-        self.steps: list[Progress] = []
+        self.steps: list[TrainingStep] = []
         self.saved: list[TrainingState] = []
         self._due, self._stop, self._state = due, stop, state
 
     def resume(self) -> TrainingState | None:
         return self._state
 
-    def step(self, progress: Progress) -> None:
+    def step(self, progress: TrainingStep) -> None:
         self.steps.append(progress)
 
     def due(self, step: int) -> bool:

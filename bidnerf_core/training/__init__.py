@@ -4,12 +4,11 @@ from bidnerf_core.training.colour_transform import ColourTransforms, fitted_colo
 from bidnerf_core.training.loop import StepOutcome, cosine, fit
 from bidnerf_core.training.loss import ray_termination, supervised_loss
 from bidnerf_core.training.ray_bank import RayBank, TrainingBatch
-from bidnerf_core.training.report import Progress, Report, Silent, TrainingState, TrainingStopped
+from bidnerf_core.training.report import Report, Silent, TrainingState, TrainingStep, TrainingStopped
 from bidnerf_core.training.supervision import Supervision, SupervisionConfig
 
 __all__ = [
     "ColourTransforms",
-    "Progress",
     "RayBank",
     "Report",
     "Silent",
@@ -18,6 +17,7 @@ __all__ = [
     "SupervisionConfig",
     "TrainingBatch",
     "TrainingState",
+    "TrainingStep",
     "TrainingStopped",
     "cosine",
     "fit",

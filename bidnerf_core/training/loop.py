@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.training.report import Progress, Report, TrainingState, TrainingStopped
+from bidnerf_core.training.report import Report, TrainingState, TrainingStep, TrainingStopped
 
 BESIDE = "beside."
 """Prefix of the names under which a state holds parameters that are learned jointly with the field."""
@@ -71,7 +71,7 @@ def fit(
         result.loss.backward()
         optimizer.step()
         psnr = -10 * math.log10(max(result.mse, 1e-10))
-        report.step(Progress(step + 1, steps, loss, psnr, result.samples_per_ray))
+        report.step(TrainingStep(step + 1, steps, loss, psnr, result.samples_per_ray))
         # Read it once: it may change at any time, and a training that stops must have saved its state.
         stopping = report.stopping
         if stopping or report.due(step + 1):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingStep:
     """One step of training, for display."""
 
     step: int
@@ -37,7 +37,7 @@ class Report(Protocol):
         """Return the state to resume from, or None to start anew."""
         ...
 
-    def step(self, progress: Progress) -> None:
+    def step(self, progress: TrainingStep) -> None:
         """Receive the progress after each step."""
         ...
 
@@ -63,7 +63,7 @@ class Silent:
     def resume(self) -> TrainingState | None:
         return None
 
-    def step(self, progress: Progress) -> None:
+    def step(self, progress: TrainingStep) -> None:
         pass
 
     def due(self, step: int) -> bool:
