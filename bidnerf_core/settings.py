@@ -90,6 +90,9 @@ class Expert:
 EXPERT = Expert()
 
 Count = Annotated[int, Range(1, 10**7)]
+Layers = Annotated[
+    int, Range(1, 100)
+]  # of a network: each takes time and memory even where its tensors have only shapes
 NotNegative = Annotated[float, Range(0.0)]
 Positive = Annotated[float, Above(0.0, 1e6)]
 

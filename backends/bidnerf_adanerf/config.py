@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.settings import Count, NotNegative, Positive, Range
+from bidnerf_core.settings import Count, Layers, NotNegative, Positive, Range
 from bidnerf_core.training import SupervisionConfig
 
 
@@ -16,12 +16,12 @@ class AdaNerfConfig(SupervisionConfig):
 
     # The shading network.
     width: Count = 128  # units of a hidden layer of the shading network
-    layers: Count = 4  # hidden layers of the shading network before the density
+    layers: Layers = 4  # hidden layers of the shading network before the density
     position_frequencies: Annotated[int, Range(0, 64)] = 8  # octaves of sines and cosines of the position
     direction_frequencies: Annotated[int, Range(0, 64)] = 2  # octaves of sines and cosines of the direction
     # The sampling network, here called the oracle.
     oracle_width: Count = 256  # units of a hidden layer of the oracle, the network that chooses samples
-    oracle_layers: Count = 3  # hidden layers of the oracle
+    oracle_layers: Layers = 3  # hidden layers of the oracle
     ray_points: Annotated[int, Range(2, 10**7)] = 16  # points that describe a ray to the oracle
     ray_frequencies: Annotated[int, Range(0, 64)] = 3  # octaves of sines and cosines of each of these points
     # How many samples a ray takes. The last two may be changed in a trained map. Fewer samples are faster, but missed bins

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import FieldValues, RaySampler, SceneBounds
 from bidnerf_core.fields.sampling import Concentrated
-from bidnerf_core.settings import Count, NotNegative, Range, Settings
+from bidnerf_core.settings import Count, Layers, NotNegative, Range, Settings
 from bidnerf_hashgrid.encoding import HashEncoding, HashEncodingConfig
 from bidnerf_hashgrid.networks import log_density_and_rgb
 from bidnerf_hashgrid.occupancy import GridDensity, OccupancyGrid
@@ -32,7 +32,7 @@ class FieldConfig(Settings):
     # cells of the finest level across what a pixel shows; finest_resolution limits them, and decides alone where this is 0
     cells_per_pixel: NotNegative = 2.5
     width: Count = 64  # units of a hidden layer
-    colour_layers: Count = 2  # hidden layers of the colour network
+    colour_layers: Layers = 2  # hidden layers of the colour network
     # number of features that the density network passes on to the colour network
     geometry_features: Count = 15
     # cells of the occupancy grid along the longest side of the scene

@@ -11,14 +11,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bidnerf_core.fields.encoding import encoded_width, frequency_encoding, octaves
-from bidnerf_core.settings import Count, Range, Settings
+from bidnerf_core.settings import Count, Layers, Range, Settings
 
 
 @dataclass(frozen=True)
 class NetworkConfig(Settings):
     """Size of one MLP."""
 
-    layers: Count = 4  # hidden layers before the density
+    layers: Layers = 4  # hidden layers before the density
     width: Count = 128  # units of a hidden layer; the layer that takes the direction has half of them
     skip: Annotated[int, Range(0)] = 2  # number of layers before the position is fed in once more; 0: never
     # octaves of sines and cosines of the position; the first period is the scene's longest side
