@@ -31,7 +31,7 @@ def grown(
 
 
 def met(box: AxisBox, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> float:
-    """Return the fraction of the rays that meet the box ."""
+    """Return the fraction of the rays that meet the box."""
     near, far = crossed_box(origins, directions, *box)
     return (far >= near.clamp(min=0)).double().mean().item()
 
