@@ -135,8 +135,9 @@ class Map:
         For the surface, views with measured depth replace rendered ones; landmarks are built from all views of ``data``
         (those of ``split``, where it is a dataset or the path to one). Without data, landmarks are built from images that the
         field renders, unless the map has landmarks of photos: these are kept unless ``rendered_landmarks`` is set.
-        ``features`` is the name of another detector of landmarks than the map's. Raises ``InputError`` where the data is not usable or shows another scene, where nothing can be baked, and where another
-        program writes into the folder; raises ``Cancelled`` once ``cancel`` returns True. Parts that are finished then stay.
+        ``features`` is the name of another detector of landmarks than the map's. Raises ``InputError`` where the data is not
+        usable or shows another scene, where nothing can be baked, and where another program writes into the folder; raises
+        ``Cancelled`` once ``cancel`` returns True. Parts that are finished then stay.
         """
         if rendered_landmarks and data is not None:
             raise InputError("rendered_landmarks takes no photos, but data gives some; expected one of them")

@@ -76,9 +76,9 @@ def train(
     """Train a map on posed images: check and refine their poses, train the field, and bake a surface and landmarks.
 
     ``data`` is a dataset, the path to one, or views whose reference frame is the world; ``split`` names the views of a dataset.
-    ``backend`` is the name of an installed backend, and ``config`` holds its settings: an object of its ``config_type``, or a dict of
-    those that differ from the defaults. The map is stored in folder ``out`` while it is trained, and stays in memory only if
-    that is None. ``refine_poses`` is "always", "never", or "auto": if the images contradict the given poses. ``bake`` may hold
+    ``backend`` is the name of an installed backend, and ``config`` holds its settings: an object of its ``config_type``, or a
+    dict of those that differ from the defaults. The map is stored in folder ``out`` while it is trained, and stays in memory
+    only if that is None. ``refine_poses`` is "always", "never", or "auto": if the images contradict the given poses. ``bake`` may hold
     the settings of baking.
 
     ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True, ``Cancelled`` is
@@ -86,7 +86,8 @@ def train(
     training as well; the map in the folder is then that of the last checkpoint, at most ``checkpoint_seconds`` old.
 
     ``background`` is the colour behind images with an alpha channel. Images without depth take that of the points of the COLMAP
-    sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones. ``features`` is the name of the detector of the landmarks.
+    sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones. ``features`` is the name of the
+    detector of the landmarks.
 
     Raises ``InputError`` where data, settings or folder are not usable; the folder must be empty unless ``overwrite`` is set.
     """
