@@ -1,4 +1,4 @@
-"""Each distribution under plugins/ is installed as a stranger's would be, is found, and its own tests run there."""
+"""Each distribution under plugins/ is installed as a stranger's would be, and is found. ``.ci/wheels`` runs their own tests."""
 
 from __future__ import annotations
 
@@ -63,14 +63,13 @@ def offered(environment: dict[str, str]) -> dict[tuple[str, str], str]:
 
 @pytest.mark.slow
 @every_plugin
-def test_a_plugin_is_found_and_its_own_tests_run(plugin: Path, tmp_path: Path) -> None:
+def test_a_plugin_is_found(plugin: Path, tmp_path: Path) -> None:
     source = copied(plugin, tmp_path)
     environment = installed(source, tmp_path / "site")
     found = offered(environment)
     assert {point: found.get(point) for point in declared(source)} == dict.fromkeys(
         declared(source), plugin.name
     )
-    assert "passed" in run_tests(source, environment)
 
 
 @every_plugin
