@@ -1,8 +1,9 @@
 """Steps as CUDA graphs: all operations of a step in one launch.
 
-A step of a few thousand rays is some hundreds of short operations. Launching each from Python takes longer than it computes;
-a graph of them takes the device's time only. What may be captured is what runs without waiting for the device (see
-``waiting``), in the same shapes each time, on tensors that it writes in place. Values that Python computes are captured as they are.
+A step of a few thousand rays consists of some hundreds of short operations, each of which takes longer to launch from Python
+than to compute; a graph launches all of them at once. A step can be captured if it never waits for the device (see
+``devices.without_waiting``), has the same shapes each time, and writes its results into existing tensors. Numbers computed in
+Python keep the value that they had during the capture.
 """
 
 from __future__ import annotations
