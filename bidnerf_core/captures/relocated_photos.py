@@ -58,7 +58,7 @@ class Relocation:
         return "turned" if about_axis and math.degrees(angle) >= TURNED_ANGLE else "badly posed"
 
     def onto(self, record: PhotoRecord) -> PhotoRecord:
-        """Return the record, completed by how far off the given pose is; a mirrored photo has no pose to compare."""
+        """Return the record with the error of its given pose filled in; that of a mirrored photo cannot be compared."""
         if self.mirrored:
             return record
         translation, rotation = (float(torch.linalg.vector_norm(part)) for part in self.update.split(3))

@@ -158,9 +158,9 @@ def _factors(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor
 
 
 def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> Float[Tensor, "4"]:
-    """Return the standard deviations of the corrections that the images' intrinsics, although right, seem to need.
+    """Return the standard deviations of the corrections estimated for intrinsics that are in fact right.
 
-    What the fits' own uncertainty explains is left out.
+    The part explained by the uncertainty of each fit is removed.
     """
     apparent = torch.stack([answer.found.miscalibration.apparent for answer in answers])
     noise = torch.stack([answer.found.miscalibration.noise for answer in answers])

@@ -106,7 +106,7 @@ DEPTH_RESIDUALS: dict[str, DepthResidual] = {
 
 
 def free_space(rendering: Rendering, distance: Float[Tensor, "*p"], margin: float) -> Float[Tensor, "*p"]:
-    """Return how far, on average over the ray, rendering weight lies nearer than ``distance - margin``; metres.
+    """Return how far (metres) the matter on a ray lies in front of ``distance - margin``, summed with the rendering weights.
 
     A sensor that measured a distance saw nothing in front of it. The error of the mean distance can be 0 with matter on both
     sides of the measured point; this residual cannot.

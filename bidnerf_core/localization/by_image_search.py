@@ -88,7 +88,7 @@ def _refined_robustly(
 ) -> ColourAnswer:
     """Refine the best pose of a search on many rays, with a loss that ignores outliers, and judge it as any other pose.
 
-    Few rays, or rays at a coarse level, lead it away where half of them are outliers.
+    If half of the rays are outliers, refinement on few rays or at a coarse level drifts away from the true pose.
     """
     *_, fine = usual_stages(config, 1)
     many = replace(fine, rays=MANY_RAYS * fine.rays, colour_scale=fine.colour_scale / 2)

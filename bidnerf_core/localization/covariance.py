@@ -1,4 +1,4 @@
-"""Covariances of poses: right updates at the camera, translation (metres) before rotation (radians)."""
+"""Covariances of poses, for right updates in the camera frame: translation (metres) before rotation (radians)."""
 
 from __future__ import annotations
 

@@ -19,13 +19,13 @@ from bidnerf_core.frames.frame import Frame
 
 
 def focal_scaled(frame: Frame, factor: float, generator: Generator) -> Frame:
-    """State ``factor`` times the true focal lengths; the image stays as it is."""
+    """Multiply the stated focal lengths by ``factor``; the image stays as it is."""
     camera = frame.intrinsics
     return replace(frame, intrinsics=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
 
 
 def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
-    """State only a focal length, marked as approximate, as for an uncalibrated photo; the image stays as it is."""
+    """Reduce the stated camera to a focal length, marked as approximate, as for an uncalibrated photo; the image stays as it is."""
     if not on:
         return frame
     camera = frame.intrinsics
@@ -34,7 +34,7 @@ def nominal(frame: Frame, on: float, generator: Generator) -> Frame:
 
 
 def stretched(frame: Frame, factor: float, generator: Generator) -> Frame:
-    """State ``factor`` times the true horizontal focal length, as if only the image's height had been resized."""
+    """Multiply the stated horizontal focal length by ``factor``, as if only the image's height had been resized."""
     return replace(frame, intrinsics=replace(frame.intrinsics, fx=frame.intrinsics.fx * factor))
 
 
@@ -66,7 +66,7 @@ def _kept(size: int, share: float, end: Tensor) -> slice:
 
 
 def principal_point_moved(frame: Frame, pixels: float, generator: Generator) -> Frame:
-    """State a principal point that is ``pixels`` away from the true one, in a random direction."""
+    """Move the stated principal point by ``pixels`` in a random direction; the image stays as it is."""
     camera, (across, down) = frame.intrinsics, random_direction(generator)
     wrong = replace(camera, cx=camera.cx + pixels * across, cy=camera.cy + pixels * down)
     return replace(frame, intrinsics=wrong)
