@@ -10,14 +10,14 @@ from torch import Tensor
 
 from bidnerf_core import SE3
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
-from bidnerf_core.mapping.bundle_adjustment import (
+from bidnerf_core.mapping.geometry.bundle_adjustment import (
     Adjustment,
     MeasuredSightings,
     PosePrior,
     adjusted,
     linearized,
 )
-from bidnerf_core.mapping.triangulation import Sightings
+from bidnerf_core.mapping.geometry.triangulation import Sightings
 from landmark_scene import looking_in
 
 VIEWS, POINTS, FOCAL = 12, 150, 300.0

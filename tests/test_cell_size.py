@@ -16,8 +16,8 @@ from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import BakeConfig, bake
-from bidnerf_core.mapping.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
-from bidnerf_core.mapping.posed_depth import PosedDepthImage, measured_image
+from bidnerf_core.mapping.surface.cell_size import chosen_grid, depth_noise, footprint, spacing, surface_bytes
+from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, measured_image
 from bidnerf_core.scenes.primitives import Box
 from bidnerf_core.scenes.textures import blotches
 

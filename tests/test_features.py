@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bidnerf_core import InputError
-from bidnerf_core.mapping.features import (
+from bidnerf_core.mapping.landmarks.features import (
     Features,
     Sift,
     paired_squared_distances,

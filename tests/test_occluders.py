@@ -18,8 +18,8 @@ from bidnerf_core.localization.search.correspondences import query_image
 from bidnerf_core.localization.search.guided import projected_landmarks
 from bidnerf_core.localization.search.mirrored import mirror_image
 from bidnerf_core.localization.search.occluders import Occluder, nearest_piece
-from bidnerf_core.mapping.calibration import GIVEN
-from bidnerf_core.mapping.features import SIFT
+from bidnerf_core.mapping.geometry.calibration import GIVEN
+from bidnerf_core.mapping.landmarks.features import SIFT
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
 from problems import localize

@@ -29,7 +29,7 @@ from bidnerf_core.localization.tracking.odometry import LEAST_CORNERS, Odometry
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
-from bidnerf_core.mapping.features import grey_image
+from bidnerf_core.mapping.landmarks.features import grey_image
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.testing.textured_field import textured_map
 from flights import (

@@ -21,14 +21,14 @@ from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.features import USUAL_FEATURES, Features
-from bidnerf_core.mapping.landmark_building import (
+from bidnerf_core.mapping.landmarks.building import (
     DEFAULT_LANDMARKS,
     LandmarkConfig,
     TrackedViews,
     tracked_views,
 )
-from bidnerf_core.mapping.landmarks import HeldOutTrial, LandmarkMap
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, Features
+from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap
 
 HELD_OUT, MOST_HELD_OUT = 8, 24
 """One image in ``HELD_OUT`` is held out, and at most ``MOST_HELD_OUT`` in all."""
@@ -58,7 +58,7 @@ def build_tried_landmarks(
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
-    """Build landmarks as ``mapping.landmark_building.build_landmarks`` does, and try them: see ``tried_landmarks``."""
+    """Build landmarks as ``mapping.landmarks.building.build_landmarks`` does, and try them: see ``tried_landmarks``."""
     return tried_landmarks(tracked_views(views, features, config, progress), views, None, config, report)
 
 

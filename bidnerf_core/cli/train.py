@@ -28,7 +28,7 @@ from bidnerf_core.devices import working_device
 from bidnerf_core.errors import InputError, UsageError
 from bidnerf_core.io.images import background_colour
 from bidnerf_core.io.json import from_plain
-from bidnerf_core.mapping.features import USUAL_FEATURES
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 from bidnerf_core.maps import training
 from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS
 from bidnerf_core.maps.description import MapInfo, load_info

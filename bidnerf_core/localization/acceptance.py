@@ -20,8 +20,8 @@ from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.mapping.calibration import UNSTRETCHED, Calibration
-from bidnerf_core.mapping.casting import trace
+from bidnerf_core.mapping.geometry.calibration import UNSTRETCHED, Calibration
+from bidnerf_core.mapping.surface.casting import trace
 
 WELL_BEFORE = 0.04
 """Share of the extent by which a line of sight must meet the surface too early to count as a violation."""

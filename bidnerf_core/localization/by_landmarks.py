@@ -44,7 +44,7 @@ from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.calibration import Calibration
+from bidnerf_core.mapping.geometry.calibration import Calibration
 
 POINTS = 2000
 """Largest number of measured points that are fused."""

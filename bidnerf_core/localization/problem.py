@@ -19,7 +19,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 _Item = TypeVar("_Item")
 _Map = TypeVar("_Map", bound="SceneMap")

@@ -48,7 +48,7 @@ from bidnerf_core.localization.tracking.relocalization import (
 from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.features import grey_image, strongest
+from bidnerf_core.mapping.landmarks.features import grey_image, strongest
 
 START = 0.03, 0.1
 """Standard deviations of a start whose uncertainty is not given: share of the scene's extent, and radians."""

@@ -9,9 +9,9 @@ from bidnerf_core.fields.contract import LARGEST_LENGTH
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.images import COLOUR_ROUNDING
-from bidnerf_core.mapping.surface_map import SurfaceMap
-from bidnerf_core.mapping.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
-from bidnerf_core.mapping.surfels import Surfels
+from bidnerf_core.mapping.surface.surface_map import SurfaceMap
+from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, COARSER_FROM, SurfelIndex, block_shape
+from bidnerf_core.mapping.surface.surfels import Surfels
 
 Kinds = dict[str, tuple[tuple[int, ...], torch.dtype]]
 """Shape (-1: any length) and dtype of named tensors."""

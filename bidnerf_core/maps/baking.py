@@ -16,10 +16,10 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
-from bidnerf_core.mapping.keyframes import colour_noise, rendered_views
-from bidnerf_core.mapping.landmark_building import TrackedViews, tracked_views
-from bidnerf_core.mapping.landmarks import HeldOutTrial, LandmarkMap
-from bidnerf_core.mapping.pose_scatter import update_scatter
+from bidnerf_core.mapping.landmarks.building import TrackedViews, tracked_views
+from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap
+from bidnerf_core.mapping.landmarks.pose_scatter import update_scatter
+from bidnerf_core.mapping.surface.keyframes import colour_noise, rendered_views
 from bidnerf_core.maps.description import LandmarkSource, MapInfo, cameras_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 

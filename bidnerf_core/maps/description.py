@@ -13,7 +13,7 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import from_plain, read_json
-from bidnerf_core.mapping.features import USUAL_FEATURES
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 
 FORMAT = "bidnerf map"
 VERSION = 1

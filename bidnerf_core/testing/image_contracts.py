@@ -13,7 +13,7 @@ from torch import Tensor
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults import Fault, find_fault
 from bidnerf_core.frames.frame import Frame
-from bidnerf_core.mapping.features import Features, Keypoints, find_features, squared_distances
+from bidnerf_core.mapping.landmarks.features import Features, Keypoints, find_features, squared_distances
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.textured_field import training_views
 
@@ -48,7 +48,7 @@ class FeaturesContract:
             )
             require_that(
                 found.descriptors.dtype == torch.uint8,
-                f"{who}: descriptors are {found.descriptors.dtype}, expected bytes; bidnerf_core.mapping.features.quantized"
+                f"{who}: descriptors are {found.descriptors.dtype}, expected bytes; bidnerf_core.mapping.landmarks.features.quantized"
                 " makes them of numbers",
             )
             inside = (found.pixels >= 0).all() and (found.pixels <= torch.tensor([width, height])).all()

@@ -16,8 +16,8 @@ from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
-from bidnerf_core.mapping.landmark_building import build_landmarks
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.landmarks.building import build_landmarks
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 from bidnerf_core.scenes.trajectories import orbit
 
 BOUNDS = SceneBounds((-1.2, -1.2, -0.3), (1.2, 1.2, 0.3), 0.1, 6.0)

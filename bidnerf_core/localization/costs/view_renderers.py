@@ -13,7 +13,7 @@ from bidnerf_core.devices import constant
 from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.casting import cast
+from bidnerf_core.mapping.surface.casting import cast
 
 CHUNK = 16384
 """Number of rays that are rendered at a time."""

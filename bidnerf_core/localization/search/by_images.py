@@ -20,7 +20,7 @@ from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.casting import Cast, cast
+from bidnerf_core.mapping.surface.casting import Cast, cast
 
 APART, TURNED = 0.15, math.radians(20)
 """Two poses farther apart than this (share of the extent, radians) are different answers."""

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.ransac import focal_consensus
-from bidnerf_core.mapping.calibration import ANY, UNSTRETCHED, Calibration, Stretch
-from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.geometry.calibration import ANY, UNSTRETCHED, Calibration, Stretch
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 UNSUSPECTED = 0.8
 """Least share of agreeing matches at which a pose is not suspected."""

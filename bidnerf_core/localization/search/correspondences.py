@@ -13,10 +13,10 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import exposure_times, transposed_exposure_times
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.features import Features, Keypoints
-from bidnerf_core.mapping.keypoint_depth import measured_depth
-from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.landmarks.features import Features, Keypoints
+from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 
 @dataclass(frozen=True, eq=False)

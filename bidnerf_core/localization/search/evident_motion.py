@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
-from bidnerf_core.mapping.calibration import FIXED, NOMINAL, CalibrationPrior
-from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import ReprojectionFit, log_motion_evidence, resect
+from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, CalibrationPrior
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.resection import ReprojectionFit, log_motion_evidence, resect
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 ENOUGH_POINTS = 20
 """Least number of points that determine a motion: with fewer, the noise is as uncertain as the motion itself."""

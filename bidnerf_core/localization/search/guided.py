@@ -15,9 +15,9 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times, moved_points
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
-from bidnerf_core.mapping.calibration import GIVEN, Calibration
-from bidnerf_core.mapping.features import paired_squared_distances
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
+from bidnerf_core.mapping.landmarks.features import paired_squared_distances
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 CANDIDATES = 6
 """Largest number of landmarks that are compared with a keypoint: the nearest ones in the image."""

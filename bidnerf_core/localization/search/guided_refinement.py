@@ -27,7 +27,7 @@ from bidnerf_core.localization.search.miscalibration import (
     taken_intrinsics,
 )
 from bidnerf_core.localization.search.ransac import Hypothesis
-from bidnerf_core.mapping.calibration import (
+from bidnerf_core.mapping.geometry.calibration import (
     ANY,
     CALIBRATED,
     CROPPED,
@@ -37,9 +37,9 @@ from bidnerf_core.mapping.calibration import (
     NOMINAL,
     CalibrationPrior,
 )
-from bidnerf_core.mapping.features import NORM
-from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood_ratio, resect
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.resection import ReprojectionFit, log_likelihood_ratio, resect
+from bidnerf_core.mapping.landmarks.features import NORM
 
 RADII = (3.0, 1.5)
 """Radii of the rounds of guided matching, in units of the inlier threshold."""

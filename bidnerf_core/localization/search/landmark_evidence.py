@@ -15,7 +15,7 @@ from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.guided_refinement import GuidedPose
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Unguided
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 LEAST_DEPTHS = 6
 """Least number of measured depths that determine a depth scale."""

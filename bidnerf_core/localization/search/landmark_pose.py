@@ -16,8 +16,8 @@ from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.search.camera_fit import UNSUSPECTED, CameraFit, better_camera
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.miscalibration import Miscalibration
-from bidnerf_core.mapping.calibration import GIVEN, UNSTRETCHED, Calibration, Stretch
-from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.geometry.calibration import GIVEN, UNSTRETCHED, Calibration, Stretch
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 ESTIMATED_INFLATION = 3.0
 """Factor on the covariance of poses whose intrinsics were estimated too.

@@ -14,10 +14,10 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
 from bidnerf_core.localization.search.map_camera import MapCamera, map_camera
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
-from bidnerf_core.mapping.calibration import GIVEN, Calibration, CalibrationPrior
-from bidnerf_core.mapping.features import paired_squared_distances
-from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration, CalibrationPrior
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.landmarks.features import paired_squared_distances
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 THRESHOLD = 0.005
 """Largest reprojection error of an inlier, as a share of the image's diagonal; never less than 2 pixels."""

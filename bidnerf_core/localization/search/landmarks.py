@@ -23,8 +23,8 @@ from bidnerf_core.localization.search.resized_image import with_resized_map_came
 from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.localization.search.twins import twin_of
 from bidnerf_core.localization.search.unguided import unguided_matches
-from bidnerf_core.mapping.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
-from bidnerf_core.mapping.features import Features
+from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
+from bidnerf_core.mapping.landmarks.features import Features
 
 STRONGEST = 700
 """Number of keypoints, the strongest of an image, that are matched first; all are matched only if these do not suffice."""

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
-from bidnerf_core.mapping.calibration import (
+from bidnerf_core.mapping.geometry.calibration import (
     CALIBRATED,
     GIVEN,
     MISTAKEN,

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping.features import Features, find_features, squared_distances
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.landmarks.features import Features, find_features, squared_distances
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 EXHAUSTIVE = 4_000
 """The number of landmarks up to which the search is exhaustive, and no cells are built."""

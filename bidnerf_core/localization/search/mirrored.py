@@ -15,8 +15,8 @@ from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.localization.search.unguided import unguided_matches
-from bidnerf_core.mapping.calibration import FIXED
-from bidnerf_core.mapping.features import Features
+from bidnerf_core.mapping.geometry.calibration import FIXED
+from bidnerf_core.mapping.landmarks.features import Features
 
 KEYPOINTS = 700
 """Number of keypoints, the strongest of a mirrored image, that are matched."""

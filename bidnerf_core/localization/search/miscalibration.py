@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, SAME_CAMERA, SAME_LOG_ODDS, MapCamera
-from bidnerf_core.mapping.calibration import (
+from bidnerf_core.mapping.geometry.calibration import (
     ANY,
     CALIBRATED,
     CROPPED,
@@ -24,8 +24,8 @@ from bidnerf_core.mapping.calibration import (
     Calibration,
     CalibrationPrior,
 )
-from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import ReprojectionFit
+from bidnerf_core.mapping.geometry.resection import ReprojectionFit
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 Mixture = tuple[tuple[CalibrationPrior, float], ...]
 """Priors and their shares."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.casting import cast
+from bidnerf_core.mapping.surface.casting import cast
 
 JUMP = 0.05
 """Relative difference of the depths of neighbouring pixels above which they belong to different things."""

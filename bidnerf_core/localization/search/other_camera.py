@@ -28,7 +28,7 @@ from bidnerf_core.localization.search.map_camera import (
 )
 from bidnerf_core.localization.search.ransac import Hypothesis, sample_consensus
 from bidnerf_core.localization.search.stopwatch import Stopwatch
-from bidnerf_core.mapping.calibration import ANY, FIXED, Calibration, Stretch
+from bidnerf_core.mapping.geometry.calibration import ANY, FIXED, Calibration, Stretch
 
 AS_MANY = 0.9
 """Share of the matches agreeing with another camera that must still agree after its refinement, or with the map's instead."""

@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.calibration import GIVEN, Calibration
-from bidnerf_core.mapping.observed_points import ObservedPoints
+from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 SUCCESS = 0.9999
 """RANSAC stops once a sample without outliers has been drawn with this probability."""

@@ -22,9 +22,9 @@ from bidnerf_core.localization.search.map_camera import ALIKE_SHAPES
 from bidnerf_core.localization.search.miscalibration import WRONG_SHARE
 from bidnerf_core.localization.search.other_camera import AS_MANY, sampled_with_map_camera
 from bidnerf_core.localization.search.stopwatch import Stopwatch
-from bidnerf_core.mapping.calibration import FIXED
-from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import ReprojectionFit, log_likelihood, resect
+from bidnerf_core.mapping.geometry.calibration import FIXED
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.resection import ReprojectionFit, log_likelihood, resect
 
 CONSENSUS = 0.6
 """Share of the matches required in the end that have to agree with minimal samples: these are inexact, and know no motion."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 LOOKED_UP = 4
 """Number of landmarks looked up per keypoint; the best one at another place shows how ambiguous the match is."""

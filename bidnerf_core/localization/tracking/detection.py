@@ -30,10 +30,10 @@ from bidnerf_core.localization.search.matching import EXHAUSTIVE, LandmarkMatche
 from bidnerf_core.localization.search.miscalibration import Miscalibration, TakenIntrinsics
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose, with_motion
-from bidnerf_core.mapping.calibration import FIXED, GIVEN, NOMINAL
-from bidnerf_core.mapping.features import Features
-from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.resection import resect
+from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, NOMINAL
+from bidnerf_core.mapping.geometry.resection import resect
+from bidnerf_core.mapping.landmarks.features import Features
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 NEARBY = EXHAUSTIVE
 """Largest number of landmarks that are compared with an image: those seen in the most images of the map."""

@@ -14,7 +14,7 @@ from bidnerf_core.localization.tracking.detection import flow_evidence
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, fit_pose
-from bidnerf_core.mapping.keypoint_depth import measured_depth
+from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 
 LEAST_CORNERS = 20
 """Least number of corners that must agree with a motion."""

@@ -16,10 +16,10 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.evident_motion import SHARE_MOVING, EvidentMotion, evident_motion
 from bidnerf_core.localization.search.ransac import sample_consensus
-from bidnerf_core.mapping.keypoint_depth import measured_depth
-from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import ReprojectionFit, resect
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
+from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 LEAST_FOLLOWED = 6
 """Least number of points from which a pose is estimated."""

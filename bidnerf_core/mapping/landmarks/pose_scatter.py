@@ -10,10 +10,10 @@ from torch import Tensor
 
 from bidnerf_core.geometry.robust import chi_squared_quantile
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.resection import resect
-from bidnerf_core.mapping.triangulation import Sightings
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.resection import resect
+from bidnerf_core.mapping.geometry.triangulation import Sightings
+from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints
 
 LEAST_VISIBLE_POINTS = 20
 """Least number of points from which the pose of an image is estimated."""

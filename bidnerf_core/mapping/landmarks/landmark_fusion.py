@@ -12,9 +12,9 @@ from torch import Tensor
 from bidnerf_core.camera.rolling_shutter import poses_of_rows
 from bidnerf_core.frames.frame import SeenLandmarks
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.landmarks import LandmarkMap
-from bidnerf_core.mapping.tracks import PosedKeypoints
-from bidnerf_core.mapping.triangulation import Sightings
+from bidnerf_core.mapping.geometry.triangulation import Sightings
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping.landmarks.tracks import PosedKeypoints
 
 
 @dataclass(frozen=True, eq=False)

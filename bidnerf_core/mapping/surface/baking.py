@@ -16,17 +16,17 @@ from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.cell_size import chosen_grid, comparison_noise, finest_cell, spacing
-from bidnerf_core.mapping.posed_depth import (
+from bidnerf_core.mapping.surface.cell_size import chosen_grid, comparison_noise, finest_cell, spacing
+from bidnerf_core.mapping.surface.posed_depth import (
     WITNESSES,
     PosedDepthImage,
     agreed,
     measured_image,
     rendered_image,
 )
-from bidnerf_core.mapping.surface_map import SurfaceMap
-from bidnerf_core.mapping.surfel_index import MOST_CELLS, SurfelIndex
-from bidnerf_core.mapping.surfels import fused_surfels, merged
+from bidnerf_core.mapping.surface.surface_map import SurfaceMap
+from bidnerf_core.mapping.surface.surfel_index import MOST_CELLS, SurfelIndex
+from bidnerf_core.mapping.surface.surfels import fused_surfels, merged
 from bidnerf_core.settings import Above, Range, Settings
 
 

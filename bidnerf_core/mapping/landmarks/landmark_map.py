@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.devices import moved, working_device
-from bidnerf_core.mapping.features import USUAL_FEATURES
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class LandmarkMap:
 
     positions: Float[Tensor, "n 3"]
     deviations: Float[Tensor, "n 2"]  # metres: standard deviation across and along ``directions``
-    descriptors: UInt8[Tensor, "n d"]  # mean over the views; see ``mapping.features``
+    descriptors: UInt8[Tensor, "n d"]  # mean over the views; see ``mapping.landmarks.features``
     directions: Float[Tensor, "n 3"]  # unit, from the landmark: the mean direction to the cameras that saw it
     cones: Float[Tensor, "n"]  # radians: greatest angle between ``directions`` and such a camera
     sizes: Float[Tensor, "n"]  # metres: diameter of the keypoint, measured at its distance

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import moved_points
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.calibration import Calibration
+from bidnerf_core.mapping.geometry.calibration import Calibration
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import AT_REST
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.features import Keypoints, squared_distances
+from bidnerf_core.mapping.landmarks.features import Keypoints, squared_distances
 
 EPIPOLAR_BAND = 2.0
 """Largest distance (pixels) of a match from the epipolar line."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.devices import constant, may_wait
-from bidnerf_core.mapping.surface_map import SurfaceMap
+from bidnerf_core.mapping.surface.surface_map import SurfaceMap
 
 ROUND = 6
 """Number of steps after which rays that have met the surface or left the grid are dropped."""

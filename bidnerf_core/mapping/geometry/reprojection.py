@@ -16,9 +16,9 @@ from torch import Tensor
 from bidnerf_core.camera.rolling_shutter import AT_REST, moved_array
 from bidnerf_core.geometry.rotations import rotation_matrix
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.calibration import GIVEN, Calibration
-from bidnerf_core.mapping.observed_points import ObservedPoints
-from bidnerf_core.mapping.robust_equations import Array, RobustEquations, robust_spread
+from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.robust_equations import Array, RobustEquations, robust_spread
 
 SCALE = 2.0
 """Scale of the Cauchy loss: the residual, in standard deviations, whose weight is one half."""

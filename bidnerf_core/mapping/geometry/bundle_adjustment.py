@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.triangulation import Sightings
+from bidnerf_core.mapping.geometry.triangulation import Sightings
 
 ADJUSTMENT_STEPS = 30
 """Largest number of steps; from poses that are off by a few pixels, about ten suffice."""

@@ -16,13 +16,7 @@ from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import SeenLandmarks, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.features import USUAL_FEATURES, Features, Sift, find_features
-from bidnerf_core.mapping.keypoint_depth import keypoint_depth_noise, measured_depth, placed
-from bidnerf_core.mapping.landmark_fusion import TrackedKeypoints, fused_landmarks, seen_landmarks
-from bidnerf_core.mapping.landmarks import LandmarkMap, concatenated
-from bidnerf_core.mapping.pose_scatter import pose_scatter
-from bidnerf_core.mapping.tracks import PosedKeypoints, epipolar_matches, joined_tracks
-from bidnerf_core.mapping.triangulation import (
+from bidnerf_core.mapping.geometry.triangulation import (
     Sightings,
     fitting,
     intersected,
@@ -31,7 +25,13 @@ from bidnerf_core.mapping.triangulation import (
     parallax,
     refined_points,
 )
-from bidnerf_core.mapping.view_pairs import likely_pairs_of_poses
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, Features, Sift, find_features
+from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, measured_depth, placed
+from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints, fused_landmarks, seen_landmarks
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
+from bidnerf_core.mapping.landmarks.pose_scatter import pose_scatter
+from bidnerf_core.mapping.landmarks.tracks import PosedKeypoints, epipolar_matches, joined_tracks
+from bidnerf_core.mapping.landmarks.view_pairs import likely_pairs_of_poses
 from bidnerf_core.settings import Above, Range, Settings
 
 _Item = TypeVar("_Item")

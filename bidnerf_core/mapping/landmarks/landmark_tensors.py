@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.fields.contract import LARGEST_LENGTH
-from bidnerf_core.mapping.landmarks import PER_LANDMARK, HeldOutTrial, LandmarkMap
+from bidnerf_core.mapping.landmarks.landmark_map import PER_LANDMARK, HeldOutTrial, LandmarkMap
 from bidnerf_core.mapping.tensors import check_kinds, check_range, check_unit_length
 
 LANDMARK_KINDS = {

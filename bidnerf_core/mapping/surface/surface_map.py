@@ -13,8 +13,8 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved, working_device
 from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.mapping.surfel_index import SurfelIndex
-from bidnerf_core.mapping.surfels import Surfels, surfel_bytes
+from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
+from bidnerf_core.mapping.surface.surfels import Surfels, surfel_bytes
 
 REACH = 0.7
 """Radius of a surfel, as a fraction of its distance from its fourth neighbour."""

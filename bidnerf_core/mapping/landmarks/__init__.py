@@ -1,0 +1,1 @@
+"""The landmarks of a map: points with descriptors, triangulated from its images."""

@@ -1,0 +1,171 @@
+"""Keypoints of an image and their descriptors, by which they are matched with other images.
+
+Any detector that turns an image into ``Keypoints``, a learned one included, can serve as ``Features``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from bidnerf_core.registry import Plugins, interface_defects
+from bidnerf_core.settings import Range, Settings
+
+NORM = 512.0
+"""Length of a quantised descriptor, as is customary for SIFT: it makes good use of the range of a byte."""
+FIRST_CENTRE = 0.5
+"""Offset from OpenCV's pixel coordinates to ours: the centre of the first pixel is (0, 0) there, (0.5, 0.5) here."""
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Keypoints of one image, the strongest first. Descriptors are compared by Euclidean distance."""
+
+    pixels: Float[Tensor, "n 2"]  # (u, v), the centre of the first pixel at (0.5, 0.5)
+    sizes: Float[Tensor, "n"]  # pixels: diameter of the keypoint's neighbourhood, as OpenCV defines it
+    descriptors: UInt8[Tensor, "n d"]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def __getitem__(self, index: Tensor) -> Keypoints:
+        return Keypoints(self.pixels[index], self.sizes[index], self.descriptors[index])
+
+
+@runtime_checkable
+class Features(Protocol):
+    """Detects and describes keypoints; all its descriptors must have the same number of channels.
+
+    It must be safe to call from several threads at once. ``quantized`` turns float descriptors into bytes.
+    """
+
+    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints: ...
+
+
+@runtime_checkable
+class LimitedFeatures(Features, Protocol):
+    """An optional part of ``Features``: a detector that is faster where fewer keypoints are wanted."""
+
+    def at_most(self, count: int) -> Features:
+        """Return the detector with another largest number of keypoints."""
+        ...
+
+
+@dataclass(frozen=True)
+class Sift(Settings):
+    """SIFT (Lowe 2004) by OpenCV, with the root normalisation of Arandjelovic and Zisserman 2012."""
+
+    # largest number of keypoints: those of highest contrast are kept
+    count: Annotated[int, Range(1, 10**6)] = 2000
+    # least contrast of a keypoint; OpenCV's default of 0.04 leaves few indoors
+    contrast: Annotated[float, Range(0.0, 0.999)] = 0.01
+    # Pixels along the longer side above which an image is reduced first: a phone's twelve megapixels hold no more
+    # keypoints of the sizes that maps are made of, and take half a minute.
+    largest: Annotated[int, Range(16, 10**5)] = 800
+
+    def at_most(self, count: int) -> Sift:
+        return replace(self, count=count)
+
+    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+        # The precise upscaling maps index x to 2 x: without it all keypoints of the first octave are a quarter of a
+        # pixel off. A detector object is not safe to share between threads, and costs nothing to make.
+        sift = cv2.SIFT.create(
+            nfeatures=self.count, contrastThreshold=self.contrast, enable_precise_upscale=True
+        )
+        grey, scale = _reduced(grey_image(rgb), self.largest)
+        found, descriptors = sift.detectAndCompute(grey, None)
+        if descriptors is None or not len(found):
+            return Keypoints(torch.zeros(0, 2), torch.zeros(0), torch.zeros((0, 128), dtype=torch.uint8))
+        order = np.argsort([-keypoint.response for keypoint in found], kind="stable")
+        pixels = (np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32) + FIRST_CENTRE)[order] / scale
+        sizes = np.array([found[i].size for i in order], dtype=np.float32) / scale.mean()
+        root = root_normalized(torch.from_numpy(np.asarray(descriptors, dtype=np.float32)[order]))
+        return Keypoints(torch.from_numpy(pixels), torch.from_numpy(sizes), quantized(root))
+
+
+SIFT = Sift()
+"""SIFT (Lowe 2004) by OpenCV, with root normalisation."""
+
+
+def _defects(features: Any) -> Iterator[str]:
+    yield from interface_defects(features, (), {"__call__": ("rgb",)})
+
+
+USUAL_FEATURES = "sift"
+"""The name of the detector that is used where none is named."""
+FEATURES: Plugins[Features] = Plugins("features", _defects, first=(USUAL_FEATURES,))
+"""The detectors by name."""
+
+
+def find_features(name: str, wanted_by: str = "") -> Features:
+    """Return a detector by name. Raises ``PluginError``, an ``InputError``, for an unknown name and a broken plugin."""
+    return FEATURES.load(name, wanted_by)
+
+
+@dataclass(frozen=True)
+class _Strongest:
+    features: Features
+    count: int
+
+    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+        found = self.features(rgb)
+        return found[torch.arange(min(self.count, len(found)))]
+
+
+def strongest(features: Features, count: int) -> Features:
+    """Return a detector that finds at most ``count`` keypoints, the strongest."""
+    return features.at_most(count) if isinstance(features, LimitedFeatures) else _Strongest(features, count)
+
+
+def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
+    """Return square roots of L1-normalised, non-negative descriptors; their Euclidean distance is the Hellinger distance."""
+    total = descriptors.sum(-1, keepdim=True).clamp(min=torch.finfo(descriptors.dtype).tiny)
+    return (descriptors / total).sqrt()
+
+
+def quantized(descriptors: Float[Tensor, "n d"]) -> UInt8[Tensor, "n d"]:
+    """Return descriptors of unit length as bytes; if any channel is negative, all are shifted, which keeps distances."""
+    negative = len(descriptors) > 0 and float(descriptors.min()) < 0
+    scaled = descriptors * (NORM / 2 if negative else NORM) + (128 if negative else 0)
+    return scaled.round().clamp(0, 255).to(torch.uint8)
+
+
+def squared_distances(
+    a: UInt8[Tensor, "n d"] | Float[Tensor, "n d"], b: UInt8[Tensor, "m d"] | Float[Tensor, "m d"]
+) -> Float[Tensor, "n m"]:
+    """Return squared Euclidean distances between all pairs; exact for bytes, whose sums of squares fit a float32."""
+    x, y = a.float(), b.float()
+    return torch.addmm((x * x).sum(-1)[:, None] + (y * y).sum(-1), x, y.T, alpha=-2).clamp_(min=0)
+
+
+def paired_squared_distances(
+    a: UInt8[Tensor, "n d"],
+    b: UInt8[Tensor, "m d"],
+    rows: Int[Tensor, "p"],
+    columns: Int[Tensor, "p"],
+) -> Float[Tensor, "p"]:
+    """Return the squared Euclidean distance of each pair ``a[rows]``, ``b[columns]``."""
+    return (a[rows].float() - b[columns].float()).square_().sum(-1)
+
+
+def grey_image(rgb: Float[Tensor, "h w 3"]) -> np.ndarray:
+    clean = rgb.detach().cpu().float().nan_to_num(0.0).clamp_(0, 1).mul_(255).round_()
+    return cv2.cvtColor(clean.to(torch.uint8).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
+
+
+def _reduced(grey: np.ndarray, largest: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the image with at most ``largest`` pixels along its longer side, and its scale (x, y)."""
+    height, width = grey.shape
+    factor = largest / max(height, width)
+    if factor >= 1:
+        return grey, np.ones(2, dtype=np.float32)
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    scale = np.array([size[0] / width, size[1] / height], dtype=np.float32)
+    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA), scale
