@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from bidnerf_core.mapping.landmarks.features import Keypoints, quantized
 
 PINHOLE = Intrinsics(300.0, 300.0, 200.0, 150.0, 400, 300)
 SIZE = 0.04  # metres: of what a keypoint describes
+MIRRORED = 0.5
 
 
 @dataclass
@@ -41,9 +42,10 @@ class Points:
         seed: int = 0,
         motion: Tensor | None = None,
     ) -> View:
-        """An image whose one number names the keypoints in it; with depth at them, times ``depth``.
+        """An image whose first pixel names the keypoints in it; with depth at them, times ``depth``.
 
         The rows of a camera with a ``motion`` are exposed one after another. The view does not tell.
+        The right half adds ``MIRRORED``, which is what the first pixel has in a mirror.
         """
         generator = torch.Generator().manual_seed(seed)
         local = T_world_camera.inverse().apply(self.positions)
@@ -63,11 +65,17 @@ class Points:
         sizes = SIZE * focal / local[inside, 2]
         self.seen.append(Keypoints(pixels.float(), sizes.float(), self.descriptors[shown]))
         image = torch.full((intrinsics.height, intrinsics.width, 3), float(len(self.seen) - 1))
+        image[:, intrinsics.width // 2 :] += MIRRORED
         measured = None if depth is None else self._depth(intrinsics, pixels, local[inside, 2] * depth)
         return View(Frame("f", image, intrinsics, measured), T_ref_camera or T_world_camera)
 
     def __call__(self, rgb: Tensor) -> Keypoints:
-        return self.seen[int(rgb[0, 0, 0])]
+        first = float(rgb[0, 0, 0])
+        keypoints = self.seen[int(first)]
+        if first % 1 != MIRRORED:
+            return keypoints
+        across, down = keypoints.pixels.unbind(-1)
+        return replace(keypoints, pixels=torch.stack([rgb.shape[1] - across, down], dim=-1))
 
     def _depth(self, intrinsics: Intrinsics, pixels: Tensor, z: Tensor) -> Tensor:
         image = torch.zeros(intrinsics.height, intrinsics.width)
