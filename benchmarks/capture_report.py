@@ -37,8 +37,8 @@ from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.landmarks.building import tracked_views
-from bidnerf_core.mapping.landmarks.features import SIFT, Keypoints
+from bidnerf_core.mapping import Keypoints, tracked_views
+from bidnerf_core.mapping.landmarks.features import SIFT
 
 BLUR = 0.02
 """Length of the motion blur, as a share of the image's longer side."""

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from bidnerf_core import SE3, Frame, View
 from bidnerf_core.frames.pixels import observe
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.surface.casting import trace
+from bidnerf_core.mapping import SurfaceMap, trace
 from bidnerf_core.results.errors import CRITERIA, pose_error
 
 WITNESSES = 24

@@ -37,8 +37,8 @@ from bidnerf_core.evaluation.trials import forget_peak_memory, peak_memory_bytes
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.landmarks.building import build_landmarks
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
+from bidnerf_core.mapping import LandmarkMap, build_landmarks
+from bidnerf_core.mapping.landmarks.landmark_map import concatenated
 from bidnerf_core.results.errors import pose_error, success_rate
 
 # The child measures itself: the child's peak as reported to the parent includes the parent's own.

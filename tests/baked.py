@@ -16,8 +16,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.search.by_points import PointSearch
-from bidnerf_core.mapping import BakeConfig, SurfaceMap, Surfels, bake
-from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
+from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
 from bidnerf_core.scenes.closed_form import ClosedFormScene
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.fields import GaussianBlobs

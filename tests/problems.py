@@ -11,8 +11,7 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import Localization, find_method, settings_of
 from bidnerf_core.localization.problem import Problem, rig
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import tiny
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.carving import estimate_bounds
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping.landmarks.building import LandmarkConfig, tracked_views
+from bidnerf_core.mapping import LandmarkConfig, tracked_views
 from landmark_scene import Points, ring
 
 CAMERA = Intrinsics(60.0, 60.0, 32.0, 24.0, 64, 48)

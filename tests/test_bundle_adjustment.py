@@ -10,13 +10,8 @@ from torch import Tensor
 
 from bidnerf_core import SE3
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
-from bidnerf_core.mapping.geometry.bundle_adjustment import (
-    Adjustment,
-    MeasuredSightings,
-    PosePrior,
-    adjusted,
-    linearized,
-)
+from bidnerf_core.mapping import Adjustment, PosePrior, adjusted
+from bidnerf_core.mapping.geometry.bundle_adjustment import MeasuredSightings, linearized
 from bidnerf_core.mapping.geometry.triangulation import Sightings
 from landmark_scene import looking_in
 

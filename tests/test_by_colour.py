@@ -20,8 +20,7 @@ from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping import SurfaceMap, bake
-from bidnerf_core.mapping.landmarks.building import build_landmarks
+from bidnerf_core.mapping import SurfaceMap, bake, build_landmarks
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit

@@ -20,9 +20,8 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.map_camera import camera_like
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.geometry.calibration import GIVEN, UNSTRETCHED, Calibration, Stretch
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.landmarks.building import build_landmarks
+from bidnerf_core.mapping import Calibration, ObservedPoints, Stretch, build_landmarks
+from bidnerf_core.mapping.geometry.calibration import GIVEN, UNSTRETCHED
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import CAMERA, textured_map, training_views, unseen
 from landmark_scene import PINHOLE, Points, looking_in, ring

@@ -17,7 +17,7 @@ from bidnerf_core.camera.intrinsics import (
 )
 from bidnerf_core.camera.orientation import QUARTER_TURNS
 from bidnerf_core.localization.search.map_camera import map_camera
-from bidnerf_core.mapping.geometry.calibration import Calibration
+from bidnerf_core.mapping import Calibration
 
 LANDSCAPE = Intrinsics(520.0, 521.0, 310.0, 245.0, 640, 480, (0.05, -0.01, 0.001, 0.002))
 TILTED = replace(LANDSCAPE, distortion=(0.0,) * 12 + (0.1, 0.0))

@@ -21,8 +21,7 @@ from bidnerf_core.captures.report import CaptureReport, CoverageRecord, Gap, Pho
 from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.io.json import from_plain, to_plain
-from bidnerf_core.mapping.landmarks.building import LandmarkConfig, tracked_views
-from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial
+from bidnerf_core.mapping import HeldOutTrial, LandmarkConfig, tracked_views
 from bidnerf_core.results.capture_plot import draw_capture
 from bidnerf_core.scenes.closed_form import views
 from bidnerf_core.scenes.demo import demo_object

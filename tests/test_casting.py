@@ -7,7 +7,7 @@ import torch
 from torch import Generator
 
 import baked
-from bidnerf_core.mapping.surface.casting import cast, trace
+from bidnerf_core.mapping import cast, trace
 
 
 def rays(count: int, generator: Generator) -> tuple[torch.Tensor, torch.Tensor]:

@@ -23,8 +23,7 @@ from bidnerf_core.cli import main
 from bidnerf_core.cli.output import read_views
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.mapping.landmarks.building import TrackedViews, tracked_views
+from bidnerf_core.mapping import BakeConfig, TrackedViews, tracked_views
 from bidnerf_core.maps import baking
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.files import save_capture

@@ -18,7 +18,7 @@ from bidnerf_core.captures.cameras import PoseConsistency, as_given, stored_came
 from bidnerf_core.captures.training_poses import TrainingPoses
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping.landmarks.building import TrackedViews, tracked_views
+from bidnerf_core.mapping import TrackedViews, tracked_views
 from bidnerf_core.maps.description import cameras_of, load_info
 from bidnerf_core.maps.files import load_capture
 from commands import Run

@@ -18,7 +18,8 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import AutoConfig, Localization, find_method, settings_of
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.mapping.landmarks.features import SIFT, Keypoints
+from bidnerf_core.mapping import Keypoints
+from bidnerf_core.mapping.landmarks.features import SIFT
 from bidnerf_core.registry import registered
 from bidnerf_core.testing import FaultContract, FeaturesContract, MethodContract, ReaderContract
 from bidnerf_core.testing.textured_field import BOUNDS, training_views

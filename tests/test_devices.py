@@ -20,7 +20,7 @@ from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.localization import AutoConfig
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.testing import textured_field

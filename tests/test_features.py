@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from bidnerf_core import InputError
+from bidnerf_core.mapping import Features, Sift
 from bidnerf_core.mapping.landmarks.features import (
-    Features,
-    Sift,
     paired_squared_distances,
     quantized,
     root_normalized,

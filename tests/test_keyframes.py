@@ -14,8 +14,8 @@ from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.landmarks.building import build_landmarks
-from bidnerf_core.mapping.surface.keyframes import KEYFRAME_SIDE, MOST, colour_noise, rendered_views
+from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
+from bidnerf_core.mapping.surface.baking import KEYFRAME_SIDE, MOST
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import HomogeneousBall
 from bidnerf_core.scenes.trajectories import orbit

@@ -9,13 +9,10 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
+from bidnerf_core.mapping import LandmarkConfig, LandmarkMap, Sift, build_landmarks, tracked_views
 from bidnerf_core.mapping.geometry.triangulation import Sightings, intersected, parallax, refined_points
-from bidnerf_core.mapping.landmarks.building import LandmarkConfig, build_landmarks, tracked_views
-from bidnerf_core.mapping.landmarks.features import Sift
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
-from bidnerf_core.mapping.landmarks.pose_scatter import robust_covariance, update_scatter
-from bidnerf_core.mapping.landmarks.tracks import Matches, joined_tracks
-from bidnerf_core.mapping.landmarks.view_pairs import likely_pairs
+from bidnerf_core.mapping.landmarks.building import robust_covariance, update_scatter
+from bidnerf_core.mapping.landmarks.tracks import Matches, joined_tracks, likely_pairs
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 

@@ -13,10 +13,9 @@ from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import NOMINAL
-from bidnerf_core.mapping.landmarks.building import build_landmarks
 from bidnerf_core.mapping.landmarks.features import squared_distances
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 TRUE = looking_in(0.43, 0.45, 3.6)

@@ -16,9 +16,7 @@ import tiny
 from bidnerf_core.errors import InputError
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import to_plain
-from bidnerf_core.mapping.landmarks.building import build_landmarks
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
-from bidnerf_core.mapping.landmarks.landmark_tensors import landmark_tensors
+from bidnerf_core.mapping import LandmarkMap, build_landmarks, landmark_tensors
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.files import save_landmarks, save_map, save_surface
 from bidnerf_core.maps.map import load_map

@@ -10,9 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.landmarks.building import build_landmarks
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
-from bidnerf_core.mapping.landmarks.landmark_tensors import landmark_tensors, landmarks_from_tensors
+from bidnerf_core.mapping import LandmarkMap, build_landmarks, landmark_tensors, landmarks_from_tensors
 from landmark_scene import Points, ring
 
 

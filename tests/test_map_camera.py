@@ -27,10 +27,8 @@ from bidnerf_core.localization.search.miscalibration import (
     probability_of_map_camera,
 )
 from bidnerf_core.localization.search.unguided import unguided_matches
-from bidnerf_core.mapping.geometry.calibration import GIVEN, NOMINAL, Calibration
-from bidnerf_core.mapping.geometry.resection import ReprojectionFit
-from bidnerf_core.mapping.landmarks.building import build_landmarks
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import Calibration, LandmarkMap, ReprojectionFit, build_landmarks
+from bidnerf_core.mapping.geometry.calibration import GIVEN, NOMINAL
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 TRUE = looking_in(0.43, 0.45, 3.6)

@@ -34,11 +34,16 @@ from bidnerf_core.localization.search.evident_motion import (
 )
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.mapping import (
+    LandmarkConfig,
+    TrackedViews,
+    landmark_tensors,
+    landmarks_from_tensors,
+    resect,
+    tracked_views,
+)
 from bidnerf_core.mapping.geometry.calibration import FIXED
-from bidnerf_core.mapping.geometry.resection import resect
-from bidnerf_core.mapping.landmarks.building import LandmarkConfig, TrackedViews, tracked_views
-from bidnerf_core.mapping.landmarks.landmark_tensors import landmark_tensors, landmarks_from_tensors
-from bidnerf_core.mapping.landmarks.pose_scatter import observed_at_rest, pose_updates
+from bidnerf_core.mapping.landmarks.building import observed_at_rest, pose_updates
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, unseen
 from bidnerf_core.training import RayBank
 from landmark_scene import PINHOLE, Points, looking_in

@@ -15,7 +15,7 @@ import bidnerf_core.cli.localize as localize_module
 from bidnerf_core import Frame, Intrinsics, Localizer
 from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.maps.map import Map
 from bidnerf_core.results.errors import pose_error

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3
 from bidnerf_core.captures.pose_conventions import Y_AND_Z_REVERSED, OtherConvention, other_convention
-from bidnerf_core.mapping.landmarks.building import tracked_views
-from bidnerf_core.mapping.landmarks.tracks import PosedKeypoints
+from bidnerf_core.mapping import PosedKeypoints, tracked_views
 from landmark_scene import Points, looking_in, ring
 
 REVERSED = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))

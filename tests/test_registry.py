@@ -19,7 +19,8 @@ from bidnerf_core.datasets import Dataset, Reader, ReadOptions
 from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.localization import find_method
-from bidnerf_core.mapping.landmarks.features import FEATURES, find_features
+from bidnerf_core.mapping import find_features
+from bidnerf_core.mapping.landmarks.features import FEATURES
 from bidnerf_core.registry import (
     GROUPS,
     UNREADABLE,

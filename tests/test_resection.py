@@ -15,10 +15,10 @@ from bidnerf_core import SE3, Intrinsics
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_times
 from bidnerf_core.localization.search.evident_motion import ENOUGH_POINTS, evident_motion
 from bidnerf_core.localization.tracking.points import PointFit, with_motion
-from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, NOMINAL, Calibration
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping import Calibration, ObservedPoints, resect
+from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, NOMINAL
 from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State
-from bidnerf_core.mapping.geometry.resection import log_likelihood_ratio, resect
+from bidnerf_core.mapping.geometry.resection import log_likelihood_ratio
 
 TRUE = SE3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3], dtype=torch.float64))
 FOCAL, WIDTH, HEIGHT = 400.0, 640.0, 480.0

@@ -20,9 +20,8 @@ from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.resized_image import RESIZED, log_odds
+from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import FIXED
-from bidnerf_core.mapping.landmarks.building import build_landmarks
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 from bidnerf_core.results.errors import pose_error
 from landmark_scene import PINHOLE, Points, looking_in, ring
 

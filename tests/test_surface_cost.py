@@ -16,8 +16,7 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.pixels import measured_middle
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.mapping import SurfaceMap, Surfels
-from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
+from bidnerf_core.mapping import SurfaceMap, SurfelIndex, Surfels
 from tiny import depth_rays_of
 
 SCALES = PointScales(0.1, 0.3, 0.7)

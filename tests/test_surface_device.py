@@ -35,10 +35,8 @@ from bidnerf_core.localization.search.by_images import IMAGE_STAGES, ImageSearch
 from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
 from bidnerf_core.localization.solvers import levenberg_marquardt
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
-from bidnerf_core.mapping import SurfaceMap, Surfels
+from bidnerf_core.mapping import SurfaceMap, SurfelIndex, Surfels, cast, trace
 from bidnerf_core.mapping.surface import casting
-from bidnerf_core.mapping.surface.casting import cast, trace
-from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
 from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
 from problems import FieldMap
 

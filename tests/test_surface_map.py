@@ -9,8 +9,7 @@ from torch import Generator, Tensor
 
 import baked
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.surface.casting import trace
+from bidnerf_core.mapping import SurfaceMap, trace
 from bidnerf_core.scenes.primitives import Box, Primitive, Shape, Sphere
 from bidnerf_core.scenes.textures import blotches
 

@@ -17,7 +17,8 @@ import baked
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, SurfelIndex, block_levels, index_bytes
+from bidnerf_core.mapping import SurfelIndex
+from bidnerf_core.mapping.surface.surfel_index import CELLS_OF_BLOCK, block_levels, index_bytes
 from voxels import cell_centres
 
 BOUNDS = SceneBounds((-1.0, 0.0, 2.0), (1.0, 3.0, 2.9), 0.0, 10.0)

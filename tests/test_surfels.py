@@ -7,7 +7,7 @@ import torch
 from torch import Generator
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.surface.surfels import fused_surfels, merged
+from bidnerf_core.mapping.surface.surface_map import fused_surfels, merged
 
 
 def on_a_plane(generator: Generator, count: int = 400) -> tuple[torch.Tensor, torch.Tensor]:

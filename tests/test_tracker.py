@@ -54,7 +54,7 @@ def test_a_sequence_is_tracked_with_honest_covariances(depth: bool) -> None:
 
 def test_most_frames_are_tracked_without_detecting_keypoints(monkeypatch: pytest.MonkeyPatch) -> None:
     """The optical flow carries landmarks on; keypoints are detected where these become few."""
-    from bidnerf_core.mapping.landmarks.features import Sift
+    from bidnerf_core.mapping import Sift
 
     calls = list[int]()
     detect = Sift.__call__

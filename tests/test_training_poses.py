@@ -23,8 +23,7 @@ from bidnerf_core.captures.cameras import (
 from bidnerf_core.captures.pose_refinement import adjusted_poses
 from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
 from bidnerf_core.datasets import open_dataset
-from bidnerf_core.mapping.landmarks.building import LandmarkConfig, tracked_views
-from bidnerf_core.mapping.landmarks.features import Sift
+from bidnerf_core.mapping import LandmarkConfig, Sift, tracked_views
 from landmark_scene import Points, looking_in, ring
 
 VIEWS, WRONG = 16, 7

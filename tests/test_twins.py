@@ -18,8 +18,7 @@ from bidnerf_core.localization.search.landmarks import confirm, propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.tracking.relocalization import relocalized
 from bidnerf_core.localization.twin_rejection import twin_rejection
-from bidnerf_core.mapping.landmarks.building import build_landmarks
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, textured_map, unseen
 from landmark_scene import Points, looking_in, ring

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping import TrackedKeypoints
 
 LINK = 5
 """Least number of shared landmarks that links two photos. Photos of different places share one by chance, seldom two: a match

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.robust import MAD_TO_SIGMA
-from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.landmarks.view_pairs import likely_pairs
+from bidnerf_core.mapping import TrackedKeypoints
+from bidnerf_core.mapping.landmarks.tracks import likely_pairs
 
 LARGEST = 800
 """Pixels along the longer side to which photos are reduced: finer detail is of no use to a map."""

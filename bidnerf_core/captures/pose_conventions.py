@@ -18,9 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.mapping import PosedKeypoints
 from bidnerf_core.mapping.landmarks.features import squared_distances
-from bidnerf_core.mapping.landmarks.tracks import LEAST_BASELINE, PosedKeypoints
-from bidnerf_core.mapping.landmarks.view_pairs import likely_pairs_of_poses
+from bidnerf_core.mapping.landmarks.tracks import LEAST_BASELINE, likely_pairs_of_poses
 
 MOST_PAIRS = 40
 """Largest number of pairs of images that are examined."""

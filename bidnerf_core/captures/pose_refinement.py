@@ -14,12 +14,11 @@ from bidnerf_core.captures.cameras import PoseConsistency
 from bidnerf_core.captures.shutter_evidence import common_motion
 from bidnerf_core.geometry.robust import MAD_TO_SIGMA
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.geometry.bundle_adjustment import MeasuredSightings, PosePrior, adjusted
+from bidnerf_core.mapping import LandmarkConfig, PosePrior, TrackedKeypoints, TrackedViews, adjusted
+from bidnerf_core.mapping.geometry.bundle_adjustment import MeasuredSightings
 from bidnerf_core.mapping.geometry.resection import LEAST_NOISE
 from bidnerf_core.mapping.geometry.triangulation import noise
-from bidnerf_core.mapping.landmarks.building import LandmarkConfig, TrackedViews
-from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.landmarks.pose_scatter import ENOUGH_IMAGES, pose_updates
+from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, pose_updates
 
 ROUNDS = 3
 """Largest number of adjustments. After each, the keypoints are matched anew, which finds those that wrong poses hid."""

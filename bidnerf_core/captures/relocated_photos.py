@@ -19,9 +19,7 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import mirror_image
-from bidnerf_core.mapping.landmarks.building import LandmarkConfig, TrackedViews
-from bidnerf_core.mapping.landmarks.features import Features
-from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping import Features, LandmarkConfig, TrackedKeypoints, TrackedViews
 
 SUSPECT = 0.5
 """A photo is a suspect if the share of its keypoints that are landmarks is below this fraction of the capture's median."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial
+from bidnerf_core.mapping import HeldOutTrial
 
 PhotoProblem = Literal["mirrored", "turned", "badly posed", "apart", "isolated", "blurred", "badly exposed"]
 """What can be wrong with a photo, the gravest first. A photo that is "apart" is linked to a few others only, as are photos of

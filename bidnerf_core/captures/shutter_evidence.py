@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
-from bidnerf_core.mapping.geometry.resection import log_motion_evidence, resect
+from bidnerf_core.mapping import TrackedKeypoints, resect
+from bidnerf_core.mapping.geometry.resection import log_motion_evidence
 from bidnerf_core.mapping.geometry.triangulation import noise
-from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.landmarks.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, observed_at_rest
+from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS, observed_at_rest
 
 MOST_IMAGES = 60
 """Largest number of images that are examined; they are spread over the capture."""

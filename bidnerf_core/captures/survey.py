@@ -22,12 +22,16 @@ from bidnerf_core.captures.photos import (
 from bidnerf_core.captures.relocated_photos import Relocation, image_motion, relocated, suspects
 from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecord
 from bidnerf_core.frames.frame import View
+from bidnerf_core.mapping import (
+    DEFAULT_LANDMARKS,
+    Features,
+    HeldOutTrial,
+    LandmarkConfig,
+    TrackedKeypoints,
+    TrackedViews,
+)
 from bidnerf_core.mapping.geometry.triangulation import noise
-from bidnerf_core.mapping.landmarks.building import DEFAULT_LANDMARKS, LandmarkConfig, TrackedViews
-from bidnerf_core.mapping.landmarks.features import Features
-from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints
-from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial
-from bidnerf_core.mapping.landmarks.pose_scatter import ENOUGH_IMAGES, pose_updates, robust_covariance
+from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, pose_updates, robust_covariance
 
 NOT_TRIED = HeldOutTrial()
 LEAST_EXPOSURE = 1.0

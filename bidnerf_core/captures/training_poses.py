@@ -14,8 +14,7 @@ from bidnerf_core.captures.links import groups, linked
 from bidnerf_core.captures.pose_refinement import AdjustedPoses, adjusted_poses
 from bidnerf_core.captures.relocated_photos import Relocation, relocated, suspects
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping.landmarks.building import LandmarkConfig, TrackedViews
-from bidnerf_core.mapping.landmarks.features import Features
+from bidnerf_core.mapping import Features, LandmarkConfig, TrackedViews
 
 INCONSISTENT = 0.25
 """Least deviation (pixels) that errors of the given poses must add to that of the keypoints for the poses to be refined.

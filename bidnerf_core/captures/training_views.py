@@ -20,10 +20,10 @@ from bidnerf_core.captures.training_poses import INCONSISTENT, training_poses
 from bidnerf_core.carving import has_outline
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping.landmarks.building import DEFAULT_LANDMARKS, TrackedViews, tracked_views
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedViews, tracked_views
+from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 from bidnerf_core.mapping.landmarks.keypoint_depth import depth_ratio
-from bidnerf_core.mapping.landmarks.pose_scatter import ENOUGH_IMAGES, LEAST_VISIBLE_POINTS
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 
 log = logging.getLogger("bidnerf")

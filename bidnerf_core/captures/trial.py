@@ -21,14 +21,16 @@ from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.landmarks.building import (
+from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
+    Features,
+    HeldOutTrial,
     LandmarkConfig,
+    LandmarkMap,
     TrackedViews,
     tracked_views,
 )
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, Features
-from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 
 HELD_OUT, MOST_HELD_OUT = 8, 24
 """One image in ``HELD_OUT`` is held out, and at most ``MOST_HELD_OUT`` in all."""

@@ -40,7 +40,7 @@ from bidnerf_core.localization.methods import (
     require_start,
     require_use_of_depth,
 )
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.results.answers import Answer, Answers, Failure, localize_each
 from bidnerf_core.results.errors import PoseError, pose_error, standard_deviations

@@ -15,11 +15,18 @@ from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
-from bidnerf_core.mapping.landmarks.building import TrackedViews, tracked_views
-from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap
-from bidnerf_core.mapping.landmarks.pose_scatter import update_scatter
-from bidnerf_core.mapping.surface.keyframes import colour_noise, rendered_views
+from bidnerf_core.mapping import (
+    BakeConfig,
+    HeldOutTrial,
+    LandmarkMap,
+    SurfaceMap,
+    TrackedViews,
+    bake,
+    colour_noise,
+    rendered_views,
+    tracked_views,
+)
+from bidnerf_core.mapping.landmarks.building import update_scatter
 from bidnerf_core.maps.description import LandmarkSource, MapInfo, cameras_of
 from bidnerf_core.progress import Cancel, ProgressCallback, counter
 

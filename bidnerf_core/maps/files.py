@@ -25,9 +25,14 @@ from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.io.json import from_plain, read_json, to_plain
 from bidnerf_core.io.tensors import load_part, packed, read_tensors
-from bidnerf_core.mapping import SurfaceMap, surface_from_tensors, surface_tensors
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
-from bidnerf_core.mapping.landmarks.landmark_tensors import landmark_tensors, landmarks_from_tensors
+from bidnerf_core.mapping import (
+    LandmarkMap,
+    SurfaceMap,
+    landmark_tensors,
+    landmarks_from_tensors,
+    surface_from_tensors,
+    surface_tensors,
+)
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, LandmarkSource, MapInfo, load_info
 from bidnerf_core.maps.weights import checked_weights
 from bidnerf_core.training import TrainingState

@@ -23,10 +23,7 @@ from bidnerf_core.io.files import locked
 from bidnerf_core.io.json import from_plain
 from bidnerf_core.io.tensors import read_tensors
 from bidnerf_core.localization.problem import on_device
-from bidnerf_core.mapping import BakeConfig, SurfaceMap
-from bidnerf_core.mapping.landmarks.building import TrackedViews
-from bidnerf_core.mapping.landmarks.features import find_features
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, TrackedViews, find_features
 from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, MapInfo, load_info
 from bidnerf_core.maps.files import (

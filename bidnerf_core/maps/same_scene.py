@@ -8,7 +8,7 @@ from bidnerf_core.captures.cameras import stored_cameras
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping.surface.keyframes import colour_noise
+from bidnerf_core.mapping import colour_noise
 from bidnerf_core.maps.description import MapInfo
 
 UNLIKE, UNLIKE_ITS_OWN, UNLIKE_ANY = 0.2, 2.0, 0.3

@@ -14,8 +14,7 @@ from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import amount
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
 from bidnerf_core.io.json import to_plain
-from bidnerf_core.mapping.landmarks.landmark_map import HeldOutTrial, LandmarkMap
-from bidnerf_core.mapping.surface.surface_map import SurfaceMap
+from bidnerf_core.mapping import HeldOutTrial, LandmarkMap, SurfaceMap
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.progress import duration_text
 

@@ -23,9 +23,8 @@ from bidnerf_core.errors import Cancelled, InputError, amount
 from bidnerf_core.frames.frame import View
 from bidnerf_core.io.json import from_plain, to_plain
 from bidnerf_core.io.tensors import packed
-from bidnerf_core.mapping import BakeConfig
-from bidnerf_core.mapping.landmarks.building import TrackedViews
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, find_features
+from bidnerf_core.mapping import BakeConfig, TrackedViews, find_features
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 from bidnerf_core.maps.checkpoints import CHECKPOINT_SECONDS, Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.files import load_state, map_folder

@@ -30,8 +30,7 @@ from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
-from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views
 from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere

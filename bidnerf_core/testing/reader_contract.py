@@ -15,7 +15,7 @@ from bidnerf_core.datasets.dataset import Dataset
 from bidnerf_core.datasets.reader import READERS, Reader, ReadOptions
 from bidnerf_core.datasets.sequence import FrameSequence
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping.landmarks.building import DEFAULT_LANDMARKS, TrackedViews, tracked_views
+from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedViews, tracked_views
 from bidnerf_core.mapping.landmarks.keypoint_depth import depth_ratio
 from bidnerf_core.testing.faults import calling, require_that
 

@@ -15,9 +15,7 @@ from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping import BakeConfig, SurfaceMap, bake
-from bidnerf_core.mapping.landmarks.building import build_landmarks
-from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, bake, build_landmarks
 from bidnerf_core.scenes.trajectories import orbit
 
 BOUNDS = SceneBounds((-1.2, -1.2, -0.3), (1.2, 1.2, 0.3), 0.1, 6.0)

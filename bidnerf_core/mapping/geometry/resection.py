@@ -17,8 +17,14 @@ from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.reprojection import LinearizedErrors, ReprojectionErrors, State
-from bidnerf_core.mapping.geometry.robust_equations import Array, RobustEquations, damped_solution
+from bidnerf_core.mapping.geometry.reprojection import (
+    Array,
+    LinearizedErrors,
+    ReprojectionErrors,
+    RobustEquations,
+    State,
+    damped_solution,
+)
 
 RESECTION_STEPS = 20
 """Largest number of steps; from a good start, four or five suffice."""

@@ -10,7 +10,7 @@ from bidnerf_core.depth.sensors import UNKNOWN
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.robust import MAD_TO_SIGMA
 from bidnerf_core.mapping.geometry.triangulation import Sightings
-from bidnerf_core.mapping.landmarks.landmark_fusion import TrackedKeypoints
+from bidnerf_core.mapping.landmarks.tracks import TrackedKeypoints
 
 DEPTH_EDGE = 0.05
 """Largest relative change of the depth around a keypoint; more indicates a depth edge."""

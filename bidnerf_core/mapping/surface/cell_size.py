@@ -17,8 +17,8 @@ from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.geometry.robust import MAD_TO_SIGMA
 from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, witnesses
+from bidnerf_core.mapping.surface.surface_map import surfel_bytes
 from bidnerf_core.mapping.surface.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes
-from bidnerf_core.mapping.surface.surfels import surfel_bytes
 
 PIXEL = 0.7
 """Cell as a share of a pixel's footprint: pixels of several images lie between each other's and together resolve more."""
