@@ -29,9 +29,7 @@ from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.localization import AutoConfig
 from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.mapping.features import Features
-from bidnerf_core.mapping.landmark_building import build_landmarks
-from bidnerf_core.mapping.landmarks import LandmarkMap
+from bidnerf_core.mapping import Features, LandmarkMap, build_landmarks
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing import textured_field
 from landmark_scene import PINHOLE, Points, looking_in, ring
