@@ -1,6 +1,6 @@
 """A record of a capture: what its photos are fit for, and how well they cover the scene.
 
-The records are plain data that JSON can hold; ``capture_advice`` puts them into words.
+The records are plain data that JSON can hold; ``captures.advice`` puts them into words.
 """
 
 from __future__ import annotations

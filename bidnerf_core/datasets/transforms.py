@@ -8,7 +8,7 @@ captures; a single frame is both.
 These keys are read from a frame or, where it lacks them, from the file: ``camera_angle_x [camera_angle_y]`` or
 ``fl_x [fl_y]``, ``cx cy w h``, ``k1 k2 p1 p2 k3``, ``camera_model``, ``depth_unit_scale_factor`` (metres per unit, default
 0.001; as in nerfstudio it applies to ``.npy`` depth as well). These are read only from a frame: ``file_path`` (its extension
-may be missing), ``transform_matrix``, ``depth_file_path`` (planar z; see ``depth_images`` for values that count as not
+may be missing), ``transform_matrix``, ``depth_file_path`` (planar z; see ``depth_image`` for values that count as not
 measured). ``applied_transform`` and ``applied_scale`` record transformations that were already applied to the poses. They are
 not undone, so the world is that of the file. A sequence is ordered by ``time`` or ``timestamp`` of the frames (seconds), or
 by the number that names the file in ``source``; where a frame lacks all of them, by name. Other keys are ignored.
