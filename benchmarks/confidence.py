@@ -24,9 +24,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from bidnerf_core.localization import confidence
+from bidnerf_core.localization import Outcome, confidence
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
-from bidnerf_core.localization.result import Outcome
 
 STORED = Path(confidence.__file__).with_suffix(".json")
 RIDGE = 0.005

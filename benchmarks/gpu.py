@@ -36,19 +36,18 @@ from bidnerf_core.evaluation.json_lines import RowStore
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.evaluation.trials import opened
 from bidnerf_core.fields.contract import levels
-from bidnerf_core.localization import METHODS
-from bidnerf_core.localization.costs.sampled import SampledLoss
-from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import (
+from bidnerf_core.localization import (
+    METHODS,
     AdamSettings,
     DescentSettings,
+    RayCounts,
     ReachSettings,
+    SampledLoss,
     objective_of,
+    pivot,
+    rig,
 )
-from bidnerf_core.localization.pivots import pivot
-from bidnerf_core.localization.problem import rig
-from bidnerf_core.localization.solvers.adam import AdamSteps
-from bidnerf_core.localization.solvers.cuda_graph import captured
+from bidnerf_core.localization.solvers.adam import AdamSteps, captured
 
 TIMED_RAYS, WARM_UP, TIMED, PROFILED = 2048, 30, 200, 20
 FRAMES = 40

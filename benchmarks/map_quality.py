@@ -40,8 +40,7 @@ from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import to_plain
-from bidnerf_core.localization.search.landmarks import confirm
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization import LandmarkMatcher, confirm
 from bidnerf_core.maps.map import Map, load_map
 from bidnerf_core.training import fitted_colours
 

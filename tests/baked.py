@@ -13,8 +13,7 @@ from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.surface import PointCloud
-from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization import PointCloud, Problem, rig
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.mapping import BakeConfig, SurfaceMap, SurfelIndex, Surfels, bake
 from bidnerf_core.scenes.closed_form import ClosedFormScene

@@ -26,9 +26,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3, Intrinsics, Localization, View
 from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.localization import AutoConfig
-from bidnerf_core.localization.problem import Problem, rig
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Problem, rig
 from bidnerf_core.mapping import Features, LandmarkMap, build_landmarks
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing import textured_field

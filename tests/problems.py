@@ -9,8 +9,7 @@ from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import Localization, find_method, settings_of
-from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization import Localization, Problem, find_method, rig, settings_of
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 
 

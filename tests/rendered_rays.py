@@ -11,9 +11,9 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.residuals import Objective, colour_term, depth_term
 from bidnerf_core.geometry.robust import Robust
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import Pivot
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
-from bidnerf_core.localization.costs.weighted_rays import WeightedRays
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.costs.rendered import WeightedRays
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit
 

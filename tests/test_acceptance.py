@@ -12,6 +12,7 @@ from torch import Generator
 
 import baked
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import Outcome, PointCloud, Verdict
 from bidnerf_core.localization.acceptance import (
     SurfaceDiagnostics,
     descent_verdict,
@@ -19,12 +20,10 @@ from bidnerf_core.localization.acceptance import (
     rendered_verdict,
     surface_diagnostics,
 )
-from bidnerf_core.localization.costs.surface import PointCloud
-from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
-from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.localization.settings import RenderedThresholds
 from bidnerf_core.scenes.demo import demo_room
 
 

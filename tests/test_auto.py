@@ -15,12 +15,19 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig, Localization, Outcome, by_depth, settings_of
-from bidnerf_core.localization.auto_config import LEAST_POINTS
-from bidnerf_core.localization.costs.surface import PointCloud
-from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization import (
+    AutoConfig,
+    Localization,
+    Outcome,
+    PointCloud,
+    Problem,
+    by_depth,
+    rig,
+    settings_of,
+)
 from bidnerf_core.localization.search.by_points import PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.mapping import bake
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_room

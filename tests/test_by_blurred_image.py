@@ -14,14 +14,16 @@ from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import Localization, by_blurred_image
+from bidnerf_core.localization import LandmarkMatcher, Localization, Outcome, Problem, by_blurred_image, rig
 from bidnerf_core.localization.by_blurred_image import BLURS
-from bidnerf_core.localization.costs.images import ColourScales, ImageCost, uniform_cost
-from bidnerf_core.localization.costs.thumbnails import gaussian_blurred, thumbnail
-from bidnerf_core.localization.costs.view_renderers import FieldRenderer
-from bidnerf_core.localization.problem import Problem, rig
-from bidnerf_core.localization.result import Outcome
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.costs.images import (
+    ColourScales,
+    FieldRenderer,
+    ImageCost,
+    gaussian_blurred,
+    thumbnail,
+    uniform_cost,
+)
 from bidnerf_core.mapping import build_landmarks
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs

@@ -15,7 +15,16 @@ import bidnerf_core.localization.by_landmarks as by_landmarks_module
 from bidnerf_core import Localization, Localizer, Outcome, View
 from bidnerf_core.depth.sensors import find_depth_sensor
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig
+from bidnerf_core.localization import (
+    AutoConfig,
+    LandmarkAnswer,
+    LandmarkMatcher,
+    RefinementStage,
+    RenderedCost,
+    RenderedCostSettings,
+    answer_by_landmarks,
+    rig,
+)
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
 from bidnerf_core.localization.by_depth import share_on_surface
 from bidnerf_core.localization.by_landmarks import (
@@ -23,18 +32,12 @@ from bidnerf_core.localization.by_landmarks import (
     SHARPEST,
     STEPS,
     THOROUGHLY,
-    LandmarkAnswer,
-    answer_by_landmarks,
     corrected,
     localization_by_landmarks,
 )
-from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.fused_pose import FusedPose, Measurements
-from bidnerf_core.localization.method_settings import RefinementStage
-from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.search.landmarks import Confirmation
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing import textured_field
 from bidnerf_core.testing.textured_field import CAMERA, MapWithLandmarks, textured_map, unseen

@@ -12,14 +12,10 @@ from torch import Generator
 from bidnerf_core import Frame, Localization, Outcome, View
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig
+from bidnerf_core.localization import AutoConfig, LandmarkMatcher, LandmarkPose, propose, rig
 from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.localization.problem import rig
 from bidnerf_core.localization.search.camera_fit import LEAST_STRETCH, UNSUSPECTED, CameraFit, better_camera
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.map_camera import camera_like
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import Calibration, ObservedPoints, Stretch, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import GIVEN, UNSTRETCHED
 from bidnerf_core.results.errors import pose_error

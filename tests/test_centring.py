@@ -10,7 +10,7 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import all_pixels, observe
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.view_renderers import FieldRenderer
+from bidnerf_core.localization.costs.images import FieldRenderer
 from bidnerf_core.localization.search.centring import centred, rendered_middle
 from blob_images import BOUNDS, FIELD, FRAME, TRUTH, photograph
 

@@ -30,7 +30,7 @@ from bidnerf_core.cli import COMMANDS, main
 from bidnerf_core.cli.progress import Display
 from bidnerf_core.datasets.transforms import TransformsDataset
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.methods import METHODS
+from bidnerf_core.localization import METHODS
 from bidnerf_core.maps.checkpoints import Checkpoints
 from bidnerf_core.maps.description import MapInfo, load_info
 from bidnerf_core.maps.map import load_map

@@ -10,7 +10,7 @@ import pytest
 import tyro
 
 from bidnerf_core.cli import COMMANDS, main, options
-from bidnerf_core.localization.methods import METHODS
+from bidnerf_core.localization import METHODS
 
 CHOICES = {
     "train": [["--backend", name] for name in ("adanerf", "hashgrid", "vanilla")],

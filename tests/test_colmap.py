@@ -23,7 +23,7 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render, render_image
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization import rig
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.demo import demo_object
 from bidnerf_core.scenes.fields import GaussianBlobs

@@ -16,8 +16,7 @@ from bidnerf_core.datasets.reader import READERS, Reader, ReadOptions
 from bidnerf_core.evaluation.faults import FAULTS, find_fault
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig, Localization, find_method, settings_of
-from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization import AutoConfig, Localization, Problem, find_method, settings_of
 from bidnerf_core.mapping import Keypoints
 from bidnerf_core.mapping.landmarks.features import SIFT
 from bidnerf_core.registry import registered

@@ -12,7 +12,7 @@ from torch import Generator
 import baked
 from bidnerf_core.depth.sensors import EXACT
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
+from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import (
     INDEPENDENT,
     position_deviation,

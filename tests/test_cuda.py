@@ -22,7 +22,7 @@ from bidnerf_core.fields.contract import FieldValues, SceneBounds, device_of, le
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.localization import settings_of
 from bidnerf_core.localization.solvers import adam
-from bidnerf_core.localization.solvers.cuda_graph import captured
+from bidnerf_core.localization.solvers.adam import captured
 from bidnerf_core.maps.map import load_map
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views
 from bidnerf_core.training import Silent, TrainingState, TrainingStep, TrainingStopped

@@ -11,7 +11,7 @@ from bidnerf_core.fields.contract import RaySamples
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import Rendering
 from bidnerf_core.fields.residuals import depth_residual, first_surface_residual, truncated_depth_residual
-from bidnerf_core.localization.method_settings import ColourSettings, DepthSettings, objective_of
+from bidnerf_core.localization import ColourSettings, DepthSettings, objective_of
 
 
 def pixel_at(distance: float) -> Observations:

@@ -9,7 +9,7 @@ import torch
 from torch import Generator, Tensor
 
 import baked
-from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
+from bidnerf_core.localization import NormalEquations, PointCloud, PointScales, SurfaceCost, rig
 from bidnerf_core.localization.depth_scale import (
     LANDMARK_SCALE_NOISE,
     PLAUSIBLE,
@@ -19,8 +19,6 @@ from bidnerf_core.localization.depth_scale import (
     residual_equations,
     with_factor,
 )
-from bidnerf_core.localization.normal_equations import NormalEquations
-from bidnerf_core.localization.problem import rig
 from problems import FieldMap
 
 SCALES = PointScales(0.1, 0.3, 0.7)

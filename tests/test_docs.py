@@ -30,10 +30,9 @@ from bidnerf_core.cli import COMMANDS, main
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.fields import residuals
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import METHODS, AutoConfig, settings_of
+from bidnerf_core.localization import METHODS, AutoConfig, ByColourConfig, Problem, settings_of
 from bidnerf_core.localization.auto import auto
-from bidnerf_core.localization.by_colour import ByColourConfig, ColourRefinementSettings
-from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.settings import ColourRefinementSettings
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.registry import registered
 from bidnerf_core.results.errors import pose_error

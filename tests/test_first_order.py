@@ -17,20 +17,25 @@ from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.pixels import DrawerName, draw, uniform
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import BidConfig, InerfConfig, settings_of
-from bidnerf_core.localization.costs.sampled import SampledLoss
-from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import (
+from bidnerf_core.localization import (
     AdamSettings,
+    BidConfig,
     DescentSettings,
+    InerfConfig,
+    Outcome,
+    Pivot,
+    Problem,
+    RayCounts,
     ReachSettings,
+    SampledLoss,
     objective_of,
+    pivot,
+    rig,
+    settings_of,
 )
-from bidnerf_core.localization.pivots import Pivot, PivotName, pivot
-from bidnerf_core.localization.problem import Problem, rig
-from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.history import WINDOW
+from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit

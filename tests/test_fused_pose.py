@@ -11,9 +11,18 @@ import torch
 from torch import Generator, Tensor
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.prior import GaussianPrior
-from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
-from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
+from bidnerf_core.localization import (
+    ColourSettings,
+    GaussianPrior,
+    Pivot,
+    PointCloud,
+    RefinementSettings,
+    RefinementStage,
+    RenderedCost,
+    RenderedCostSettings,
+    SurfaceCost,
+    rig,
+)
 from bidnerf_core.localization.covariance import INDEPENDENT, LEAST_VARIANCE, position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
 from bidnerf_core.localization.fused_pose import (
@@ -23,9 +32,6 @@ from bidnerf_core.localization.fused_pose import (
     fused_pose,
 )
 from bidnerf_core.localization.fusion import finest_cost
-from bidnerf_core.localization.method_settings import ColourSettings, RefinementSettings, RefinementStage
-from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.localization.problem import rig
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
 

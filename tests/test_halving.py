@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.normal_equations import NormalEquations
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization import NormalEquations, Pivot
 from bidnerf_core.localization.search.halving import Distinct, SearchStage, search
 
 PLACES = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]], dtype=torch.float64)

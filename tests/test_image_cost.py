@@ -16,17 +16,20 @@ from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import NormalEquations
 from bidnerf_core.localization.costs.images import (
     UNKNOWN_COST,
     ColourScales,
+    FieldRenderer,
     ImageCost,
     RenderedView,
+    SurfaceRenderer,
+    Thumbnail,
+    ViewRenderer,
     exposed,
     render_view,
+    thumbnail,
 )
-from bidnerf_core.localization.costs.thumbnails import Thumbnail, thumbnail
-from bidnerf_core.localization.costs.view_renderers import FieldRenderer, SurfaceRenderer, ViewRenderer
-from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.search.by_images import WIDE_SCALES
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit

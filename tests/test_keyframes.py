@@ -12,8 +12,7 @@ from bidnerf_core import View
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.sampling import Stratified
-from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization import LandmarkMatcher, propose
 from bidnerf_core.mapping import build_landmarks, colour_noise, rendered_views
 from bidnerf_core.mapping.surface.baking import KEYFRAME_SIDE, MOST
 from bidnerf_core.results.errors import pose_error

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization import LandmarkMatcher
 from bidnerf_core.mapping import LandmarkMap, build_landmarks, landmark_tensors, landmarks_from_tensors
 from landmark_scene import Points, ring
 

@@ -11,8 +11,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from bidnerf_core.geometry.se3 import SE3, skew
-from bidnerf_core.localization.normal_equations import NormalEquations, Sum
-from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.localization import NormalEquations, Sum, descend
 
 GENERATOR = torch.Generator().manual_seed(0)
 POINTS = torch.randn((40, 3), generator=GENERATOR, dtype=torch.float64) + torch.tensor([0.0, 0, 4])

@@ -10,17 +10,14 @@ import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, Intrinsics, View
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, Outcome, propose
 from bidnerf_core.localization.acceptance import (
     LandmarkThresholds,
     doubtful_intrinsics,
     landmark_verdict,
 )
-from bidnerf_core.localization.result import Outcome
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.map_camera import SAME_CAMERA, correction_between, map_camera
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import (
     CameraEvidence,
     probability_beside_approximate,

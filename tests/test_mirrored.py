@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from bidnerf_core import Localizer, Outcome, View
-from bidnerf_core.localization.search.landmarks import confirm, propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization import LandmarkMatcher, confirm, propose
 from bidnerf_core.localization.search.mirrored import (
     MirrorEvidence,
     mirror_evidence,

@@ -26,14 +26,13 @@ from bidnerf_core.captures.training_poses import TrainingPoses, training_poses
 from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.fields.rendering import render, render_image
 from bidnerf_core.frames.pixels import all_pixels, observe
+from bidnerf_core.localization import LandmarkMatcher, propose
 from bidnerf_core.localization.search.evident_motion import (
     SHARE_AS_MAP,
     SHARE_MOVING,
     evident_motion,
     share_moving,
 )
-from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import (
     LandmarkConfig,
     TrackedViews,

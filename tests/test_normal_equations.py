@@ -7,7 +7,7 @@ import torch
 from torch import Generator
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.normal_equations import Cost, NormalEquations, Scaled, Sum
+from bidnerf_core.localization import Cost, NormalEquations, Scaled, Sum
 
 
 def random(count: int, generator: Generator) -> NormalEquations:

@@ -18,17 +18,17 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import render, render_image
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import window
-from bidnerf_core.localization.costs.sampled import SampledLoss
-from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import (
+from bidnerf_core.localization import (
     ColourSettings,
     DepthSettings,
     DescentSettings,
+    Problem,
+    RayCounts,
     ReachSettings,
+    SampledLoss,
     objective_of,
+    window,
 )
-from bidnerf_core.localization.problem import Problem
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import orbit

@@ -15,7 +15,7 @@ from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.pixels import draw, uniform
 from bidnerf_core.geometry.robust import Robust
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization import Problem, rig
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.fields import GaussianBlobs
 from bidnerf_core.scenes.trajectories import look_at, orbit

@@ -7,10 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.prior import GaussianPrior
-from bidnerf_core.localization.normal_equations import Cost, Scaled, Sum
-from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.localization import Cost, GaussianPrior, Pivot, Scaled, Sum, descend
 
 MEAN = SE3.exp(torch.tensor([0.4, -1.0, 2.0, 0.8, -0.5, 0.3], dtype=torch.float64))
 PIVOTS = {

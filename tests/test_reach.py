@@ -13,18 +13,21 @@ from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import METHODS, Localizer, settings_of
-from bidnerf_core.localization.costs.blurred_field import Blurred
-from bidnerf_core.localization.costs.sampled import SampledLoss
-from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import (
+from bidnerf_core.localization import (
+    METHODS,
     ColourSettings,
     DepthSettings,
     DescentSettings,
+    Localizer,
+    Problem,
+    RayCounts,
     ReachSettings,
+    SampledLoss,
     objective_of,
+    rig,
+    settings_of,
 )
-from bidnerf_core.localization.problem import Problem, rig
+from bidnerf_core.localization.costs.blurred_field import Blurred
 from bidnerf_core.settings import to_flat
 from bidnerf_core.testing.scene import CAMERA
 from problems import FieldMap, localize

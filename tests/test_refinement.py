@@ -12,16 +12,16 @@ from torch import Generator
 import baked
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.fusion import finest_cost
-from bidnerf_core.localization.method_settings import (
+from bidnerf_core.localization import (
     ColourSettings,
     DepthSettings,
     RefinementSettings,
     RefinementStage,
+    RenderedCostSettings,
 )
-from bidnerf_core.localization.pivots import PivotName
+from bidnerf_core.localization.fusion import finest_cost
 from bidnerf_core.localization.refinement import refine, take_few_steps
+from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.results.errors import pose_error
 from blob_images import BOUNDS, FIELD, FRAME, TRUTH
 from problems import single

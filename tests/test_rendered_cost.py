@@ -12,8 +12,8 @@ from bidnerf_core.fields.rendering import render
 from bidnerf_core.fields.residuals import Objective, colour_term, depth_term
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.robust import Robust
-from bidnerf_core.localization.costs.rendered import LEAST_WITH_DEPTH, RenderedCost, Residuals, _residuals
-from bidnerf_core.localization.method_settings import RefinementSettings, RefinementStage
+from bidnerf_core.localization import RefinementSettings, RefinementStage, RenderedCost
+from bidnerf_core.localization.costs.rendered import LEAST_WITH_DEPTH, Residuals, _residuals
 from problems import single
 from rendered_rays import BOUNDS, FIELD, OBJECTIVE, OBSERVED, PIVOTS, POSES, RAYS, seen
 

@@ -10,13 +10,17 @@ import torch
 from bidnerf_core import Intrinsics, Localizer, Outcome, View
 from bidnerf_core.fields.contract import FieldValues
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.auto_config import AutoConfig
-from bidnerf_core.localization.by_landmarks import LandmarkAnswer, answer_by_landmarks
+from bidnerf_core.localization import (
+    AutoConfig,
+    LandmarkAnswer,
+    LandmarkMatcher,
+    Problem,
+    Verdict,
+    answer_by_landmarks,
+    rig,
+)
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
-from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.rendered_evidence import NOISIEST, log_odds_by_rendering
-from bidnerf_core.localization.result import Verdict
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import MirrorEvidence, mirror_image
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import CAMERA, TexturedGround, seen, textured_map, unseen

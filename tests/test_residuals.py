@@ -12,8 +12,7 @@ from bidnerf_core.fields.observations import Observations
 from bidnerf_core.fields.rendering import Rendering, render
 from bidnerf_core.fields.residuals import DEPTH_RESIDUALS, Objective, depth_residual, free_space, masked_mean
 from bidnerf_core.geometry.robust import RobustName
-from bidnerf_core.localization import BidConfig
-from bidnerf_core.localization.method_settings import ColourSettings, DepthSettings, objective_of
+from bidnerf_core.localization import BidConfig, ColourSettings, DepthSettings, objective_of
 from bidnerf_core.scenes.fields import GaussianBlobs
 
 BOUNDS = SceneBounds((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, 12.0)

@@ -13,12 +13,10 @@ from bidnerf_core import Intrinsics
 from bidnerf_core.camera.rolling_shutter import exposure_times, moved_points
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.correspondences import query_images
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.resized_image import RESIZED, log_odds
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import FIXED

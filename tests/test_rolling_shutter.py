@@ -13,10 +13,8 @@ from bidnerf_core import Localizer, View
 from bidnerf_core.evaluation.faults.camera import rolling_shutter
 from bidnerf_core.frames.pixels import observe
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
 

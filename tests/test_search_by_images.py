@@ -12,7 +12,7 @@ from torch import Generator
 import baked
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.view_renderers import SurfaceRenderer
+from bidnerf_core.localization.costs.images import SurfaceRenderer
 from bidnerf_core.localization.search.by_images import (
     APART,
     IMAGE_STAGES,

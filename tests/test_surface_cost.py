@@ -15,7 +15,7 @@ from bidnerf_core.fields.voxel_grid import VoxelGrid
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.pixels import measured_middle
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
+from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.mapping import SurfaceMap, SurfelIndex, Surfels
 from tiny import depth_rays_of
 

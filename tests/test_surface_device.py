@@ -18,23 +18,25 @@ from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs import images, surface, view_renderers
-from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.costs.surface import PointCloud
-from bidnerf_core.localization.fusion import finest_cost, rendered_term, surface_term
-from bidnerf_core.localization.method_settings import (
+from bidnerf_core.localization import (
     ColourSettings,
+    Cost,
     DepthSettings,
+    NormalEquations,
+    Pivot,
+    PointCloud,
     RefinementSettings,
     RefinementStage,
+    RenderedCostSettings,
+    Sum,
+    descend,
+    rig,
 )
-from bidnerf_core.localization.normal_equations import Cost, NormalEquations, Sum
-from bidnerf_core.localization.pivots import Pivot
-from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization.costs import images, surface
+from bidnerf_core.localization.fusion import finest_cost, rendered_term, surface_term
 from bidnerf_core.localization.search.by_images import IMAGE_STAGES, ImageSearch
 from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
 from bidnerf_core.localization.solvers import levenberg_marquardt
-from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import SurfaceMap, SurfelIndex, Surfels, cast, trace
 from bidnerf_core.mapping.surface import casting
 from bidnerf_core.testing.simulated_device import DEVICE, DeviceFault, Elsewhere
@@ -196,7 +198,7 @@ def test_waiting_where_it_is_not_allowed_is_found(module: Any, monkeypatch: pyte
 
 
 def test_a_constant_that_is_made_in_each_step_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view_renderers, "constant", lambda values, like: like.new_tensor(values))
+    monkeypatch.setattr(images, "constant", lambda values, like: like.new_tensor(values))
     with Elsewhere() as mode, pytest.raises(DeviceFault, match="copied between devices"):
         compare_images(Place(mode))
 

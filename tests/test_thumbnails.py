@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.thumbnails import slopes, smooth, thumbnail
+from bidnerf_core.localization.costs.images import slopes, smooth, thumbnail
 from bidnerf_core.scenes.trajectories import orbit
 
 PLAIN = Intrinsics(100.0, 104.0, 47.0, 33.0, 96, 64)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.localization import Outcome, Verdict
 from bidnerf_core.localization.tracking.alignment import measured_cloud
 from bidnerf_core.localization.tracking.judging import (
     as_certain_as_usual,

@@ -10,12 +10,16 @@ import torch
 
 from bidnerf_core import SE3, Frame, Localizer, Outcome, Tracker
 from bidnerf_core.depth.sensors import KINECT
-from bidnerf_core.localization import AutoConfig
-from bidnerf_core.localization.costs.prior import GaussianPrior
-from bidnerf_core.localization.costs.surface import PointScales, SurfaceCost
+from bidnerf_core.localization import (
+    AutoConfig,
+    GaussianPrior,
+    PointScales,
+    Scaled,
+    Sum,
+    SurfaceCost,
+    descend,
+)
 from bidnerf_core.localization.covariance import FINEST
-from bidnerf_core.localization.normal_equations import Scaled, Sum
-from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.tracking.alignment import (
     DEPTH_MEASUREMENTS,
     aligned,

@@ -11,11 +11,15 @@ import torch
 
 from bidnerf_core import SE3, Localization, Localizer, Outcome, View
 from bidnerf_core.fields.rendering import render_image
-from bidnerf_core.localization import AutoConfig
-from bidnerf_core.localization.problem import Problem, rig
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import confirm, propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization import (
+    AutoConfig,
+    LandmarkMatcher,
+    LandmarkPose,
+    Problem,
+    confirm,
+    propose,
+    rig,
+)
 from bidnerf_core.localization.tracking.relocalization import relocalized
 from bidnerf_core.localization.twin_rejection import twin_rejection
 from bidnerf_core.mapping import LandmarkMap, build_landmarks

@@ -8,9 +8,8 @@ from torch import Generator
 
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.weighted_rays import RayCounts, blurred, draw_weighted_rays
-from bidnerf_core.localization.method_settings import ColourSettings, DepthSettings, objective_of
-from bidnerf_core.localization.problem import rig
+from bidnerf_core.localization import ColourSettings, DepthSettings, RayCounts, objective_of, rig
+from bidnerf_core.localization.costs.rendered import blurred, draw_weighted_rays
 from blob_images import BOUNDS, CAMERA, FIELD, FRAME, POSES, TRUTH, photograph
 from problems import FieldMap, single
 from tiny import depth_rays_of

@@ -14,10 +14,8 @@ from bidnerf_core.captures.report import PhotoProblem, PhotoRecord
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import mirror_image
 from bidnerf_core.mapping import Features, LandmarkConfig, TrackedKeypoints, TrackedViews
 

@@ -17,10 +17,8 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.robust import chi_squared_quantile
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
     Features,

@@ -15,11 +15,11 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
-from bidnerf_core.localization.method_settings import RenderedThresholds
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.settings import RenderedThresholds
 from bidnerf_core.mapping.geometry.calibration import UNSTRETCHED, Calibration
 from bidnerf_core.mapping.surface.casting import trace
 

@@ -22,8 +22,6 @@ from bidnerf_core.localization.acceptance import (
     landmark_verdict,
 )
 from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_intrinsics
-from bidnerf_core.localization.auto_config import LEAST_POINTS, AutoConfig
-from bidnerf_core.localization.bid import BidConfig, bid
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
 from bidnerf_core.localization.by_colour import without_the_imprecise
 from bidnerf_core.localization.by_depth import localized_by_depth, share_on_surface
@@ -38,6 +36,7 @@ from bidnerf_core.localization.by_landmarks import (
 )
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.covariance import position_deviation
+from bidnerf_core.localization.first_order import BidConfig, bid
 from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
@@ -46,6 +45,7 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.occluders import nearest_piece
+from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
 from bidnerf_core.localization.twin_rejection import between_twins, twin_rejection
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)

@@ -19,15 +19,20 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.ambiguous_intrinsics import may_be_miscalibrated
 from bidnerf_core.localization.by_landmarks import is_sharp
 from bidnerf_core.localization.confidence import TRUSTED
-from bidnerf_core.localization.costs.images import ColourScales, ImageCost, render_view, uniform_cost
-from bidnerf_core.localization.costs.thumbnails import thumbnail
-from bidnerf_core.localization.costs.view_renderers import FieldRenderer
+from bidnerf_core.localization.costs.images import (
+    ColourScales,
+    FieldRenderer,
+    ImageCost,
+    render_view,
+    thumbnail,
+    uniform_cost,
+)
 from bidnerf_core.localization.covariance import LEAST_VARIANCE, position_deviation
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
-from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.solvers.levenberg_marquardt import Descent, descend
+from bidnerf_core.localization.solvers.pivots import Pivot, pivot
 
 WIDTH = 100
 """Pixels of the longer side of the images that are compared."""

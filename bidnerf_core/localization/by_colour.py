@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import torch
 from torch import Generator
@@ -14,41 +13,14 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import rendered_verdict
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.covariance import INDEPENDENT, position_deviation
-from bidnerf_core.localization.method_settings import (
-    ColourSettings,
-    RefinementSettings,
-    RefinementStage,
-    RenderedThresholds,
-)
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult, refine
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.settings import EXPERT, Range, Settings
-
-
-@dataclass(frozen=True)
-class ColourRefinementSettings(Settings):
-    """Settings of the last steps on colour alone."""
-
-    # steps of each pose that the search left, at the coarsest level
-    coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = 4
-    # number of rays rendered for each of the coarse steps
-    coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256
-    fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
-    # number of rays rendered for each of the fine steps; four times as many where something may hide the scene
-    fine_rays: Annotated[int, Range(7, 10**7)] = 1024
-
-
-@dataclass(frozen=True)
-class ByColourConfig(Settings):
-    """Settings of the steps on rendered rays and of their acceptance."""
-
-    steps: ColourRefinementSettings = ColourRefinementSettings()
-    colour: ColourSettings = ColourSettings()
-    refinement: RefinementSettings = RefinementSettings(surface_sigma=0.006, exposure=True)
-    thresholds: RenderedThresholds = RenderedThresholds()
-
+from bidnerf_core.localization.settings import (
+    ByColourConfig,
+    RefinementStage,
+)
 
 TYPICAL_ERRORS = 4.5
 """Largest standard deviation of a position, in median errors of the map's own images, with which a pose is accepted."""

@@ -10,25 +10,25 @@ from torch import Generator
 
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
-from bidnerf_core.localization.auto_config import AutoConfig
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
 from bidnerf_core.localization.covariance import surface_covariance
 from bidnerf_core.localization.fusion import finest_cost
-from bidnerf_core.localization.method_settings import (
-    ColourSettings,
-    DepthSettings,
-    RefinementSettings,
-    RefinementStage,
-    rendered_depth_scale,
-)
 from bidnerf_core.localization.point_exposure import cloud_with_exposure_of_map
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
 from bidnerf_core.localization.search.halving import SearchResult
+from bidnerf_core.localization.settings import (
+    AutoConfig,
+    ColourSettings,
+    DepthSettings,
+    RefinementSettings,
+    RefinementStage,
+    rendered_depth_scale,
+)
 from bidnerf_core.mapping import SurfaceMap
 
 WORSE = 0.05

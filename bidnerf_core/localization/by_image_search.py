@@ -11,14 +11,7 @@ from torch import Generator
 
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import BLANK, is_blank
-from bidnerf_core.localization.auto_config import AutoConfig
-from bidnerf_core.localization.by_colour import (
-    ByColourConfig,
-    ColourAnswer,
-    localization_of,
-    refine_by_colour,
-    usual_stages,
-)
+from bidnerf_core.localization.by_colour import ColourAnswer, localization_of, refine_by_colour, usual_stages
 from bidnerf_core.localization.by_landmarks import is_sharp
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.problem import Problem
@@ -34,6 +27,7 @@ from bidnerf_core.localization.search.by_images import (
 )
 from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.hypotheses import Surroundings, hypotheses_for_images
+from bidnerf_core.localization.settings import AutoConfig, ByColourConfig
 from bidnerf_core.mapping import SurfaceMap
 
 COMPARED_WIDTH = 96

@@ -27,14 +27,6 @@ from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
 from bidnerf_core.localization.fused_pose import Measurements, fused_pose
 from bidnerf_core.localization.fusion import finest_cost
-from bidnerf_core.localization.method_settings import (
-    ColourSettings,
-    DepthSettings,
-    RefinementSettings,
-    RefinementStage,
-    rendered_depth_scale,
-)
-from bidnerf_core.localization.pivots import Pivot, pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -43,6 +35,14 @@ from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
+from bidnerf_core.localization.settings import (
+    ColourSettings,
+    DepthSettings,
+    RefinementSettings,
+    RefinementStage,
+    rendered_depth_scale,
+)
+from bidnerf_core.localization.solvers.pivots import Pivot, pivot
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.geometry.calibration import Calibration
 

@@ -1,27 +1,49 @@
-"""First-order methods: Adam on the loss of sampled rays, of which ``bid`` and ``inerf`` are two configurations."""
+"""First-order methods: Adam on the loss of sampled rays, of which ``bid`` and ``inerf`` are two configurations.
+
+``bid`` takes colour and depth of one or several images, at the coarse level (BID-NeRF, Alg. 1); ``inerf`` the colours of one
+image, in full detail (Yen-Chen et al. 2021, iNeRF). "In full detail" is the field itself, which a NeRF renders hierarchically
+with its coarse and its fine network. iNeRF optimizes the magnitude and the axis of one screw motion from the start; here each
+step is an update of its own in the same frame, the world's. The two differ to second order, and updates have no axis that
+would be undefined at magnitude 0.
+"""
 
 from __future__ import annotations
 
 import math
 import statistics
 import time
+from dataclasses import dataclass, replace
 
 import torch
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.fields.residuals import Objective
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import BLANK, descent_verdict, is_blank
+from bidnerf_core.localization.costs.rendered import RayCounts
 from bidnerf_core.localization.costs.sampled import SampledLoss
-from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import AdamSettings, DescentSettings, ReachSettings
-from bidnerf_core.localization.pivots import pivot
+from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.localization.settings import (
+    AdamSettings,
+    ColourSettings,
+    DepthSettings,
+    DescentSettings,
+    ReachSettings,
+    objective_of,
+)
 from bidnerf_core.localization.solvers.adam import follow_gradient
 from bidnerf_core.localization.solvers.history import History
+from bidnerf_core.localization.solvers.pivots import pivot
+from bidnerf_core.settings import Settings
 
 PAPERS_REACH = ReachSettings()
 """The paper's objective, with nothing added."""
+WIDE_REACH = ReachSettings(candidates=3, box_weight=1.0)
+"""Pixels on matter and measured points in the box of the scene. On Lego this helped most (``benchmarks/bid_variants.py``)."""
+PAPER_STEPS = AdamSettings(max_steps=1000, learning_rate=0.02, decay=0.8, decay_steps=100)
+"""The paper's number of steps, with iNeRF's decay. The paper does not give its learning rate; this one is provisional."""
 
 
 def descended(
@@ -65,3 +87,69 @@ def _plain_loss(problem: Problem, objective: Objective) -> float:
     if not images:
         return math.inf
     return statistics.fmean(objective.plain_loss(frame.rgb.flatten(0, 1)) for frame in images)
+
+
+@dataclass(frozen=True)
+class BidConfig(Settings):
+    """Settings of method ``bid``."""
+
+    # The camera's own frame is the paper's pivot.
+    descent: DescentSettings = DescentSettings(level=0, pivot="scene")
+    adam: AdamSettings = AdamSettings(learning_rate=0.04, decay=0.4, decay_steps=80)
+    colour: ColourSettings = ColourSettings()
+    depth: DepthSettings = DepthSettings()
+    reach: ReachSettings = WIDE_REACH
+
+
+BID_PRESETS = {
+    "paper": BidConfig(DescentSettings(level=0, pivot="camera"), PAPER_STEPS, reach=PAPERS_REACH),
+    "paper-scene": BidConfig(DescentSettings(level=0, pivot="scene"), PAPER_STEPS, reach=PAPERS_REACH),
+}
+"""The paper's settings with updates as in its Alg. 1, in the camera's frame, and with ours, about the middle of the scene."""
+
+
+def bid(problem: Problem, config: BidConfig, seed: int = 0) -> Localization:
+    """Descend from ``problem.start``; pixels are drawn from ``seed``."""
+    objective = objective_of(config.colour, config.depth)
+    depth_rays = config.depth.depth_rays
+    return descended(problem, config.descent, config.adam, objective, depth_rays, seed, "bid", config.reach)
+
+
+BID = Method(
+    bid,
+    BidConfig,
+    needs_start=True,
+    presets=BID_PRESETS,
+    summary="Adam on colour and depth at the coarse level (BID-NeRF)",
+)
+
+
+@dataclass(frozen=True)
+class InerfConfig(Settings):
+    """Settings of method ``inerf``: the learning rate and its decay are iNeRF's (section 4)."""
+
+    descent: DescentSettings = DescentSettings(pixels="interest-regions", pivot="world")
+    adam: AdamSettings = AdamSettings(max_steps=300)
+    colour: ColourSettings = ColourSettings(colour_loss="l2")
+
+
+INERF_PRESETS = {"paper": replace(InerfConfig(), adam=AdamSettings(max_steps=1000))}
+"""The settings with which BID-NeRF compares: iNeRF's own learning rate, 1000 steps of 2048 rays."""
+
+
+def inerf(problem: Problem, config: InerfConfig, seed: int = 0) -> Localization:
+    """Descend from ``problem.start`` on colour alone. Raises ``InputError`` for more than one image."""
+    if len(problem.views) > 1:
+        raise InputError(f"method inerf takes one image, got {len(problem.views)}; method bid takes several")
+    objective = objective_of(config.colour, None)
+    return descended(problem, config.descent, config.adam, objective, 0, seed, "inerf")
+
+
+INERF = Method(
+    inerf,
+    InerfConfig,
+    needs_start=True,
+    uses_depth=False,
+    presets=INERF_PRESETS,
+    summary="Adam on the colours of one image in full detail (iNeRF)",
+)

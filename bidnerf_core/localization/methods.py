@@ -9,9 +9,9 @@ from typing import Any
 
 from bidnerf_core.depth.sensors import UNKNOWN_SENSOR
 from bidnerf_core.errors import InputError
-from bidnerf_core.localization.by_colour import ByColourConfig
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.settings import ByColourConfig
 from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import from_flat
 

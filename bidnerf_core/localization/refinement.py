@@ -20,13 +20,13 @@ from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostS
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import sandwich_covariance
 from bidnerf_core.localization.fusion import rendered_term, surface_term
-from bidnerf_core.localization.method_settings import RefinementStage
 from bidnerf_core.localization.normal_equations import NormalEquations
-from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.centring import centred
+from bidnerf_core.localization.settings import RefinementStage
 from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.localization.solvers.pivots import pivot
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,10 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.method_settings import ColourSettings, RefinementSettings, RefinementStage
-from bidnerf_core.localization.pivots import pivot
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
+from bidnerf_core.localization.settings import ColourSettings, RefinementSettings, RefinementStage
+from bidnerf_core.localization.solvers.pivots import pivot
 
 COMPARED_RAYS = 8192
 """Number of rays on which two explanations are compared; fewer if fewer pixels are not hidden."""

@@ -15,6 +15,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.localizer import Localizer, Start, map_with_distances, start_pose
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
+from bidnerf_core.localization.settings import TrackerConfig
 from bidnerf_core.localization.tracking.answers import (
     METHOD,
     tracked_localization,
@@ -45,7 +46,6 @@ from bidnerf_core.localization.tracking.relocalization import (
     search_due,
     typical_error,
 )
-from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.landmarks.features import grey_image, strongest

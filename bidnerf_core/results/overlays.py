@@ -19,8 +19,7 @@ from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.images import reduced
-from bidnerf_core.localization import Localization
-from bidnerf_core.localization.problem import SceneMap
+from bidnerf_core.localization import Localization, SceneMap
 
 PICTURE_SIDE = 240
 """Maximum pixels on the longer side; larger photos are reduced, since each rendered pixel takes time."""

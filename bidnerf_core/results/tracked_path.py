@@ -19,9 +19,8 @@ from bidnerf_core.datasets import FileSequence, FrameSequence, TimedFrame, open_
 from bidnerf_core.errors import InputError, InputWarning, amount
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import Localization, Localizer, Tracker, TrackerConfig
+from bidnerf_core.localization import Localization, Localizer, SceneMap, Tracker, TrackerConfig
 from bidnerf_core.localization.localizer import Start
-from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.maps.description import MapInfo
 from bidnerf_core.progress import Cancel, ProgressCallback, counter

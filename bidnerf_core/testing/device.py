@@ -13,23 +13,24 @@ from torch import Tensor
 
 from bidnerf_core.devices import without_waiting
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
-from bidnerf_core.localization.bid import BidConfig
-from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.costs.sampled import SampledLoss
-from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import (
+from bidnerf_core.localization import (
     AdamSettings,
+    BidConfig,
     ColourSettings,
     DepthSettings,
     DescentSettings,
+    Problem,
+    RayCounts,
     RefinementSettings,
     RefinementStage,
+    RenderedCostSettings,
+    SampledLoss,
+    descend,
     objective_of,
+    pivot,
+    rig,
 )
-from bidnerf_core.localization.pivots import pivot
-from bidnerf_core.localization.problem import Problem, rig
 from bidnerf_core.localization.solvers.adam import AdamSteps
-from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.scene import BOUNDS, rgbd_views

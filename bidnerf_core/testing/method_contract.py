@@ -8,9 +8,7 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.localizer import Localizer
-from bidnerf_core.localization.methods import METHODS, Method
-from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization import METHODS, Localization, Localizer, Method
 from bidnerf_core.registry import interface_defects
 from bidnerf_core.testing.faults import calling, require_that
 from bidnerf_core.testing.textured_field import (

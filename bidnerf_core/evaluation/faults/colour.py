@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Generator, Tensor
 
 from bidnerf_core.frames.frame import Frame
-from bidnerf_core.localization.costs.thumbnails import KERNEL_REACH
+from bidnerf_core.localization.costs.images import KERNEL_REACH
 
 
 def exposure(frame: Frame, factor: float, generator: Generator) -> Frame:

@@ -1,29 +1,187 @@
 """The cost of whole small images: compare renderings of a map from many poses with the photo.
 
-The derivative of a rendered image with respect to the pose follows from the image's gradient and its depth, whatever the
-renderer; automatic differentiation is not needed.
+Thumbnails are the photos, small and smooth. Renderers draw the same views fast, without derivatives, from the baked surface or
+from a field. The derivative of a rendered image with respect to the pose follows from the image's gradient and its depth,
+whatever the renderer; automatic differentiation is not needed.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
+from torch.nn.functional import conv2d, grid_sample, interpolate, pad
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.devices import constant
+from bidnerf_core.fields.contract import RadianceField, SceneBounds
+from bidnerf_core.fields.rendering import render
+from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.robust import geman_mcclure_inlier
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.thumbnails import Thumbnail, gaussian_blurred, slopes, smooth
-from bidnerf_core.localization.costs.view_renderers import ViewRenderer
 from bidnerf_core.localization.exposure import Exposure, clipped, fit_exposure
 from bidnerf_core.localization.normal_equations import NormalEquations
+from bidnerf_core.mapping import SurfaceMap
+from bidnerf_core.mapping.surface.casting import cast
 
+KERNEL_REACH = 3.0
+"""Radius of a blurring kernel in standard deviations."""
+CHUNK = 16384
+"""Number of rays that are rendered at a time."""
 UNKNOWN_COST = 0.7
 """Cost of a pixel for which the map renders nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A view resampled to a small camera without distortion. All that is derived from it lies on the device of ``rgb``."""
+
+    camera: Intrinsics
+    T_last_camera: SE3
+    rgb: Float[Tensor, "3 h w"]  # smoothed
+
+    @cached_property
+    def flat(self) -> Float[Tensor, "n 3"]:
+        """The pixels' points on the plane z = 1 of the camera frame, row by row."""
+        return self.camera.unproject(self.camera.pixel_centres()).reshape(-1, 3).to(self.rgb.device)
+
+    @cached_property
+    def directions(self) -> Float[Tensor, "n 3"]:
+        """The pixels' unit directions, in the last camera's frame."""
+        return self.T_last_camera.to(self.flat).rotate(torch.nn.functional.normalize(self.flat, dim=-1))
+
+    @cached_property
+    def directness(self) -> Float[Tensor, "n"]:
+        """Ratio of depth (planar z) to distance along each ray."""
+        return 1 / torch.linalg.vector_norm(self.flat, dim=-1)
+
+    @cached_property
+    def origin(self) -> Float[Tensor, "3"]:
+        return self.T_last_camera.translation.to(self.flat)
+
+    @cached_property
+    def rotation(self) -> Float[Tensor, "3 3"]:
+        """Rotation that takes the axes of the camera to those of the last camera."""
+        return self.T_last_camera.rotation.to(self.flat)
+
+    @cached_property
+    def slopes(self) -> Float[Tensor, "3 n 2"]:
+        return slopes(self.rgb, self.camera)
+
+
+def thumbnail(view: View, width: int) -> Thumbnail:
+    """Return ``view`` reduced to at most ``width`` pixels on its longer side, without distortion, smoothed; on the CPU."""
+    camera = view.frame.intrinsics
+    small = replace(camera.scaled(min(1.0, width / max(camera.width, camera.height))), distortion=())
+    rgb = view.frame.rgb.cpu().float().permute(2, 0, 1)[None]
+    # Averaged first, so that every pixel of the image contributes.
+    rgb = interpolate(rgb, (small.height, small.width), mode="area")
+    if camera.distortion:
+        seen = camera.project(small.unproject(small.pixel_centres())) / torch.tensor(
+            [camera.width, camera.height]
+        )
+        rgb = grid_sample(rgb, 2 * seen[None] - 1, padding_mode="border", align_corners=False)
+    return Thumbnail(small, view.T_ref_camera.to("cpu", torch.float64), smooth(rgb[0]))
+
+
+def smooth(image: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+    """Convolve with a binomial kernel of 5x5 pixels, about a Gaussian of one pixel; the border is repeated."""
+    kernel = constant((1.0, 4.0, 6.0, 4.0, 1.0), image) / 16
+    flat = image.reshape(-1, 1, *image.shape[-2:])
+    flat = conv2d(pad(flat, (2, 2, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 5))
+    flat = conv2d(pad(flat, (0, 0, 2, 2), mode="replicate"), kernel.view(1, 1, 5, 1))
+    return flat.view(image.shape)
+
+
+def gaussian_blurred(image: Float[Tensor, "b c h w"], pixels: float) -> Float[Tensor, "b c h w"]:
+    """Convolve with a Gaussian of standard deviation ``pixels``; the border is repeated."""
+    size = 2 * math.ceil(KERNEL_REACH * pixels) + 1
+    return gaussian_blur2d(image, (size, size), (pixels, pixels), "replicate")
+
+
+def slopes(image: Float[Tensor, "*b h w"], camera: Intrinsics) -> Float[Tensor, "*b n 2"]:
+    """Return central differences to the right and down, per unit on the plane z = 1."""
+    flat = image.reshape(-1, 1, *image.shape[-2:])
+    wide = pad(flat, (1, 1, 1, 1), mode="replicate")
+    across = (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) * (camera.fx / 2)
+    down = (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]) * (camera.fy / 2)
+    return torch.stack([across, down], -1).reshape(*image.shape[:-2], -1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class RayColours:
+    """The rendered colour and distance of rays."""
+
+    rgb: Float[Tensor, "r 3"]  # times ``known``, where that is less than 1
+    known: Float[Tensor, "r"]  # 0 where the map has nothing along the ray
+    # Metres to what is seen or, where that is the background, to where the ray passes closest to the scene.
+    along: Float[Tensor, "r"]
+
+
+@runtime_checkable
+class ViewRenderer(Protocol):
+    """Renders half-lines with unit directions (world frame)."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device on which the rays must lie and their colours are returned."""
+        ...
+
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours: ...
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceRenderer:
+    """Renders the colours of surfels and, where the scene has a background, its colour behind them."""
+
+    surface: SurfaceMap
+    background: (
+        tuple[float, float, float] | None
+    )  # None: a ray that meets nothing looks through a hole in the map
+
+    @property
+    def device(self) -> torch.device:
+        return self.surface.device
+
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours:
+        found = cast(self.surface, origins, directions)
+        met = found.met[:, None].to(origins)
+        behind = constant(self.background or (0.0, 0.0, 0.0), origins)
+        rgb = met * self.surface.surfels.rgb[found.index] + (1 - met) * behind
+        known = met[:, 0] if self.background is None else torch.ones_like(found.along)
+        return RayColours(rgb, known, found.along.clamp(min=self.surface.cell))
+
+
+@dataclass(frozen=True, eq=False)
+class FieldRenderer:
+    """Renders a field, with its background."""
+
+    field: RadianceField
+    bounds: SceneBounds
+    device: torch.device
+
+    @torch.no_grad()
+    def __call__(self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]) -> RayColours:
+        lower, upper = (constant(corner, origins) for corner in (self.bounds.lower, self.bounds.upper))
+        middle = (lower + upper) / 2
+        passing = ((middle - origins) * directions).sum(-1)
+        parts = [
+            self._rendered(*some) for some in zip(origins.split(CHUNK), directions.split(CHUNK), strict=True)
+        ]
+        rgb, along, opacity = (torch.cat(values) for values in zip(*parts, strict=True))
+        along = torch.where(opacity > 0.5, along / opacity.clamp(min=0.5), passing)
+        return RayColours(rgb, torch.ones_like(along), along.clamp(min=self.bounds.near))
+
+    def _rendered(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        seen = render(self.field, self.bounds.rays(origins, directions), self.bounds.background)
+        return seen.rgb, seen.distance, seen.opacity
 
 
 @dataclass(frozen=True)

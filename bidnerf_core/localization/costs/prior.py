@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidnerf_core.geometry.se3 import SE3, se3_right_jacobian
 from bidnerf_core.localization.normal_equations import NormalEquations
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.solvers.pivots import Pivot
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,9 @@ from bidnerf_core.frames.pixels import PixelDrawer, draw, drawer
 from bidnerf_core.geometry.robust import Robust
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.blurred_field import Blurred
-from bidnerf_core.localization.costs.weighted_rays import RayCounts
-from bidnerf_core.localization.method_settings import DescentSettings, ReachSettings
+from bidnerf_core.localization.costs.rendered import RayCounts
 from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.settings import DescentSettings, ReachSettings
 
 DIFFERENT = 0.02
 """Colour difference from the background, in [0, 1], above which a pixel shows matter."""

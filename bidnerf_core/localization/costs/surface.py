@@ -16,7 +16,7 @@ from bidnerf_core.frames.pixels import observe
 from bidnerf_core.geometry.robust import geman_mcclure_inlier
 from bidnerf_core.geometry.se3 import SE3, skew
 from bidnerf_core.localization.normal_equations import NormalEquations
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.mapping import SurfaceMap
 
 SURFEL_RADIUS = 1.5

@@ -13,12 +13,18 @@ from torch import Tensor
 from bidnerf_core.devices import moved
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.costs.images import ColourScales, ImageCost
-from bidnerf_core.localization.costs.thumbnails import Thumbnail, thumbnail
-from bidnerf_core.localization.costs.view_renderers import FieldRenderer, SurfaceRenderer, ViewRenderer
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.costs.images import (
+    ColourScales,
+    FieldRenderer,
+    ImageCost,
+    SurfaceRenderer,
+    Thumbnail,
+    ViewRenderer,
+    thumbnail,
+)
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.halving import Distinct, SearchResult, SearchStage, search
+from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.surface.casting import Cast, cast
 

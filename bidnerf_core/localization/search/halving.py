@@ -13,8 +13,8 @@ from torch import Tensor
 from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.normal_equations import Cost
-from bidnerf_core.localization.pivots import Pivot
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
+from bidnerf_core.localization.solvers.pivots import Pivot
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 from torch.quasirandom import SobolEngine
 
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.pivots import Pivot
+from bidnerf_core.localization.solvers.pivots import Pivot
 
 
 @dataclass(frozen=True, eq=False)

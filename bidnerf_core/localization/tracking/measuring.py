@@ -13,7 +13,7 @@ from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
-from bidnerf_core.localization.by_colour import ByColourConfig, refine_by_colour
+from bidnerf_core.localization.by_colour import refine_by_colour
 from bidnerf_core.localization.covariance import INDEPENDENT
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.problem import SceneMap, rig
@@ -23,6 +23,7 @@ from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import pixel_threshold
 from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.settings import ByColourConfig, TrackerConfig
 from bidnerf_core.localization.tracking.alignment import (
     SURFACE_BIAS,
     aligned,
@@ -40,7 +41,6 @@ from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.judging import not_by_chance, precise_enough, unconfirmed
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
-from bidnerf_core.localization.tracking.settings import TrackerConfig
 from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.mapping import SurfaceMap

@@ -10,12 +10,12 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import is_blank
-from bidnerf_core.localization.auto_config import LEAST_POINTS
 from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Localization
+from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.localization.twin_rejection import between_twins
 
 FIRST_FULL_SEARCH = 4

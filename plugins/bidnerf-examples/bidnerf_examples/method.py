@@ -9,9 +9,7 @@ import torch
 
 from bidnerf_core import InputError, Localization
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import Method, Outcome
-from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.search.landmarks import propose
+from bidnerf_core.localization import Method, Outcome, Problem, propose
 from bidnerf_core.settings import Settings
 
 

@@ -1,4 +1,4 @@
-"""Groups of settings that several methods share, and the stages of coarse-to-fine methods."""
+"""Settings of the methods and of a tracker: groups that several methods share, and what the names of objectives mean."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
+from bidnerf_core.depth.sensors import DEPTH_SENSORS
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.residuals import (
     DEPTH_RESIDUALS,
@@ -17,12 +18,14 @@ from bidnerf_core.fields.residuals import (
 )
 from bidnerf_core.frames.pixels import DrawerName
 from bidnerf_core.geometry.robust import Robust, RobustName
-from bidnerf_core.localization.pivots import PivotName
 from bidnerf_core.localization.solvers.history import AnswerName
+from bidnerf_core.localization.solvers.pivots import PivotName
 from bidnerf_core.settings import EXPERT, Above, Count, NotNegative, OneOf, Positive, Range, Settings
 
 RENDERED_DEPTH_SHARE = 0.038
 """Depth difference at which outliers begin in rendered rays, as a share of the scene's mean side."""
+LEAST_POINTS = 50
+"""Least number of measured depths from which the shape of the scene can be recognised."""
 
 
 @dataclass(frozen=True)
@@ -191,3 +194,68 @@ def rendered_depth_scale(bounds: SceneBounds) -> float:
     baked surface does not matter: it may be made of measured depth, which is more accurate than what the field renders.
     """
     return RENDERED_DEPTH_SHARE * math.prod(bounds.size) ** (1 / 3)
+
+
+@dataclass(frozen=True)
+class ColourRefinementSettings(Settings):
+    """Settings of the last steps on colour alone."""
+
+    # steps of each pose that the search left, at the coarsest level
+    coarse_steps: Annotated[int, Range(1, 10**5), EXPERT] = 4
+    # number of rays rendered for each of the coarse steps
+    coarse_rays: Annotated[int, Range(7, 10**7), EXPERT] = 256
+    fine_steps: Annotated[int, Range(1, 10**5)] = 8  # steps of the best pose, in full detail
+    # number of rays rendered for each of the fine steps; four times as many where something may hide the scene
+    fine_rays: Annotated[int, Range(7, 10**7)] = 1024
+
+
+@dataclass(frozen=True)
+class ByColourConfig(Settings):
+    """Settings of the steps on rendered rays and of their acceptance."""
+
+    steps: ColourRefinementSettings = ColourRefinementSettings()
+    colour: ColourSettings = ColourSettings()
+    refinement: RefinementSettings = RefinementSettings(surface_sigma=0.006, exposure=True)
+    thresholds: RenderedThresholds = RenderedThresholds()
+
+
+@dataclass(frozen=True)
+class AutoConfig(Settings):
+    """Settings of method ``auto``."""
+
+    # largest number of measured points that are aligned
+    points: Annotated[int, Range(LEAST_POINTS, 10**6)] = 2000
+    hypotheses: Annotated[int, Range(8, 10**5)] = 256  # number of poses with which a round of search begins
+    # largest number of rounds of search, each with fresh hypotheses, until an answer is accepted
+    rounds: Annotated[int, Range(1, 100)] = 3
+    # steps on rendered rays that refine an answer by depth; 0: none
+    refine_steps: Annotated[int, Range(0, 1000)] = 2
+    refine_rays: Annotated[int, Range(64, 10**6)] = 512  # number of rays rendered for each of these steps
+    landmarks: bool = True  # match image features with the map's landmarks first, where it has some
+    # number of rendered rays that are fused with landmarks; 0: nothing is rendered, neither for that nor to tell cameras or mirror
+    # images apart
+    fused_rays: Annotated[int, Range(0, 10**6)] = 1024
+    # what measured the depth: unknown, kinect, realsense, lidar or rendered
+    depth_sensor: Annotated[str, OneOf(DEPTH_SENSORS)] = "unknown"
+    by_colour: Annotated[ByColourConfig, EXPERT] = ByColourConfig()
+
+
+@dataclass(frozen=True)
+class TrackerConfig(Settings):
+    """Settings of a tracker."""
+
+    # largest number of landmarks that are followed from image to image
+    points: Annotated[int, Range(20, 10**4)] = 250
+    depth_points: Annotated[int, Range(50, 10**6)] = 400  # largest number of measured pixels that are aligned
+    # number of keypoints of an image in which landmarks are sought
+    keypoints: Annotated[int, Range(50, 10**5), EXPERT] = 600
+    # share of the followed landmarks that is left when new ones are sought
+    refresh_share: Annotated[float, Range(0, 1), EXPERT] = 0.5
+    # number of frames after which new landmarks are sought anyway
+    refresh_frames: Annotated[int, Range(1, 10**6), EXPERT] = 20
+    # number of second-order steps on depth in addition to landmarks
+    depth_steps: Annotated[int, Range(1, 100), EXPERT] = 1
+    # number of lost frames that are all searched; afterwards every second one is
+    patience: Annotated[int, Range(1, 10**6), EXPERT] = 3
+    # interval between frames without time stamps, seconds
+    frame_seconds: Annotated[float, Above(0.0, 1e4)] = 1 / 30
