@@ -26,7 +26,7 @@ from torch import Tensor
 
 from bidnerf_core import SE3, Intrinsics, Localization, View
 from bidnerf_core.evaluation.faults import faulty
-from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Problem, rig
+from bidnerf_core.localization import AutoConfig, LandmarkMatcher, Problem, rig, settings_of
 from bidnerf_core.mapping import Features, LandmarkMap, build_landmarks
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing import textured_field
@@ -35,7 +35,12 @@ from problems import localize
 
 POSES = (looking_in(0.43, 0.45, 3.6), looking_in(0.2, 0.6, 4.0), looking_in(0.8, -0.2, 4.4))
 COPY = SE3.exp(torch.tensor([30.0, 5.0, -20.0, 0.2, -0.9, 0.4], dtype=torch.float64))
-QUICK = AutoConfig(points=500, hypotheses=32, rounds=1, refine_steps=0, fused_rays=128)
+QUICK = settings_of(
+    "auto",
+    {"points": 500, "hypotheses": 32, "rounds": 1, "refine_steps": 0, "fused_rays": 128}
+    | {"coarse_steps": 1, "coarse_rays": 64, "fine_steps": 1, "fine_rays": 64},
+)
+NOT_RENDERED = replace(QUICK, fused_rays=0)
 ACCEPTED = "converged"
 COLOUR_NOISE = 0.02
 RIGHT = 0.05, 2.0
@@ -188,7 +193,7 @@ def points_case(
     problem = rig(
         textured_field.textured_map(surface=True), views, start, matcher=PointMatcher(landmarks, points)
     )
-    return Case(f"points/{fault}/{number}", problem, truth, replace(QUICK, fused_rays=0), **expected)
+    return Case(f"points/{fault}/{number}", problem, truth, NOT_RENDERED, **expected)
 
 
 def doubled(landmarks: LandmarkMap) -> LandmarkMap:
