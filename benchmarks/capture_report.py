@@ -37,27 +37,14 @@ from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping import Keypoints, tracked_views
-from bidnerf_core.mapping.landmarks.features import SIFT
+from bidnerf_core.mapping import Features, tracked_views
+from bidnerf_core.mapping.landmarks.features import SIFT, FoundOnce
 
 BLUR = 0.02
 """Length of the motion blur, as a share of the image's longer side."""
 TURN, SHIFT = 15.0, 0.3
 """A wrong pose: degrees, and share of the distance between the cameras' mean and the camera."""
 STOPS = 4.0
-
-
-class RememberedKeypoints:
-    """SIFT that caches its keypoints by image, since most photos are the same in all cases."""
-
-    def __init__(self) -> None:
-        self._found: dict[int, Keypoints] = {}
-
-    def __call__(self, rgb: Tensor) -> Keypoints:
-        key = hash(rgb.numpy().tobytes())
-        if key not in self._found:
-            self._found[key] = SIFT(rgb)
-        return self._found[key]
 
 
 @dataclass
@@ -238,11 +225,11 @@ def judged(case: Case, report: CaptureReport, usual: dict[str, set[str]]) -> dic
     return found
 
 
-def survey(views: list[View], features: RememberedKeypoints) -> tuple[CaptureReport, dict[str, float]]:
+def survey(views: list[View], features: Features) -> tuple[CaptureReport, dict[str, float]]:
     began = time.process_time()
     tracked = tracked_views(views, features)
     middle = time.process_time()
-    report = surveyed(tracked, views, features)
+    report = surveyed(tracked, views)
     return report, {
         "matching_cpu_seconds": middle - began,
         "survey_cpu_seconds": time.process_time() - middle,
@@ -251,7 +238,7 @@ def survey(views: list[View], features: RememberedKeypoints) -> tuple[CaptureRep
 
 def scene(views: list[View], others: list[View] | None, seed: int, only: Sequence[str]) -> dict[str, Any]:
     """Apply each kind of damage to one dataset, and judge the record of each."""
-    features = RememberedKeypoints()
+    features = FoundOnce(SIFT)  # most photos are the same in all cases
     plain, cost = survey(views, features)
     usual = {
         p: {photo.name for photo in plain.with_problem(p)} for photo in plain.photos for p in photo.problems

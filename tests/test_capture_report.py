@@ -108,7 +108,7 @@ def test_a_missing_side_is_named_by_the_photos_beside_it() -> None:
     views = ring(points := Points(noise=0.3), 60)
     left = [view for i, view in enumerate(views) if not 20 <= i < 30]
     named = [replace(view, frame=replace(view.frame, name=f"{i}")) for i, view in enumerate(left)]
-    report = surveyed(tracked_views(named, points), named, points)
+    report = surveyed(tracked_views(named, points), named)
     assert report.coverage.arrangement == "around"
     (gap,) = report.coverage.gaps
     assert {gap.after, gap.before} == {"19", "20"}  # of those that are left
@@ -117,7 +117,7 @@ def test_a_missing_side_is_named_by_the_photos_beside_it() -> None:
 
 def test_one_side_is_no_gap() -> None:
     views = ring(points := Points(), 12)
-    report = surveyed(tracked_views(views, points), views, points)
+    report = surveyed(tracked_views(views, points), views)
     assert report.coverage.arrangement == "one side"
     assert report.coverage.gaps == ()
     assert report.coverage.open_side is not None
@@ -134,7 +134,7 @@ def test_photos_of_two_places_are_two_groups() -> None:
     two.seen = one.seen  # both number their images in one list
     views += [two.view(looking_in(0.105 * i + 0.05), seed=i) for i in range(5)]
     views = [replace(view, frame=replace(view.frame, name=f"{i}")) for i, view in enumerate(views)]
-    report = surveyed(tracked_views(views, one), views, one)
+    report = surveyed(tracked_views(views, one), views)
     assert names(report, "apart") == ["10", "11", "12", "13", "14"]
     assert [len(group) for group in report.groups] == [10, 5]
     assert any("another place" in sentence for sentence in sentences(report))
@@ -145,7 +145,7 @@ def test_photos_from_one_place_have_no_parallax() -> None:
     T = looking_in(0.0)
     turns = [SE3.exp(torch.tensor([0, 0, 0, 0, 0.02 * i, 0.01 * i], dtype=torch.float64)) for i in range(9)]
     views = [points.view(T @ turn) for turn in turns]
-    report = surveyed(tracked_views(views, points), views, points)
+    report = surveyed(tracked_views(views, points), views)
     assert report.coverage.arrangement == "one place"
     assert report.coverage.parallax_deg < 0.1
     assert not report.with_problem("isolated", "apart", "badly posed")

@@ -69,7 +69,7 @@ def capture(moved: Tensor, pose_error: float = 0.0) -> tuple[Points, list[View],
 
 def refined(moved: Tensor, pose_error: float = 0.004) -> tuple[TrainingPoses, list[View], SE3]:
     points, views, true = capture(moved, pose_error)
-    return training_poses(tracked_views(views, points), views, features=points), views, true
+    return training_poses(tracked_views(views, points), views), views, true
 
 
 def evidence_prior(tracked: TrackedViews) -> object:
@@ -133,7 +133,7 @@ def test_wrong_intrinsics_are_no_motion(wrong: dict[str, Any], pose_error: float
     points, views, _ = capture(motions(0.0), pose_error)
     camera = replace(PINHOLE, **wrong)
     views = [replace(view, frame=replace(view.frame, intrinsics=camera)) for view in views]
-    found = training_poses(tracked_views(views, points), views, features=points)
+    found = training_poses(tracked_views(views, points), views)
     assert bool((found.tracked.motion == 0).all())
 
 
@@ -191,13 +191,6 @@ def test_training_gets_the_motions(monkeypatch: pytest.MonkeyPatch) -> None:
         "tracked_views",
         lambda given, features, progress: tracked_views(given, points, progress=progress),
     )
-    monkeypatch.setattr(
-        training_views,
-        "training_poses",
-        lambda tracked, given, least, progress: training_poses(
-            tracked, given, least, points, progress=progress
-        ),
-    )
     found = training_views.prepared(views)
     moving = [view.motion is not None and bool(view.motion.any()) for view in found.views]
     assert sum(moving) >= VIEWS - 1  # an image whose keypoints are all left out keeps its pose
@@ -250,7 +243,7 @@ def test_a_trial_finds_the_motions_that_the_map_knows() -> None:
     poses = [looking_in(0.105 * i, 0.3 * (i % 3)) for i in range(count)]
     seen = [points.view(T, seed=i, motion=moved[i]) for i, T in enumerate(poses)]
     views = [replace(view, motion=motion) for view, motion in zip(seen, moved, strict=True)]
-    landmarks = tried_landmarks(tracked_views(views, points), views, points)
+    landmarks = tried_landmarks(tracked_views(views, points), views)
     assert landmarks.trial.found == 6
     assert landmarks.trial.rotation_deg < 0.08
     assert landmarks.correlation < 5

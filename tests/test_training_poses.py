@@ -49,7 +49,7 @@ def capture(noise: float, updates: Tensor) -> tuple[Points, list[View], SE3]:
 
 def refined(noise: float, updates: Tensor, least: float = 0.25) -> tuple[TrainingPoses, list[View], SE3]:
     points, views, poses = capture(noise, updates)
-    return training_poses(tracked_views(views, points), views, least, points), views, poses
+    return training_poses(tracked_views(views, points), views, least), views, poses
 
 
 @functools.cache
@@ -134,7 +134,7 @@ def test_too_few_images_are_left_alone() -> None:
     views = ring(points, 3)
     tracked = tracked_views(views, points)
     assert adjusted_poses(tracked, LandmarkConfig()) is None
-    found = training_poses(tracked, views, features=points)
+    found = training_poses(tracked, views)
     assert (found.refined, found.consistency, found.replaced) == (False, None, [])
 
 
@@ -145,7 +145,7 @@ def test_nothing_in_common_leaves_the_poses_alone() -> None:
         replace(view, frame=replace(view.frame, rgb=torch.full_like(view.frame.rgb, 12.0))) for view in views
     ]
     points.seen.append(points.seen[0][torch.zeros(0, dtype=torch.long)])
-    found = training_poses(tracked_views(blank, points), blank, features=points)
+    found = training_poses(tracked_views(blank, points), blank)
     assert (found.refined, found.consistency, found.replaced) == (False, None, [])
 
 
@@ -194,7 +194,7 @@ def test_poses_of_motion_capture_are_refined_and_those_of_a_renderer_are_not(
 ) -> None:
     views = open_dataset(data_dir / scene).views("train")[:24]
     features = Sift(count=500)
-    found = training_poses(tracked_views(views, features), views, features=features)
+    found = training_poses(tracked_views(views, features), views)
     assert found.refined == refined
     assert found.consistency is not None
     if refined:

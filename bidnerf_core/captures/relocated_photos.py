@@ -17,7 +17,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.search.mirrored import mirror_image
-from bidnerf_core.mapping import Features, LandmarkConfig, TrackedKeypoints, TrackedViews
+from bidnerf_core.mapping import LandmarkConfig, TrackedKeypoints, TrackedViews
 
 SUSPECT = 0.5
 """A photo is a suspect if the share of its keypoints that are landmarks is below this fraction of the capture's median."""
@@ -80,7 +80,6 @@ def relocated(
     tracked: TrackedViews,
     views: Sequence[View],
     numbers: Sequence[int],
-    features: Features,
     config: LandmarkConfig,
 ) -> dict[int, Relocation]:
     """Localize the suspects by landmarks that are built without them, as they are and then mirrored."""
@@ -92,6 +91,7 @@ def relocated(
         return {}
     answers: dict[int, Relocation] = {}
     for number in numbers:
+        features = tracked.detector_of(views[number], number)
         for mirrored in (False, True):
             view = views[number]
             if mirrored:

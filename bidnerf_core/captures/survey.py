@@ -24,7 +24,6 @@ from bidnerf_core.captures.report import CaptureReport, PhotoProblem, PhotoRecor
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import (
     DEFAULT_LANDMARKS,
-    Features,
     HeldOutTrial,
     LandmarkConfig,
     TrackedKeypoints,
@@ -43,7 +42,6 @@ CLIPPED = 0.25
 def surveyed(
     tracked: TrackedViews,
     views: Sequence[View],
-    features: Features | None = None,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     trial: HeldOutTrial = NOT_TRIED,
 ) -> CaptureReport:
@@ -59,9 +57,7 @@ def surveyed(
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, count, group)
     posed: dict[int, Relocation | None] = dict(_by_own_landmarks(seen, positions, views))
-    posed |= dict.fromkeys(doubtful) | relocated(
-        tracked, views, doubtful, features or tracked.detector, config
-    )
+    posed |= dict.fromkeys(doubtful) | relocated(tracked, views, doubtful, config)
     exposure = exposures(views, seen, measures.brightness, near)
     problems = _problems(measures, exposure, near, group, posed)
     sharpness = above_neighbours(measures.sharpness, near)

@@ -14,7 +14,7 @@ from bidnerf_core.captures.links import groups, linked
 from bidnerf_core.captures.pose_refinement import AdjustedPoses, adjusted_poses
 from bidnerf_core.captures.relocated_photos import Relocation, relocated, suspects
 from bidnerf_core.frames.frame import View
-from bidnerf_core.mapping import Features, LandmarkConfig, TrackedViews
+from bidnerf_core.mapping import LandmarkConfig, TrackedViews
 
 INCONSISTENT = 0.25
 """Least deviation (pixels) that errors of the given poses must add to that of the keypoints for the poses to be refined.
@@ -37,7 +37,6 @@ def training_poses(
     tracked: TrackedViews,
     views: Sequence[View],
     least: float = INCONSISTENT,
-    features: Features | None = None,
     config: LandmarkConfig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TrainingPoses:
@@ -48,7 +47,7 @@ def training_poses(
     """
     config = LandmarkConfig() if config is None else config
     given = tracked.T_world_camera
-    wrong = _wrongly_posed(tracked, views, features or tracked.detector, config)
+    wrong = _wrongly_posed(tracked, views, config)
     if wrong:
         updates = torch.zeros(len(views), 6, dtype=torch.float64)
         for number, found in wrong.items():
@@ -82,11 +81,11 @@ def _chosen(
 
 
 def _wrongly_posed(
-    tracked: TrackedViews, views: Sequence[View], features: Features, config: LandmarkConfig
+    tracked: TrackedViews, views: Sequence[View], config: LandmarkConfig
 ) -> dict[int, Relocation]:
     """Return the photos that the landmarks of the others find at another place, by number."""
     seen, _ = tracked.triangulated(config)
     count = torch.bincount(seen.image, minlength=len(views))
     doubtful = suspects(seen, count, groups(linked(seen)))
-    found = relocated(tracked, views, doubtful, features, config)
+    found = relocated(tracked, views, doubtful, config)
     return {number: photo for number, photo in found.items() if photo.problem in ("badly posed", "turned")}

@@ -59,13 +59,12 @@ def build_tried_landmarks(
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
     """Build landmarks as ``mapping.landmarks.building.build_landmarks`` does, and try them: see ``tried_landmarks``."""
-    return tried_landmarks(tracked_views(views, features, config, progress), views, None, config, report)
+    return tried_landmarks(tracked_views(views, features, config, progress), views, config, report)
 
 
 def tried_landmarks(
     tracked: TrackedViews,
     views: Sequence[View],
-    features: Features | None = None,
     config: LandmarkConfig = DEFAULT_LANDMARKS,
     report: Callable[[str], None] = lambda sentence: None,
 ) -> LandmarkMap:
@@ -77,7 +76,7 @@ def tried_landmarks(
     """
     landmarks = tracked.landmarks(config, report)
     held_out = _held_out(len(views))
-    answers = _answers(tracked, views, held_out, features or tracked.detector, config)
+    answers = _answers(tracked, views, held_out, config)
     landmarks = replace(landmarks, trial=_trial(answers, len(held_out)))
     if len(answers) < ENOUGH_ANSWERS:
         return landmarks
@@ -99,7 +98,6 @@ def _answers(
     tracked: TrackedViews,
     views: Sequence[View],
     held_out: Sequence[int],
-    features: Features,
     config: LandmarkConfig,
 ) -> list[_Answer]:
     """Localize the images that are held out, and return the accepted answers."""
@@ -115,7 +113,8 @@ def _answers(
         T = views[number].T_ref_camera.to("cpu", torch.float64)
         view = View(views[number].frame, SE3.identity())
         # Poses that were found without a motion are compared with such poses.
-        found = propose(matcher, [view], features, moving=views[number].motion is not None)
+        features, moving = tracked.detector_of(view, number), views[number].motion is not None
+        found = propose(matcher, [view], features, moving=moving)
         if found is not None and landmark_verdict(found).accepted:
             answers.append(_Answer(found, (T.inverse() @ found.T_world_camera).log()))
     return answers

@@ -22,7 +22,7 @@ from bidnerf_core.geometry.se3 import SE3, pose_from_matrix
 from bidnerf_core.io.json import LARGEST_INTEGER
 from bidnerf_core.localization.direction_only import NO_DISTANCES, direction_only
 from bidnerf_core.localization.methods import USUAL_METHOD, Method, find_method, require_use_of_depth
-from bidnerf_core.localization.problem import SceneMap, on_device, rig
+from bidnerf_core.localization.problem import Problem, SceneMap, on_device, rig
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.settings import ByColourConfig
@@ -84,9 +84,20 @@ class Localizer:
         """
         if depth_rays is not None:
             require_use_of_depth(self.method)
-        problem = rig(
-            self.map, _views(query), None if start is None else start_pose(start), depth_rays, self.matcher
-        )
+        return self.solved(self.problem(query, start, depth_rays), seed)
+
+    def problem(
+        self,
+        query: Frame | View | Sequence[View],
+        start: Start | None = None,
+        depth_rays: Observations | None = None,
+    ) -> Problem:
+        """Return what ``__call__`` solves, which may be solved several times: the images' keypoints are found once."""
+        T_world_camera = None if start is None else start_pose(start)
+        return rig(self.map, _views(query), T_world_camera, depth_rays, self.matcher)
+
+    def solved(self, problem: Problem, seed: int = 0) -> Localization:
+        """Return the answer to a ``problem`` that this localizer made."""
         found = self._method.solve(problem, self.config, _checked_seed(seed))
         return found if self.map.has_distances else direction_only(found)
 

@@ -90,7 +90,9 @@ class Problem:
     start: SE3 | None  # T_world_K; None where nothing is known about it
     depth_rays: Observations | None = None  # from a lidar or the like, in the frame of the last camera
     surface: SurfaceMap | None = None  # baked from the field
-    matcher: LandmarkMatcher | None = None  # of the map's landmarks
+    matcher: LandmarkMatcher | None = (
+        None  # of the map's landmarks, with the keypoints of the images: see ``for_query``
+    )
     # Root mean square difference of the field's colours from its own training images; None where unknown.
     colour_noise: float | None = None
     sensor: DepthSensorModel = UNKNOWN  # model of the sensor that measured the depth
@@ -166,10 +168,10 @@ def rig(
     relative = tuple(
         View(v.frame, (T_last_ref @ v.T_ref_camera.to("cpu", torch.float64)).normalized()) for v in views
     )
-    start = None if start is None else start.to("cpu", torch.float64)
     return Problem(
-        scene.field, scene.bounds, relative, start, depth_rays, scene.surface, matcher, scene.colour_noise
-    )
+        scene.field, scene.bounds, relative, None if start is None else start.to("cpu", torch.float64),
+        depth_rays, scene.surface, None if matcher is None else matcher.for_query(), scene.colour_noise,
+    )  # fmt: skip
 
 
 def window(sequence: Sequence[_Item], last: int, size: int, stride: int = 1) -> tuple[_Item, ...]:

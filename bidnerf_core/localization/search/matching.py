@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from itertools import pairwise
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping.landmarks.features import Features, find_features, squared_distances
+from bidnerf_core.mapping.landmarks.features import Features, FoundOnce, find_features, squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 EXHAUSTIVE = 4_000
@@ -43,13 +44,22 @@ class LandmarkMatcher:
         self.landmarks = landmarks.to("cpu")
         self._descriptors = landmarks.descriptors
         self._cells: _Cells | None = None
+        self._found_once: FoundOnce | None = None
         if len(landmarks) > EXHAUSTIVE:
             self._cells = _Cells(landmarks.descriptors, seed)
 
     @property
     def features(self) -> Features:
         """The detector whose keypoints the landmarks are. Raises ``PluginError``, an ``InputError``, where it is not installed."""
-        return find_features(self.landmarks.features, "the detector of the map's landmarks")
+        return self._found_once or find_features(
+            self.landmarks.features, "the detector of the map's landmarks"
+        )
+
+    def for_query(self) -> LandmarkMatcher:
+        """Return the matcher for one query: its ``features`` finds the keypoints of each image once; all else is shared."""
+        found = copy.copy(self)
+        found._found_once = FoundOnce(lambda rgb: self.features(rgb))
+        return found
 
     def nearest(
         self, descriptors: UInt8[Tensor, "q d"], count: int

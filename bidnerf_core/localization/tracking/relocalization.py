@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import torch
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.localizer import Localizer
-from bidnerf_core.localization.problem import SceneMap, rig
+from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.localization.twin_rejection import between_twins
@@ -47,17 +48,18 @@ def relocalized(
     that could be searched, 0 at the beginning of a sequence.
     """
     if localizer.matches_landmarks:
-        assert localizer.matcher is not None
-        began = time.perf_counter()
-        problem = rig(localizer.map, [View(frame, SE3.identity())], None, None, localizer.matcher)
-        answer = answer_by_landmarks(problem, localizer.matcher, 0, seed)
+        began, problem = time.perf_counter(), localizer.problem(frame)
+        assert problem.matcher is not None
+        answer = answer_by_landmarks(problem, problem.matcher, 0, seed)
         if answer is not None:
             near = predicted if lost <= FIRST_FULL_SEARCH else None  # later predictions have drifted
-            answer = between_twins(problem, localizer.matcher, answer, near, 0, seed)
+            answer = between_twins(problem, problem.matcher, answer, near, 0, seed)
         found = None if answer is None else localization_by_landmarks(problem, answer, began)
         if found is not None and found.converged:
             return found
-        return localizer(frame, predicted, seed=seed) if _searched(localizer, frame, lost) else found
+        if not _searched(localizer, frame, lost):
+            return found
+        return localizer.solved(replace(problem, start=predicted), seed)
     try:
         return localizer(frame, predicted, seed=seed)
     except InputError:

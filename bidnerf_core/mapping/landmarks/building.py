@@ -28,7 +28,7 @@ from bidnerf_core.mapping.geometry.triangulation import (
     parallax,
     refined_points,
 )
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, Features, Sift, find_features
+from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, Features, FoundOnce, Sift, find_features
 from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, measured_depth, placed
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
 from bidnerf_core.mapping.landmarks.tracks import (
@@ -167,6 +167,10 @@ class TrackedViews:
     def detector(self) -> Features:
         """What detected the keypoints."""
         return find_features(self.features) if isinstance(self.features, str) else self.features
+
+    def detector_of(self, view: View, number: int) -> Features:
+        """Return the detector for a query with image ``number``, whose ``view`` is given: its keypoints are known."""
+        return FoundOnce(self.detector, [(view.frame.rgb, self.observations.images[number].keypoints)])
 
     def landmarks(
         self, config: LandmarkConfig, report: Callable[[str], None] = lambda sentence: None

@@ -5,8 +5,9 @@ Any detector that turns an image into ``Keypoints``, a learned one included, can
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import cv2
@@ -122,6 +123,24 @@ class _Strongest:
 def strongest(features: Features, count: int) -> Features:
     """Return a detector that finds at most ``count`` keypoints, the strongest."""
     return features.at_most(count) if isinstance(features, LimitedFeatures) else _Strongest(features, count)
+
+
+class FoundOnce:
+    """A detector that remembers the keypoints of each image for as long as it lives, which is one query.
+
+    ``known``: images whose keypoints are known already. Threads may share it.
+    """
+
+    def __init__(self, features: Features, known: Iterable[tuple[Tensor, Keypoints]] = ()) -> None:
+        self._features, self._found, self._lock = features, list(known), Lock()
+
+    def __call__(self, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
+        with self._lock:
+            for seen, keypoints in self._found:
+                if seen is rgb or (seen.shape == rgb.shape and torch.equal(seen.to(rgb), rgb)):
+                    return keypoints
+            self._found.append((rgb, self._features(rgb)))
+            return self._found[-1][1]
 
 
 def root_normalized(descriptors: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
