@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from bidnerf_core.backend import Backend, load_backend
-from bidnerf_core.datasets import Dataset, Reader, ReadOptions
+from bidnerf_core.datasets import Dataset, Reader, ReadOptions, open_dataset, open_sequence
 from bidnerf_core.datasets.reader import find_reader
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.localization import find_method
@@ -557,6 +557,32 @@ def test_a_reader_that_fails_is_named_and_passed_over(site: Site, tmp_path: Path
     register("readers", "sound", Claiming())
     with pytest.warns(InputWarning):
         assert find_reader(tmp_path) is load_plugin("readers", "sound")
+
+
+@pytest.mark.usefixtures("nothing_registered", "unchecked")
+@pytest.mark.parametrize(
+    ("opens", "said"),
+    [
+        (lambda: {}["poses"], "fails to open it: KeyError: 'poses'"),
+        (lambda: None, "(returned a NoneType, expected a Dataset|fails to open it: AttributeError)"),
+    ],
+)
+def test_a_reader_that_cannot_open_what_it_recognised_is_named(
+    opens: Callable[[], Any], said: str, tmp_path: Path
+) -> None:
+    class Stranger(Reader):
+        expected = "anything"
+
+        def recognises(self, path: Path) -> bool:
+            return True
+
+        def open(self, path: Path, options: ReadOptions) -> Any:
+            return opens()
+
+    register("readers", "stranger", Stranger())
+    for ask in (open_dataset, open_sequence):
+        with pytest.raises(InputError, match=f"{tmp_path}: reader Stranger {said}"):
+            ask(tmp_path)
 
 
 @pytest.mark.usefixtures("nothing_registered")

@@ -16,6 +16,8 @@ from bidnerf_core.datasets.reader import (
     ReadOptions,
     expected_files,
     find_reader,
+    opened,
+    opened_sequence,
 )
 from bidnerf_core.datasets.rgbd import DepthFile, read_rgbd
 from bidnerf_core.datasets.sequence import (
@@ -81,7 +83,7 @@ def open_dataset(
     reader = _reader_of(folder, readers)
     if reader is None:
         raise InputError(f"{folder}: {_without_dataset(folder, readers)}")
-    return reader.open(folder, _options(reader, folder, CameraSource(camera), background, register_depth))
+    return opened(reader, folder, _options(reader, folder, CameraSource(camera), background, register_depth))
 
 
 def open_sequence(
@@ -118,7 +120,7 @@ def open_sequence(
     if reader is None:
         sensor = ReadOptions(register_depth=register_depth).sensor(place)
         return open_images(place, given, sensor, background)
-    return reader.open_sequence(place, _options(reader, place, given, background, register_depth))
+    return opened_sequence(reader, place, _options(reader, place, given, background, register_depth))
 
 
 def _options(

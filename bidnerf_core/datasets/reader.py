@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Literal, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.dataset import Dataset
@@ -18,6 +18,7 @@ from bidnerf_core.registry import PluginError, Plugins, interface_defects
 
 DepthRegistration: TypeAlias = bool | DepthCamera | str | Path
 """The registration of depth to colour images: from a sensor or a file of one, from the format's own (True), or none (False)."""
+Answer = TypeVar("Answer")
 OpenQuestion = Literal["camera", "register_depth"]
 """An option of ``ReadOptions`` that a format may leave open."""
 
@@ -107,6 +108,31 @@ def find_reader(folder: Path) -> Reader | None:
             f"{folder}: is recognised by the readers {enumeration(list(claims))}, expected one; uninstall the others"
         )
     return next(iter(claims.values()), None)
+
+
+def opened(reader: Reader, folder: Path, options: ReadOptions) -> Dataset:
+    """Return what a reader opens. Raises ``InputError`` where one that is not bundled fails, or opens no dataset."""
+    return _answer(reader, folder, Dataset, lambda: reader.open(folder, options))
+
+
+def opened_sequence(reader: Reader, folder: Path, options: ReadOptions) -> FrameSequence:
+    """Return the sequence that a reader opens. Raises ``InputError`` as ``opened`` does."""
+    return _answer(reader, folder, FrameSequence, lambda: reader.open_sequence(folder, options))
+
+
+def _answer(reader: Reader, folder: Path, expected: type, ask: Callable[[], Answer]) -> Answer:
+    if any(reader is READERS[name] for name in ORDER):
+        return ask()
+    who = f"{folder}: reader {type(reader).__name__}"
+    try:
+        answer = ask()
+    except (InputError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        raise InputError(f"{who} fails to open it: {type(error).__name__}: {error}") from error
+    if not isinstance(answer, expected):
+        raise InputError(f"{who} returned a {type(answer).__name__}, expected a {expected.__name__}")
+    return answer
 
 
 def expected_files(readers: Sequence[Reader] | None = None) -> str:
