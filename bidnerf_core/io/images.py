@@ -33,6 +33,11 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".p
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 NAMED_BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 OTHER_COLOURS = ("CMYK", "YCbCr", "LAB", "HSV")
+
+# Pillow warns about large images, odd EXIF and palettes, which is of no use to whoever opens a photo. It is done once and with
+# the lowest precedence: filters belong to the whole process, so threads that changed and restored them while they read images
+# would leave those of each other behind.
+warnings.filterwarnings("ignore", module=r"PIL\.", append=True)
 FULL_SCALE = {"bool": 1, "uint8": 255, "uint16": 65535}
 COLOUR_ROUNDING = 1e-3
 """How far a floating-point channel may exceed [0, 1], as happens in resampling and colour conversion."""
@@ -234,8 +239,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     """
     if path.suffix.lower() in HEIF_SUFFIXES:
         _register_heif(path)
-    with open_binary(path, "an image file") as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's warnings about large images, odd EXIF, palettes
+    with open_binary(path, "an image file") as file:
         try:
             with Image.open(file, formats=_formats()) as image:
                 _check_pixels(path, image.width, image.height)
