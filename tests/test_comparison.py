@@ -13,6 +13,7 @@ import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
+from bidnerf_core.evaluation import trials
 from bidnerf_core.evaluation.bench import Plan
 from bidnerf_core.evaluation.comparison import (
     Comparison,
@@ -26,7 +27,7 @@ from bidnerf_core.evaluation.plots import comparison_figure
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of
 from bidnerf_core.evaluation.trial import ScalarPoseError, Trace, Trial, TrialResult
 from bidnerf_core.evaluation.trials import run_trial
-from bidnerf_core.evaluation.workers import Measured, TrialProcess, samples_per_ray
+from bidnerf_core.evaluation.workers import Measured, TrialProcess, measured, samples_per_ray
 from bidnerf_core.io.json import from_plain, to_plain
 
 QUICK = json.dumps({"rays": 32, "max_steps": 3})
@@ -92,6 +93,22 @@ def test_a_process_elsewhere_finds_what_this_one_finds(
         assert replace(again, seconds=0.0, peak_memory_bytes=0) == replace(
             found, seconds=0.0, peak_memory_bytes=0
         )
+
+
+def test_a_process_elsewhere_takes_no_file_of_the_folder_for_a_module(
+    tmp_path: Path, usual: Trial, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "statistics.py").write_text("raise SystemExit('a file of the user was run')")
+    monkeypatch.chdir(tmp_path)
+    with TrialProcess() as process:
+        assert process.run(usual).result.steps == 3
+
+
+def test_a_process_keeps_one_map(usual: Trial) -> None:
+    """Its memory is measured as that of one."""
+    trials._opened.cache_clear()
+    measured(usual)
+    assert trials._opened.cache_info().currsize == 1
 
 
 def test_a_row_says_what_the_map_costs(compared: Comparison, maps: list[Path]) -> None:

@@ -16,6 +16,7 @@ import bidnerf_core as bn
 import tiny
 from bidnerf_core.cli import main
 from bidnerf_core.datasets import open_dataset
+from bidnerf_core.evaluation import trials
 from bidnerf_core.evaluation.results import read_results
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.io.json import from_plain
@@ -96,6 +97,41 @@ def test_the_folder_is_read_anew_at_each_call(folder: Path, tmp_path: Path) -> N
         assert row.weights == bn.load_map(scene).info.weights
 
 
+def test_results_of_another_map_in_memory_are_not_taken_for_its_own(tmp_path: Path) -> None:
+    """Maps in memory have no file of weights, so that their content tells them apart."""
+    first, second = (bn.train(tiny.views(), config=tiny.config(steps), bake=False) for steps in (2, 6))
+    given: dict[str, Any] = {"data": tiny.views(2), "trials": 1, "out": tmp_path / "r.jsonl", **QUICK}
+    (row,) = bn.evaluate(first, **given).rows
+    assert row.weights == first.training
+    assert timeless(bn.evaluate(first, **given).rows) == timeless([row])
+    with pytest.raises(bn.InputError, match="results of another training"):
+        bn.evaluate(second, **given)
+
+
+def test_a_process_reads_a_map_once_until_it_changes(folder: Path, tmp_path: Path) -> None:
+    """Processes of a cluster outlive an evaluation."""
+    scene = tmp_path / "map"
+    found = []
+    for steps in (4, 8):
+        words = ["train", str(folder / "data"), "--out", str(scene), "--overwrite", *tiny.options(steps)]
+        assert main(words) == 0
+        found += [trials.opened(str(scene), str(folder / "data"), *device)[0] for device in ((), ("cpu",))]
+    assert found[0] is found[1] is not found[2] is found[3]
+    assert found[3].training == bn.load_map(scene).training
+
+
+def test_frames_of_one_name_are_refused() -> None:
+    views = [dataclasses.replace(v, frame=dataclasses.replace(v.frame, name="image")) for v in tiny.views(2)]
+    with pytest.raises(bn.InputError, match="2 frames called 'image'"):
+        bn.evaluate(BLOBS, views, trials=1, **QUICK)
+
+
+def test_a_file_of_results_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(bn.InputError, match=r"r\.jsonl: cannot be written"):
+        bn.evaluate(BLOBS, BLOBS, trials=1, out=tmp_path / "file" / "r.jsonl", **QUICK)
+
+
 def test_any_thread_evaluates_and_leaves_no_trace() -> None:
     expected = timeless(bn.evaluate(BLOBS, BLOBS, trials=2, **QUICK).rows)
     handler, threads = signal.getsignal(signal.SIGINT), torch.get_num_threads()
@@ -150,6 +186,8 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         "workers is 2, expected 1": {"workers": 2},
         "trials is 0, expected a whole number, 1 to": {"trials": 0},
         "trials is 2.5": {"trials": 2.5},
+        "workers is 0, expected 1 or more": {"scene": BLOBS, "workers": 0},
+        "workers is -1, expected 1 or more": {"scene": BLOBS, "workers": -1},
         "seed is -1": {"seed": -1},
         "size is 0.3:1, expected e_t": {"sizes": [(0.3, 1.0)]},
         "did you mean 'rays'": {"config": {"ray": 3}},

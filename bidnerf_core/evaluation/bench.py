@@ -207,10 +207,10 @@ def _check_same(trials: Sequence[Trial], file: ResultsFile, scene: Opened | None
         known = file.results[key_of(trial)]
         stored, dataset = scene or opened(trial.map, trial.data, trial.device)
         advice = "name another --out, or remove the file to begin anew"
-        if known.weights != stored.info.weights:
+        if known.weights != stored.training:
             raise InputError(
                 f"{file.path}: holds results of another training of map {trial.map} "
-                f"({known.weights}, expected {stored.info.weights}); {advice}"
+                f"({known.weights}, expected {stored.training}); {advice}"
             )
         _check_settings(trial, known, f"{file.path}: was made with {{}} {{}}, expected {{}}; {advice}")
         if known.inputs is None:  # an earlier version did not record it

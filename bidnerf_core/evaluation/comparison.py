@@ -36,7 +36,7 @@ class MapRow:
 
     map: str  # the shortest name that is unique among the maps
     backend: str
-    weights: str  # file name, new with every training
+    weights: str  # identifies the training, see ``Map.training``
     success: dict[str, Success | None]  # by criterion; None where it does not apply
     translation: float | None  # metres, median of the final errors; None where most are not finite
     rotation_deg: float | None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -267,6 +268,9 @@ def _dataset(data: Data, stored: Map | None = None) -> Dataset:
     views = tuple(view for view in data if isinstance(view, View)) if isinstance(data, Sequence) else ()
     if not views or len(views) < len(data):
         raise InputError(f"data is a {type(data).__name__}, expected a folder, a dataset or a list of views")
+    name, count = Counter(view.frame.name for view in views).most_common(1)[0]
+    if count > 1:  # trials know their frames by name
+        raise InputError(f"data holds {count} frames called {name!r}, expected names that differ")
     return _GivenViews(views)
 
 

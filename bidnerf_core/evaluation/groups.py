@@ -9,6 +9,7 @@ from typing import Any
 
 from bidnerf_core.evaluation.faults import NO_FAULT
 from bidnerf_core.evaluation.trial import TrialResult
+from bidnerf_core.io.json import parse_json
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class Situation:
     """The map, the images and the starts of some trials. ``size`` is None where trials of all sizes are pooled."""
 
     map: str
-    weights: str  # file name of the map's weights, which identifies the training
+    weights: str  # identifies the training, see ``Map.training``
     data: str
     split: str
     protocol: str
@@ -50,7 +51,7 @@ class Condition:
         """Return all properties that distinguish conditions, by name."""
         own = {"images": self.images, "depth": self.depth, "depth_points": self.depth_points}
         own |= {"backend": self.backend, "device": self.device}
-        return {"method": self.method, **own, **json.loads(self.settings)}
+        return {"method": self.method, **own, **parse_json(self.settings, "settings", "an object")}
 
 
 @dataclass(frozen=True)

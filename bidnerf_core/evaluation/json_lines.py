@@ -54,14 +54,14 @@ class LineFormat:
 
 
 class JsonLinesFile:
-    """A JSON Lines file, locked by the process that has it open. Use it as a context manager."""
+    """A JSON Lines file, locked by the process that has it open, from ``open`` to ``close``."""
 
     def __init__(self, path: Path, kind: LineFormat) -> None:
         self.path, self._kind = path, kind
         self._file: BinaryIO | None = None
 
     def open(self) -> list[tuple[str, Any]]:
-        """Create, lock and repair the file; return the place and the object of each line."""
+        """Create and lock the file; return the place and the object of each line. ``repair`` makes it fit to be written."""
         self._file = self._locked()
         try:
             content = read_open_file(self._file, self.path, self._kind.expected, LARGEST_LINES)
@@ -119,10 +119,12 @@ class JsonLinesFile:
         return self._file
 
     def _locked(self) -> BinaryIO:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.exists():
-            open_binary(self.path, self._kind.expected).close()  # not a pipe, which would wait for a reader
         try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            if self.path.exists():
+                open_binary(
+                    self.path, self._kind.expected
+                ).close()  # not a pipe, which would wait for a reader
             file = self.path.open("a+b")
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written ({error.strerror}), expected a file") from error

@@ -126,7 +126,7 @@ class TrialResult:
     reason: str  # why the method stopped
     peak_memory_bytes: int  # of the process during the trial: resident memory, or memory of the GPU
     settings: dict[str, Any]  # all settings of the method
-    weights: str  # file name of the map's weights, which is new with every training
+    weights: str  # identifies the map's training, see ``Map.training``
     trial: Trial  # with folders' names instead of paths
     outcome: str = ""  # the method's verdict; empty in results of earlier versions
     focal_factor: float = 1.0  # ratio of the true to the given focal length, where it was estimated as well

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import sys
 from dataclasses import replace
 from functools import lru_cache
@@ -25,7 +26,6 @@ from bidnerf_core.evaluation.faults import faulty
 from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.evaluation.trial import (
     InputDigests,
-    ScalarPoseError,
     Trial,
     TrialResult,
     folder_digest,
@@ -35,9 +35,10 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import from_plain, parse_record, to_plain
 from bidnerf_core.localization import Localization, Localizer, settings_of
-from bidnerf_core.maps.description import MapInfo, cameras_of
+from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of
 from bidnerf_core.maps.map import Map, load_map
-from bidnerf_core.results.errors import PoseError, pose_error
+from bidnerf_core.results.answers import plain_localization
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map, is_closed_form
 from bidnerf_core.settings import to_flat
 
@@ -118,9 +119,17 @@ def open_data(name: str, stored: Map | None = None) -> Dataset:
     return open_dataset(name, None if stored is None else stored.bounds.background)
 
 
-@lru_cache(maxsize=4)
 def opened(map_name: str, data_name: str, device: str = "cpu") -> Opened:
-    """Return the map and the dataset of these names, which are read once per process."""
+    """Return the map and the dataset of these names, which are read once per process unless the map has changed since."""
+    try:
+        file = os.stat(Path(map_name) / DESCRIPTION)
+    except OSError:  # a closed-form scene, or no map, which is found out below
+        return _opened(map_name, data_name, device, None)
+    return _opened(map_name, data_name, device, (file.st_ino, file.st_mtime_ns))
+
+
+@lru_cache(maxsize=4)
+def _opened(map_name: str, data_name: str, device: str, version: tuple[int, int] | None) -> Opened:
     stored = open_map(map_name, device)
     return stored, open_data(data_name, stored)
 
@@ -138,14 +147,6 @@ def places_of(info: MapInfo) -> list[tuple[str, SE3]]:
     return [(stored.name, T) for stored, (_, T) in zip(info.cameras, cameras_of(info), strict=True)]
 
 
-def plain_localization(found: Localization, backend: str, error: PoseError | None) -> dict[str, Any]:
-    """Return the object that ``bidnerf localize --json`` prints."""
-    return found.plain() | {
-        "backend": backend,
-        "error": None if error is None else to_plain(_scalars(error)),
-    }
-
-
 def _result(
     trial: Trial,
     stored: Map,
@@ -160,20 +161,15 @@ def _result(
     more = {
         "frame": trial.frame,
         "seed": trial.seed,
-        "start_error": None if start is None else to_plain(_scalars(pose_error(start, truth))),
+        "start_error": None if start is None else pose_error(start, truth).plain(),
         "errors": {"translation": _finite(trace.translation), "rotation_deg": _finite(trace.rotation_deg)},
         "peak_memory_bytes": peak_memory_bytes(),
         "settings": to_flat(settings),
-        "weights": stored.info.weights,
+        "weights": stored.training,
         "trial": to_plain(trial.portable),
         "inputs": to_plain(digests),
     }
     return from_plain(TrialResult, plain | more, "result")
-
-
-def _scalars(error: PoseError) -> ScalarPoseError | None:
-    pair = float(error.translation), float(error.rotation_deg)
-    return ScalarPoseError(*pair) if all(map(math.isfinite, pair)) else None
 
 
 def _finite(values: Tensor) -> list[float | None]:

@@ -20,11 +20,11 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trial import Trial, TrialResult
 from bidnerf_core.evaluation.trials import Opened, opened, parse_settings, run_trial
-from bidnerf_core.fields.contract import levels
+from bidnerf_core.fields.contract import device_of, levels
 from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import draw, uniform
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.io.json import from_plain, to_plain
+from bidnerf_core.io.json import from_plain, parse_json, to_plain
 from bidnerf_core.settings import to_flat
 
 PATIENCE = "20s"
@@ -80,8 +80,11 @@ def workers_for(
     """Yield an executor for a number of trials, how many of them to run on it at once, and its description.
 
     ``workers`` is the number of processes; None stands for one a core, and one on a GPU. ``dask`` is the address of a
-    scheduler whose workers run the trials instead. Where the work fails, the processes are ended with their trials.
+    scheduler whose workers run the trials instead. Where the work fails, the processes are ended with their trials. Raises
+    ``InputError`` for a number below 1, and as ``dask_executor`` does.
     """
+    if workers is not None and workers < 1:
+        raise InputError(f"workers is {workers}, expected 1 or more, or None for one a core")
     if dask is not None:
         with dask_executor(dask) as (cluster, threads):
             yield cluster, 2 * threads, f"dask, {threads} threads"
@@ -139,12 +142,13 @@ def measured(trial: Trial, scene: Opened | None = None) -> Measured:
 
 def samples_per_ray(trial: Trial, scene: Opened | None = None) -> float:
     """Return the mean number of valid samples on uniformly drawn rays."""
-    stored, dataset = scene or opened(trial.map, trial.data)
+    stored, dataset = scene or opened(trial.map, trial.data, trial.device)
     (view,) = dataset.views(trial.split, trial.frames[-1:])
     number = to_flat(parse_settings(trial.method, trial.config)).get("level")
     level = stored.field if number is None else levels(stored.field)[number]
     own = (View(view.frame, SE3.identity()),)
-    pixels = draw(own, COUNTED_RAYS, uniform, torch.Generator().manual_seed(trial.seed))
+    device = device_of(stored.field)
+    pixels = draw(own, COUNTED_RAYS, uniform, torch.Generator().manual_seed(trial.seed), device=device)
     with torch.no_grad():
         samples = level.sampler(pixels.rays(view.T_ref_camera, stored.bounds))
     return float(samples.valid.sum()) / COUNTED_RAYS
@@ -159,7 +163,8 @@ class TrialProcess:
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            # With -P, files of the current folder are not taken for modules.
+            [sys.executable, "-P", "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             start_new_session=True,  # so that Ctrl-C reaches only this process, which ends the other
         )  # fmt: skip
 
@@ -175,7 +180,7 @@ class TrialProcess:
                 f"{trial.map}: the process that localized frame {trial.frame} ended with status {self._process.wait()},"
                 " expected a result; was memory short?"
             )
-        answer = json.loads(line)
+        answer = parse_json(line, trial.map, "a result")
         if "refused" in answer:
             raise InputError(answer["refused"])
         return from_plain(Measured, answer, "result")
@@ -193,7 +198,7 @@ class TrialProcess:
 def _serve(questions: Iterable[str], answers: Any) -> None:
     """Answer each line with a line, until there are none left."""
     for line in questions:
-        trial = from_plain(Trial, json.loads(line), "trial")
+        trial = from_plain(Trial, parse_json(line, "stdin", "a trial"), "trial")
         try:
             _send(answers, to_plain(measured(trial)))
         except InputError as error:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from safetensors.torch import save as tensors_to_bytes
+from torch import nn
 
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import InputError, amount
@@ -120,10 +122,11 @@ def _check_features(landmarks: LandmarkMap, folder: Path) -> None:
 
 def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: float | str | None) -> MapInfo:
     """Add a file to a map under the name of a part of its description."""
-    if load_info(folder).weights != of.weights:
+    info = load_info(folder)
+    if info.weights != of.weights:
         raise InputError(f"{folder}: was trained anew while its {part} was made; bake it again")
     name = _file_name(part, of.step)
-    info = replace(load_info(folder), **{part: name}, **facts)  # type: ignore[arg-type]
+    info = replace(info, **{part: name}, **facts)  # type: ignore[arg-type]
     description = _json(info)
     try:
         write_file(folder / name, content)
@@ -131,6 +134,17 @@ def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: fl
     finally:
         _sweep(folder)
     return info
+
+
+def content_digest(field: RadianceField, surface: SurfaceMap | None, landmarks: LandmarkMap | None) -> str:
+    """Return a digest of what a map consists of, in hexadecimal."""
+    parts = [packed(field.state_dict())] if isinstance(field, nn.Module) else []
+    parts += [] if surface is None else [packed(surface_tensors(surface))]
+    parts += [] if landmarks is None else [packed(landmark_tensors(landmarks))]
+    hashed = hashlib.blake2b(digest_size=8)
+    for part in parts:
+        hashed.update(tensors_to_bytes(part))
+    return hashed.hexdigest()
 
 
 def load_state(folder: Path, info: MapInfo, field: RadianceField) -> TrainingState:

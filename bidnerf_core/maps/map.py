@@ -27,6 +27,7 @@ from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, TrackedVie
 from bidnerf_core.maps.baking import BakedLandmarks, bake_landmarks, bake_surface
 from bidnerf_core.maps.description import DESCRIPTION, EXPECTED_PART, MapInfo, load_info
 from bidnerf_core.maps.files import (
+    content_digest,
     load_capture,
     load_landmarks,
     load_state,
@@ -85,6 +86,11 @@ class Map:
         if self.record is not None or self.folder is None or self.info.capture is None:
             return self.record
         return load_capture(self.folder / self.info.capture)
+
+    @cached_property
+    def training(self) -> str:
+        """What identifies the training of the map: the name of its file of weights or, in memory, a digest of its content."""
+        return self.info.weights or f"memory-{content_digest(self.field, self.surface, self.landmarks)}"
 
     @property
     def _name(self) -> str:
