@@ -15,7 +15,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from email import message_from_string
 from functools import reduce
@@ -95,6 +95,24 @@ def register(group: str, name: str, value: Any, replace: bool = False) -> None:
             f"register: the name is taken by {taken[0]}; choose another name, or replace it on purpose with replace=True"
         )
     registered[group, name] = value
+
+
+def registered_names() -> list[tuple[str, str]]:
+    """Return group and name of all that ``register`` was given in this process."""
+    return list(registered)
+
+
+def require_registered(names: Iterable[tuple[str, str]]) -> None:
+    """Raise ``PluginError`` for a group and name that another process registered and this one did not.
+
+    The name may be that of an installed plugin, which is not what the other process means by it.
+    """
+    for group, name in names:
+        if (group, name) not in registered:
+            raise PluginError(
+                f"{GROUPS[group]} {name!r} was registered in one process and is not known in another that needs it; offer it by"
+                " an entry point, register it where the main module is imported, or do everything in one process (workers=1)"
+            )
 
 
 def list_plugins(group: str) -> list[PluginInfo]:

@@ -20,6 +20,7 @@ from bidnerf_core.evaluation import trials
 from bidnerf_core.evaluation.results import read_results
 from bidnerf_core.evaluation.trial import TrialResult
 from bidnerf_core.io.json import from_plain
+from bidnerf_core.localization.methods import find_method
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map
 
 QUICK: dict[str, Any] = {
@@ -118,6 +119,24 @@ def test_a_process_reads_a_map_once_until_it_changes(folder: Path, tmp_path: Pat
         found += [trials.opened(str(scene), str(folder / "data"), *device)[0] for device in ((), ("cpu",))]
     assert found[0] is found[1] is not found[2] is found[3]
     assert found[3].training == bn.load_map(scene).training
+
+
+@pytest.mark.slow
+def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("bidnerf_core.registry.registered", {})
+    mine = dataclasses.replace(find_method("bid"), summary="mine")
+    bn.register("methods", "bid", mine, replace=True)
+    bn.register("methods", "unused", mine)
+    said = "method 'bid' was registered in one process and is not known in another"
+    with pytest.raises(bn.InputError, match=said):
+        bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **QUICK)
+    with pytest.raises(bn.InputError, match=said):
+        bn.compare([BLOBS], BLOBS, trials=1, method="bid", config=QUICK["config"])
+    assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=1, **QUICK).rows) == 2
+    other = {**QUICK, "method": "bid-lm", "config": {}, "sizes": [0.1]}
+    assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **other).rows) == 2
 
 
 def test_frames_of_one_name_are_refused() -> None:

@@ -22,6 +22,7 @@ from bidnerf_core.evaluation.trials import (
     opened,
     opened_points,
     parse_settings,
+    registered_for,
     run_trial,
     trial_views,
 )
@@ -175,7 +176,7 @@ def run_trials(
             trial = next(waiting, None)
             if trial is None:
                 break
-            under_way.add(executor.submit(run_trial, trial, scene))
+            under_way.add(executor.submit(run_trial, trial, scene, registered_for(trial)))
         if not under_way:
             break
         done, under_way = wait(under_way, return_when=FIRST_COMPLETED)

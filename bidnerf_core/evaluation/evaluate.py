@@ -74,8 +74,8 @@ def evaluate(
 
     ``out`` is a file of results: a trial that it holds is not run again, and each result is on disk before the next trial
     begins, so that an evaluation that was interrupted or cancelled goes on with the same call. ``workers`` is the number of
-    processes (None: one a core); several need a map and data in folders, and a main module that can be imported. With one,
-    everything happens in the calling thread.
+    processes (None: one a core); several need a map and data in folders, and a main module that can be imported, and know what
+    was registered only if its import registers it. With one, everything happens in the calling thread.
 
     Raises ``InputError`` for an evaluation that cannot be carried out, and ``Cancelled`` once ``cancel`` returns True and the
     trials under way have ended.

@@ -10,6 +10,7 @@ import contextlib
 import math
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +23,7 @@ from bidnerf_core.datasets import Dataset, open_dataset
 from bidnerf_core.datasets.colmap import SparseChoice, SparsePoints
 from bidnerf_core.devices import one_thread, working_device
 from bidnerf_core.errors import InputError
-from bidnerf_core.evaluation.faults import faulty
+from bidnerf_core.evaluation.faults import faulty, parse_faults
 from bidnerf_core.evaluation.protocols import find_protocol
 from bidnerf_core.evaluation.trial import (
     InputDigests,
@@ -37,6 +38,7 @@ from bidnerf_core.io.json import from_plain, parse_record, to_plain
 from bidnerf_core.localization import Localization, Localizer, settings_of
 from bidnerf_core.maps.description import DESCRIPTION, MapInfo, cameras_of
 from bidnerf_core.maps.map import Map, load_map
+from bidnerf_core.registry import registered_names, require_registered
 from bidnerf_core.results.answers import plain_localization
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.closed_form_data import closed_form_data, closed_form_map, is_closed_form
@@ -48,11 +50,15 @@ Opened: TypeAlias = tuple[Map, Dataset]
 STATUS, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def run_trial(trial: Trial, scene: Opened | None = None) -> TrialResult:
+def run_trial(
+    trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()
+) -> TrialResult:
     """Run a trial on the map and the dataset ``scene``, by default those that the trial names.
 
-    Raises ``InputError`` for an unknown name, and for a method that lacks an input it needs.
+    ``registered`` has group and name of what the process that planned the trial has registered for it. Raises ``InputError``
+    for an unknown name, for a method that lacks an input it needs, and where this process has not registered the same names.
     """
+    require_registered(registered)
     with one_thread():
         stored, dataset = scene or opened(trial.map, trial.data, trial.device)
         views = trial_views(trial, dataset)
@@ -62,6 +68,16 @@ def run_trial(trial: Trial, scene: Opened | None = None) -> TrialResult:
         forget_peak_memory()
         found = _localized(trial, stored, views, start, settings)
         return _result(trial, stored, found, start, truth, settings, digests)
+
+
+def registered_for(trial: Trial) -> list[tuple[str, str]]:
+    """Return group and name of what is registered in this process and may be needed for a trial.
+
+    The map may need any detector and backend, and the dataset any reader.
+    """
+    named = {("methods", trial.method), *(("faults", fault.name) for fault in parse_faults(trial.fault))}
+    needed = ("backends", "features", "readers")
+    return [found for found in registered_names() if found in named or found[0] in needed]
 
 
 def _localized(

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.trial import Trial, TrialResult
-from bidnerf_core.evaluation.trials import Opened, opened, parse_settings, run_trial
+from bidnerf_core.evaluation.trials import Opened, opened, parse_settings, registered_for, run_trial
 from bidnerf_core.fields.contract import device_of, levels
 from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import draw, uniform
@@ -135,9 +135,11 @@ class Measured:
     samples_per_ray: float  # of the field's level in the method's settings, else of the finest
 
 
-def measured(trial: Trial, scene: Opened | None = None) -> Measured:
-    """Run a trial and count samples. ``scene`` is its map and data, by default those that the trial names."""
-    return Measured(run_trial(trial, scene), samples_per_ray(trial, scene))
+def measured(
+    trial: Trial, scene: Opened | None = None, registered: Sequence[tuple[str, str]] = ()
+) -> Measured:
+    """Run a trial as ``run_trial`` does, and count samples."""
+    return Measured(run_trial(trial, scene, registered), samples_per_ray(trial, scene))
 
 
 def samples_per_ray(trial: Trial, scene: Opened | None = None) -> float:
@@ -152,6 +154,12 @@ def samples_per_ray(trial: Trial, scene: Opened | None = None) -> float:
     with torch.no_grad():
         samples = level.sampler(pixels.rays(view.T_ref_camera, stored.bounds))
     return float(samples.valid.sum()) / COUNTED_RAYS
+
+
+@dataclass(frozen=True)
+class _Question:
+    trial: Trial
+    registered: list[tuple[str, str]]
 
 
 class TrialProcess:
@@ -171,7 +179,7 @@ class TrialProcess:
     def run(self, trial: Trial) -> Measured:
         """Run a trial. Raises ``InputError`` if it is impossible, or if the process ends before its result."""
         try:
-            _send(self._process.stdin, to_plain(trial))
+            _send(self._process.stdin, to_plain(_Question(trial, registered_for(trial))))
             line = self._process.stdout.readline() if self._process.stdout else ""
         except BrokenPipeError:
             line = ""
@@ -198,9 +206,9 @@ class TrialProcess:
 def _serve(questions: Iterable[str], answers: Any) -> None:
     """Answer each line with a line, until there are none left."""
     for line in questions:
-        trial = from_plain(Trial, parse_json(line, "stdin", "a trial"), "trial")
+        asked = from_plain(_Question, parse_json(line, "stdin", "a trial"), "question")
         try:
-            _send(answers, to_plain(measured(trial)))
+            _send(answers, to_plain(measured(asked.trial, registered=asked.registered)))
         except InputError as error:
             _send(answers, {"refused": str(error)})
 
