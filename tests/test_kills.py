@@ -13,7 +13,9 @@ import pytest
 
 import tiny
 from bidnerf_core.cli import main
+from bidnerf_core.io import files
 from bidnerf_core.io.files import FileInUse, is_temporary, locked, temporary, write_file
+from bidnerf_core.io.folders import output_folder
 from bidnerf_core.maps.map import load_map
 from bidnerf_core.results.plot_style import new_figure, save_figure
 from commands import Run
@@ -149,6 +151,45 @@ def test_a_map_that_another_process_writes_is_not_baked(bidnerf: Run, shared: Pa
         status, said, err = bidnerf("bake", shared / "map", "--data", shared / "data", *BAKE)
     assert (status, said, err.count("\n")) == (1, "", 1)
     assert "another bidnerf writes into it" in err
+
+
+def test_a_folder_is_not_removed_from_under_another_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that fails removes the folder that it made, in which another one may have begun to work meanwhile."""
+    out, remove = tmp_path / "map", Path.rmdir
+    refused: list[bool] = []
+
+    def removed(folder: Path) -> None:
+        monkeypatch.setattr(Path, "rmdir", remove)
+        try:
+            with output_folder(folder, overwrite=False):
+                remove(folder)
+                (folder / "file").write_text("of the other one")
+        except FileInUse:
+            refused.append(True)
+        remove(folder)
+
+    monkeypatch.setattr(Path, "rmdir", removed)
+    with pytest.raises(LookupError), output_folder(out, overwrite=False):
+        raise LookupError
+    assert refused == [True]
+    assert not out.exists()
+
+
+def test_a_folder_that_was_removed_has_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(FileInUse), locked(tmp_path / "none"):
+        pass
+    (tmp_path / "map").mkdir()
+    take = files.take_lock
+
+    def taken_late(number: int) -> bool:
+        (tmp_path / "map").rmdir()
+        return take(number)
+
+    monkeypatch.setattr(files, "take_lock", taken_late)
+    with pytest.raises(FileInUse), locked(tmp_path / "map"):
+        pass
 
 
 def test_a_lock_ends_with_its_process(shared: Path) -> None:

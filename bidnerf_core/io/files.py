@@ -110,16 +110,31 @@ class FileInUse(InputError):
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock of a file or folder that exists. Raises ``FileInUse`` where another process holds it."""
-    number = os.open(path, os.O_RDONLY)
+    """Hold the lock of a file or folder that exists.
+
+    Raises ``FileInUse`` where another process holds it, or held it and removed the file or folder.
+    """
+    used = FileInUse(
+        f"{path}: another bidnerf writes into it, expected another place, or to wait for its end"
+    )
     try:
-        if not take_lock(number):
-            raise FileInUse(
-                f"{path}: another bidnerf writes into it, expected another place, or to wait for its end"
-            )
+        number = os.open(path, os.O_RDONLY)
+    except FileNotFoundError as error:
+        raise used from error
+    try:
+        if not (take_lock(number) and _is_still(path, number)):
+            raise used
         yield
     finally:
         os.close(number)
+
+
+def _is_still(path: Path, number: int) -> bool:
+    """Return whether a path names the file of an open descriptor."""
+    try:
+        return os.path.samestat(os.fstat(number), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def take_lock(number: int) -> bool:

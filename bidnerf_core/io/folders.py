@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from bidnerf_core.errors import InputError
-from bidnerf_core.io.files import FileInUse, is_temporary, locked, temporary
+from bidnerf_core.io.files import is_temporary, locked, temporary
 
 
 @contextlib.contextmanager
@@ -32,20 +32,24 @@ def output_folder(
             what = described(out) or "exists already and is not empty"
             raise InputError(f"{out}: {what}; name another folder, or overwrite it (--overwrite)")
 
+    @contextlib.contextmanager
+    def removed_on_failure() -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            with contextlib.suppress(OSError):  # not empty, or never made
+                for folder in made:
+                    folder.rmdir()
+            raise
+
     check()
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
+    with removed_on_failure():
         _make_writable(out)
-        with locked(out):
-            check()  # another process may have finished meanwhile
-            yield
-    except FileInUse:  # the folder belongs to the other process
-        raise
-    except BaseException:
-        with contextlib.suppress(OSError):  # not empty, or never made
-            for folder in made:
-                folder.rmdir()
-        raise
+    # While the lock is held: afterwards, the folder may be another process's.
+    with locked(out), removed_on_failure():
+        check()  # another process may have finished meanwhile
+        yield
 
 
 def _make_writable(out: Path) -> None:
