@@ -218,6 +218,18 @@ def test_baking_stores_what_it_made_where_the_map_is(scene: bn.Map, tmp_path: Pa
     assert load_info(tmp_path / "map") == again.info
 
 
+def test_parts_that_were_not_read_are_saved(tmp_path: Path) -> None:
+    baked = trained(tmp_path / "map", bake=BAKE)
+    assert baked.surface is not None
+    bare = bn.load_map(tmp_path / "map", baked=False)
+    assert bare.surface is None
+    for folder in (tmp_path / "copy", tmp_path / "map"):
+        bare.save(folder, overwrite=True)
+        found = bn.load_map(folder)
+        assert found.surface is not None
+        assert len(found.surface.surfels) == len(baked.surface.surfels)
+
+
 def test_a_description_is_for_people_and_for_json(scene: bn.Map) -> None:
     summary = scene.describe()
     assert "in memory, written by bidnerf" in str(summary)

@@ -219,7 +219,7 @@ class Map:
     def save(self, folder: str | Path, overwrite: bool = False) -> Map:
         """Write the whole map into a folder, and return it with that folder.
 
-        Raises ``InputError`` where the folder cannot be written, where it is not empty and ``overwrite`` is not set, and where
+        Baked parts that were left unread (``load_map`` with ``baked=False``) are written as well, and returned. Raises ``InputError`` where the folder cannot be written, where it is not empty and ``overwrite`` is not set, and where
         the field is not that of a backend.
         """
         if not isinstance(self.field, nn.Module):
@@ -228,11 +228,22 @@ class Map:
         state = TrainingState(self.info.step, self.field.state_dict(), {})
         if not self.info.complete and self.folder is not None:
             state = load_state(self.folder, self.info, self.field)
-        folder = Path(folder)
-        here = self.to("cpu")
+        folder, whole = Path(folder), self._whole()
+        here = whole.to("cpu")
         with map_folder(folder, overwrite):
             info = save_map(folder, self.info, state, here.surface, here.landmarks, self.capture)
-        return replace(self, info=info, folder=folder, record=self.capture)
+        return replace(whole, info=info, folder=folder, record=self.capture)
+
+    def _whole(self) -> Map:
+        """Return the map with the baked parts of its folder that were left unread."""
+        if self.folder is None:
+            return self
+        surface, landmarks = self.surface, self.landmarks
+        if surface is None and self.info.surface is not None:
+            surface = load_surface(self.folder / self.info.surface)
+        if landmarks is None and self.info.landmarks is not None:
+            landmarks = _with_cameras(load_landmarks(self.folder / self.info.landmarks), self.info)
+        return replace(self, surface=surface, landmarks=landmarks)
 
 
 def load_map(folder: str | Path, device: torch.device | str = "cpu", baked: bool = True) -> Map:
