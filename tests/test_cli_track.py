@@ -296,6 +296,20 @@ def test_a_folder_is_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert [r.image.name for r in found if isinstance(r, FrameRequest)] == ["2.png", "10.png", "11.png"]
 
 
+def test_depth_in_a_folder_has_its_photos_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import imageio.v3 as iio
+
+    monkeypatch.setattr(following, "POLL", 0.0)
+    for name in ("1.jpg", "2.jpg", "3.jpg", "2.depth.png"):
+        iio.imwrite(tmp_path / name, np.zeros((4, 4, 3), dtype=np.uint8))
+    np.save(tmp_path / "3.npy", np.ones((4, 4)))
+    for name in ("1.json", "2.xmp", "3.AAE"):  # what phones and apps write beside photos
+        (tmp_path / name).write_text("{}")
+    arriving = requests(str(tmp_path))
+    found = [request.depth for _ in range(3) if isinstance(request := next(arriving), FrameRequest)]
+    assert [depth and depth.name for depth in found] == [None, "2.depth.png", "3.npy"]
+
+
 def test_a_folder_that_is_not_there_is_refused(bidnerf: Run, tmp_path: Path) -> None:
     status, _, err = bidnerf("track", "MAP", tmp_path / "none", "--follow", "--hfov", 60)
     assert status == 1

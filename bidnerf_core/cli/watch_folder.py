@@ -13,7 +13,7 @@ from bidnerf_core.depth.registration import DepthCamera
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.frames.photos import photos_in
-from bidnerf_core.io.images import Background
+from bidnerf_core.io.images import IMAGE_SUFFIXES, Background
 from bidnerf_core.io.json import parse_record
 
 STDIN = "-"
@@ -82,15 +82,20 @@ def _arriving(folder: Path) -> Iterator[FrameRequest]:
         )
     given, sizes = set[Path](), dict[Path, tuple[int, int]]()
     while True:
-        photos, depths = photos_in(folder)
+        photos, others = photos_in(folder)
         waiting = [photo for photo in photos if photo not in given]
         for photo in waiting:
-            depth = next((file for file in depths if file.name.startswith(f"{photo.stem}.")), None)
+            depth = next((file for file in others if _is_depth_of(photo, file)), None)
             if not all(_is_steady(file, sizes) for file in (photo, depth) if file is not None):
                 break  # later names have to wait, to keep the order of names
             given.add(photo)
             yield FrameRequest(photo, depth)
         clocks.sleep(POLL)
+
+
+def _is_depth_of(photo: Path, file: Path) -> bool:
+    """Return whether a file beside a photo is its depth, rather than something else about it, such as ``NAME.json``."""
+    return file.name.startswith(f"{photo.stem}.") and file.suffix.lower() in (".npy", *IMAGE_SUFFIXES)
 
 
 def _is_steady(file: Path, sizes: dict[Path, tuple[int, int]]) -> bool:
