@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import json
+import logging
 import math
 import os
 import signal
@@ -22,7 +23,7 @@ import torch
 import bidnerf_core.cli.localize as localize_module
 import bidnerf_core.cli.track as track_module
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.cli import main
+from bidnerf_core.cli import _remarks_as_lines, main
 from bidnerf_core.cli.folders import check_folder, check_output
 from bidnerf_core.cli.interruptions import Interrupted, interruptions, uninterrupted
 from bidnerf_core.datasets import write_transforms
@@ -379,3 +380,11 @@ def test_what_a_stream_cannot_encode_is_escaped(monkeypatch: pytest.MonkeyPatch,
     print("20 °")
     stream.flush()
     assert stream.buffer.getvalue().endswith(b"20 \\xb0\n")  # type: ignore[attr-defined]
+
+
+def test_remarks_are_printed_only_while_a_command_runs() -> None:
+    logger = logging.getLogger("bidnerf")
+    before = logger.isEnabledFor(logging.INFO)
+    with _remarks_as_lines():
+        assert logger.isEnabledFor(logging.INFO)
+    assert logger.isEnabledFor(logging.INFO) is before

@@ -130,7 +130,8 @@ def _remarks_as_lines() -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
-        logger.level, logger.propagate = before
+        logger.setLevel(before[0])  # which, unlike assigning it, clears what the logger has cached
+        logger.propagate = before[1]
 
 
 class _Lines(logging.Handler):
