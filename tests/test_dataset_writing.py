@@ -31,6 +31,12 @@ def test_views_come_back(tmp_path: Path) -> None:
                 assert float(difference.abs().max()) < bar, what
 
 
+def test_the_folder_is_made_and_may_be_named_by_text(tmp_path: Path) -> None:
+    write_transforms(f"{tmp_path}/new/folder", {"train": tiny.views(1), "test": []})
+    dataset = open_dataset(tmp_path / "new" / "folder")
+    assert [(split, len(dataset.frame_names(split))) for split in dataset.splits] == [("train", 1)]
+
+
 def test_a_lens_and_far_depth_come_back(tmp_path: Path) -> None:
     camera = Intrinsics(20.0, 21.0, 5.5, 4.5, 12, 9, (0.1, -0.02, 0.001, 0.002, 0.003))
     generator = torch.Generator().manual_seed(0)

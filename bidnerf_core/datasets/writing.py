@@ -15,6 +15,7 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.datasets.transforms_json import METRES_PER_DEPTH_UNIT, SPLITS, file_of
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.io.files import write_file
 
 OPENCV_TO_OPENGL = (1.0, -1.0, -1.0, 1.0)  # signs of the camera axes: y and z are reversed
 LENS = ("k1", "k2", "p1", "p2", "k3")
@@ -22,14 +23,15 @@ LARGEST_DEPTH = 65534  # readers interpret the largest 16-bit number as "not mea
 
 
 def write_transforms(
-    folder: Path, splits: Mapping[str, Sequence[View]], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    folder: str | Path, splits: Mapping[str, Sequence[View]], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> None:  # fmt: skip
     """Write ``transforms_SPLIT.json``, ``images/SPLIT/NAME.png`` (8 bit) and ``depth/SPLIT/NAME.png`` (16 bit).
 
     ``background`` is the colour behind frames that have an alpha channel; it is removed from their colours. Depth is stored
-    in millimetres, or in larger steps where 16 bits would not suffice. Raises ``InputError`` for an unknown split, a name
-    that occurs twice, and a lens with more than five distortion coefficients.
+    in millimetres, or in larger steps where 16 bits would not suffice. A split without views is left out. Raises
+    ``InputError`` for an unknown split, a name that occurs twice, and a lens with more than five distortion coefficients.
     """
+    folder = Path(folder)
     for split, views in splits.items():
         if split not in SPLITS:
             raise InputError(f"{folder}: split {split!r} cannot be written, expected {', '.join(SPLITS)}")
@@ -39,7 +41,12 @@ def write_transforms(
                 f"{folder}: two frames of split {split!r} have one name, expected different ones"
             )
         frames = [_written(folder, split, view, background) for view in views]
-        (folder / file_of(split)).write_text(json.dumps({"frames": frames}, indent=1, allow_nan=False))
+        if not frames:  # readers refuse a file without any
+            continue
+        folder.mkdir(parents=True, exist_ok=True)
+        write_file(
+            folder / file_of(split), json.dumps({"frames": frames}, indent=1, allow_nan=False).encode()
+        )
 
 
 def _written(folder: Path, split: str, view: View, background: tuple[float, float, float]) -> dict[str, Any]:
