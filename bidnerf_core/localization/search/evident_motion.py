@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.geometry.rotations import left_jacobian, rotation_vector
 from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.resection import ReprojectionFit, log_motion_evidence, resect
+from bidnerf_core.mapping.geometry.quadratic_fit import TIED, CameraPrior, QuadraticFit
+from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State
+from bidnerf_core.mapping.geometry.resection import ReprojectionFit
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 ENOUGH_POINTS = 20
@@ -57,47 +61,97 @@ def evident_motion(
 ) -> EvidentMotion:
     """Return the more probable of a camera at rest and one that moved, and the doubt about the pose that is left.
 
-    ``fit`` is a fit to these points, and ``share`` the prior probability of a motion. The intrinsics are free in all fits
-    that are compared, as far as the prior ``camera`` leaves them open: what they explain is not a motion.
+    ``fit`` is a fit to these points, and ``share`` the prior probability of a motion. The intrinsics are free in all
+    explanations that are compared, as far as the prior ``camera`` leaves them open: what they explain is not a motion.
     """
     if len(data) < ENOUGH_POINTS:
         return EvidentMotion()
     motion = MotionPrior.usual(float(data.in_camera(fit.T_world_rig)[:, 2].median()))
-    still, moving = (
-        resect(data, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, prior)
-        for prior in (STILL, motion)
+    errors, at_fit = ReprojectionErrors(data, fit.T_world_rig), State.of(fit.T_world_rig, fit.calibration)
+    transposed = errors.exposed_at(data.transposed_exposure_times)
+
+    def explained(about: QuadraticFit, prior: MotionPrior) -> Explanation:
+        free = CameraPrior(np.zeros(10), torch.cat([camera.deviations, prior.deviations]).numpy())
+        known = CameraPrior(at_fit.camera, torch.cat([FIXED.deviations, prior.deviations]).numpy())
+        return Explanation.of(about, free, known)
+
+    about, about_transposed = (QuadraticFit(e, at_fit, fit.noise, correlation) for e in (errors, transposed))
+    still, moving, turned = (
+        explained(about, STILL),
+        explained(about, motion),
+        explained(about_transposed, motion),
     )
-    transposed = replace(data, exposure_times=data.transposed_exposure_times)
-    turned = resect(transposed, fit.T_world_rig, fit.noise, camera, fit.calibration, correlation, motion)
-    log_odds = [
-        log_motion_evidence(points, found, still, motion, correlation) + math.log(probability)
-        for points, found, probability in (
-            (data, moving, share * (1 - TURNED)), (transposed, turned, share * TURNED)
-        )
-    ]  # fmt: skip
-    of_still, of_moving, of_turned = torch.tensor([math.log(1 - share), *log_odds]).softmax(0).tolist()
+    log_odds = torch.tensor(
+        [
+            math.log(1 - share),
+            math.log(share * (1 - TURNED)) + moving.log_evidence_over(still),
+            math.log(share * TURNED) + turned.log_evidence_over(still),
+        ]
+    )
+    of_still, of_moving, of_turned = log_odds.softmax(0).tolist()
     if not all(map(math.isfinite, (of_still, of_moving, of_turned))):
         return EvidentMotion()
     if max(of_moving, of_turned) < NEGLIGIBLE:
         return EvidentMotion()
-    takes_motion = of_moving > of_still and moving.motion_in_deviations(motion) <= LARGEST_MOTION
-    # The pose is found with known intrinsics, so the doubt about it follows from fits with the same ones.
-    still, moving, turned = (
-        resect(points, fit.T_world_rig, found.noise, FIXED, fit.calibration, correlation, prior)
-        for points, found, prior in (
-            (data, still, STILL),
-            (data, moving, motion),
-            (transposed, turned, motion),
-        )
-    )
+    takes_motion = of_moving > of_still and moving.motion_in_deviations <= LARGEST_MOTION
+    # The pose is found with known intrinsics, so the doubt about it is that with the same ones.
     chosen = moving if takes_motion else still
-    doubt = of_turned * _square(chosen, turned)
+    doubt = of_turned * _square(chosen.pose, turned.pose)
     if takes_motion:
-        return EvidentMotion(motion, doubt + of_still * _square(chosen, still))
-    return EvidentMotion(STILL, doubt + of_moving * (_square(chosen, moving) + moving.covariance_by_motion))
+        return EvidentMotion(motion, doubt + of_still * _square(chosen.pose, still.pose))
+    return EvidentMotion(
+        STILL, doubt + of_moving * (_square(still.pose, moving.pose) + moving.covariance_by_motion)
+    )
 
 
-def _square(fit: ReprojectionFit, other: ReprojectionFit) -> Float[Tensor, "6 6"]:
-    """Return the outer product of the right update from one fit to another with itself."""
-    shift = (fit.T_world_rig.inverse() @ other.T_world_rig).log()
-    return torch.outer(shift, shift)
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """How a camera that moved, or did not, explains an image's keypoints."""
+
+    about: QuadraticFit  # the cost near the fit that the explanations start from
+    free: CameraPrior  # with unknown intrinsics
+    known: CameraPrior  # with the intrinsics with which the pose is found
+    best: State  # with unknown intrinsics
+    noise: float  # pixels, of keypoints, there
+
+    @staticmethod
+    def of(about: QuadraticFit, free: CameraPrior, known: CameraPrior) -> Explanation:
+        best = about.best(free)
+        return Explanation(about, free, known, best, about.noise_at(best, free))
+
+    @property
+    def motion_in_deviations(self) -> float:
+        """The squared size of the motion, in standard deviations of its prior; 0 for a camera at rest."""
+        return float((self.best.camera[4:] ** 2 / self.free.deviations[4:].clip(min=TIED) ** 2).sum())
+
+    def log_evidence_over(self, still: Explanation) -> float:
+        """Return the logarithm of the Bayes factor over a camera at rest, in Laplace's approximation (MacKay 2003, ch. 28)."""
+        noise = min(self.noise, still.noise)
+        ratio = still.about.cost(still.best, noise) - self.about.cost(self.best, noise)
+        width = self.free.deviations[4:]
+        posterior = self.about.under(self.free).inverse_curvature()[10:, 10:]
+        narrowed = float(np.linalg.slogdet(posterior / np.outer(width, width))[1])
+        return ratio + 0.5 * (narrowed - self.motion_in_deviations)
+
+    @property
+    def pose(self) -> State:
+        """The pose with the known intrinsics."""
+        return self.about.best(self.known)
+
+    @property
+    def covariance_by_motion(self) -> Float[Tensor, "6 6"]:
+        """The part of the pose's covariance due to the motion, to which the pose adapts."""
+        equations = self.about.under(self.known)
+        follows = -np.linalg.solve(equations.hessian[:6, :6], equations.hessian[:6, 10:])
+        found = follows @ equations.covariance()[10:, 10:] @ follows.T
+        return torch.from_numpy((found + found.T) / 2)
+
+
+def _square(a: State, b: State) -> Float[Tensor, "6 6"]:
+    """Return the outer product of the right update from one pose to another with itself."""
+    turn = a.rotation.T @ b.rotation
+    phi = rotation_vector(turn)
+    shift = np.concatenate(
+        [np.linalg.solve(left_jacobian(phi), a.rotation.T @ (b.position - a.position)), phi]
+    )
+    return torch.from_numpy(np.outer(shift, shift))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import astuple, dataclass
 
@@ -149,6 +150,12 @@ class ReprojectionErrors:
         self._focal = data.focal.numpy()[:, None]
         self._observed = data.image.numpy() * self._focal
         self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
+
+    def exposed_at(self, times: Float[Tensor, "m"]) -> ReprojectionErrors:
+        """Return the errors of the same observations with other times of exposure."""
+        found = copy.copy(self)
+        found._exposure_times = times.numpy()
+        return found
 
     def linearized(self, state: State, free: Array) -> LinearizedErrors:
         """Return the errors at a state, and their Jacobian with respect to the pose and the camera's ``free`` parameters."""
