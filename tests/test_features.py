@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+import tiny
 from bidnerf_core import InputError
-from bidnerf_core.mapping import Features, Sift
+from bidnerf_core.mapping import Features, Keypoints, Sift, tracked_views
 from bidnerf_core.mapping.landmarks.features import (
+    detected,
     paired_squared_distances,
     quantized,
     root_normalized,
     squared_distances,
+    strongest,
 )
 
 
@@ -84,3 +90,38 @@ def test_quantising_keeps_the_order_of_signed_descriptors(generator: torch.Gener
 def test_useless_settings_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(options))):
         Sift(**options)  # type: ignore[arg-type]
+
+
+SOUND = Keypoints(torch.rand(5, 2), torch.ones(5), torch.zeros(5, 8, dtype=torch.uint8))
+UNUSABLE: list[tuple[Any, str]] = [
+    (None, "returned a NoneType, expected Keypoints"),
+    (replace(SOUND, descriptors=np.zeros((5, 8), np.uint8)), "Tensor, Tensor and ndarray, expected tensors"),
+    (replace(SOUND, descriptors=SOUND.descriptors[:3]), r"shapes \(5, 2\), \(5,\) and \(3, 8\), expected"),
+    (replace(SOUND, descriptors=SOUND.descriptors.float()), "of torch.float32, expected torch.uint8"),
+    (replace(SOUND, pixels=SOUND.pixels * torch.nan), "outside the image of 40x30 pixels"),
+    (replace(SOUND, pixels=SOUND.pixels + 40), "outside the image of 40x30 pixels"),
+]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(("found", "said"), UNUSABLE, ids=range(len(UNUSABLE)))
+def test_a_detector_that_returns_no_keypoints_of_the_image_is_told(found: Any, said: str) -> None:
+    def stranger(rgb: torch.Tensor) -> Any:
+        return found
+
+    image = torch.zeros(30, 40, 3)
+    assert detected(lambda rgb: SOUND, image) is SOUND
+    with pytest.raises(InputError, match=f"detector stranger: .*{said}"):
+        detected(stranger, image)
+    with pytest.raises(InputError, match=f"detector stranger: .*{said}"):
+        strongest(stranger, 3)(image)
+
+
+def test_descriptors_of_different_lengths_are_told() -> None:
+    lengths = iter((8, 8, 9))
+
+    def stranger(rgb: torch.Tensor) -> Keypoints:
+        return replace(SOUND, descriptors=torch.zeros(5, next(lengths), dtype=torch.uint8))
+
+    with pytest.raises(InputError, match="descriptors have 8 and 9 channels in different images"):
+        tracked_views(tiny.views(3), stranger)

@@ -12,7 +12,13 @@ from torch import Tensor
 
 from bidnerf_core.devices import moved
 from bidnerf_core.errors import InputError
-from bidnerf_core.mapping.landmarks.features import Features, FoundOnce, find_features, squared_distances
+from bidnerf_core.mapping.landmarks.features import (
+    Features,
+    FoundOnce,
+    detected,
+    find_features,
+    squared_distances,
+)
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 EXHAUSTIVE = 4_000
@@ -58,7 +64,7 @@ class LandmarkMatcher:
     def for_query(self) -> LandmarkMatcher:
         """Return the matcher for one query: its ``features`` finds the keypoints of each image once; all else is shared."""
         found = copy.copy(self)
-        found._found_once = FoundOnce(lambda rgb: self.features(rgb))
+        found._found_once = FoundOnce(lambda rgb: detected(self.features, rgb))
         return found
 
     def nearest(

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames.frame import SeenLandmarks, View
 from bidnerf_core.geometry.robust import chi_squared_quantile
 from bidnerf_core.geometry.se3 import SE3
@@ -28,7 +28,14 @@ from bidnerf_core.mapping.geometry.triangulation import (
     parallax,
     refined_points,
 )
-from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES, Features, FoundOnce, Sift, find_features
+from bidnerf_core.mapping.landmarks.features import (
+    USUAL_FEATURES,
+    Features,
+    FoundOnce,
+    Sift,
+    detected,
+    find_features,
+)
 from bidnerf_core.mapping.landmarks.keypoint_depth import keypoint_depth_noise, measured_depth, placed
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap, concatenated
 from bidnerf_core.mapping.landmarks.tracks import (
@@ -253,7 +260,7 @@ def tracked_views(
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
 
     ``features`` is the name of a detector, which is stored with the landmarks and finds them in queries, or a detector itself.
-    Raises ``InputError`` if there are no views and for an unknown name.
+    Raises ``InputError`` if there are no views, for an unknown name, and for keypoints that are not usable.
     """
     detector = find_features(features) if isinstance(features, str) else features
     if not views:
@@ -261,6 +268,11 @@ def tracked_views(
     pairs = _pairs([view.T_ref_camera for view in views], config)
     counter = _Counter(progress, len(views) + len(pairs))
     images = counter.over(_mapped(lambda view: _detected(view, detector), views))
+    lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
+    if len(lengths) > 1:
+        raise InputError(
+            f"descriptors have {enumeration([*map(str, lengths)])} channels in different images, expected one number"
+        )
     depth = [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]
     return TrackedViews(_joined(images, pairs, counter), torch.cat(depth), features)
 
@@ -283,7 +295,7 @@ def _joined(images: Sequence[PosedKeypoints], pairs: list[list[int]], counter: _
 
 def _detected(view: View, features: Features) -> PosedKeypoints:
     intrinsics = view.frame.intrinsics
-    keypoints = features(view.frame.rgb)
+    keypoints = detected(features, view.frame.rgb)
     rays = intrinsics.unproject(keypoints.pixels.double())
     focal = (intrinsics.fx * intrinsics.fy) ** 0.5
     return PosedKeypoints(
