@@ -153,7 +153,7 @@ def test_a_bad_query_is_refused_in_one_line(query: Any, start: Any, message: str
         (None, "auto", None, "Localizer: got a NoneType, expected a Map$"),
         (MAP, "icp", None, "no method 'icp'; installed: auto, bid, bid-lm, inerf, inerf-lm"),
         (MAP, "bid", AutoConfig(), "method 'bid' takes a BidConfig, got a AutoConfig"),
-        (MAP, "bid", {"rays": 5}, "method 'bid' takes a BidConfig, got a dict"),
+        (MAP, "bid", {"rays": 5}, r"takes a BidConfig, got a dict; settings_of\('bid', ...\) makes"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -275,3 +275,11 @@ def test_a_start_is_one_pose_whose_gradient_plays_no_part() -> None:
 def test_the_time_of_a_frame_is_a_number(time: Any) -> None:
     with pytest.raises(InputError, match=r"^time of the frame is .*, expected seconds or None"):
         Clock(0.0, 0.1).step(time)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_method_that_returns_no_localization_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = replace(METHODS["bid"], solve=lambda problem, config, seed: None)  # type: ignore[arg-type, return-value]
+    monkeypatch.setattr("bidnerf_core.registry.registered", {("methods", "nothing"): nothing})
+    with pytest.raises(InputError, match="method 'nothing' returned a NoneType, expected a Localization"):
+        Localizer(MAP, "nothing")(FRAME, START)

@@ -114,6 +114,21 @@ def test_an_overlay_shows_photo_rendering_and_both(folder: Path) -> None:
     assert not np.array_equal(picture[:, third:], off[:, third:])
     with_start = bn.overlay(scene(), frame, T, start=T)
     assert with_start.shape[0] > picture.shape[0]
+    assert np.array_equal(bn.overlay(scene(), frame, T.matrix().numpy()), picture)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_an_overlay_of_something_else_is_refused() -> None:
+    _, frame, T = flight()[0]
+    wrong: dict[str, tuple[Any, Any, Any]] = {
+        r"overlay: got a str, expected a Map; load_map\(folder\) gives one": ("map", frame, T),
+        "overlay: frame is a View, expected a Frame": (scene(), bn.View(frame, T), T),
+        "found is a str, expected an SE3 or a 4x4 matrix": (scene(), frame, "pose.json"),
+        r"found has shape \(3, 3\)": (scene(), frame, np.eye(3)),
+    }
+    for said, given in wrong.items():
+        with pytest.raises(InputError, match=said):
+            bn.overlay(*given)
 
 
 # Files of localizations.

@@ -57,7 +57,7 @@ class Localizer:
         elsewhere are copied. ``warm_up``: do now what the first call would otherwise have to wait for. Raises ``InputError``
         for what does not fit.
         """
-        map = _checked_map(map)
+        map = checked_map(map, "Localizer")
         self.method = method
         self.map: SceneMap = map if device is None else on_device(map, device)
         self._method = find_method(method)
@@ -99,6 +99,10 @@ class Localizer:
     def solved(self, problem: Problem, seed: int = 0) -> Localization:
         """Return the answer to a ``problem`` that this localizer made."""
         found = self._method.solve(problem, self.config, _checked_seed(seed))
+        if not isinstance(found, Localization):
+            raise InputError(
+                f"method {self.method!r} returned a {type(found).__name__}, expected a Localization"
+            )
         return found if self.map.has_distances else direction_only(found)
 
     @property
@@ -143,12 +147,13 @@ def map_with_distances(localizer: Localizer) -> SceneMap:
     return localizer.map
 
 
-def _checked_map(given: object) -> SceneMap:
+def checked_map(given: object, where: str) -> SceneMap:
+    """Return a map. Raises ``InputError``, which begins with ``where``, for anything else, such as its folder."""
     if isinstance(given, SceneMap):
         return given
     is_path = isinstance(given, str | bytes) or hasattr(given, "__fspath__")
     hint = "; load_map(folder) gives one" if is_path else ""
-    raise InputError(f"Localizer: got a {type(given).__name__}, expected a Map{hint}")
+    raise InputError(f"{where}: got a {type(given).__name__}, expected a Map{hint}")
 
 
 def _checked_config(method: Method, name: str, config: Any, preset: str | None) -> Any:
@@ -160,7 +165,8 @@ def _checked_config(method: Method, name: str, config: Any, preset: str | None) 
         )
     if not isinstance(config, method.config_type):
         expected, found = method.config_type.__name__, type(config).__name__
-        raise InputError(f"method {name!r} takes a {expected}, got a {found}")
+        hint = f"; settings_of({name!r}, ...) makes one of it" if isinstance(config, dict) else ""
+        raise InputError(f"method {name!r} takes a {expected}, got a {found}{hint}")
     return config
 
 
@@ -190,16 +196,19 @@ def _views(query: Frame | View | Sequence[View]) -> Sequence[View]:
     )
 
 
-def start_pose(start: Start) -> SE3:
-    """Return a start given in any form as a rigid transform; float64."""
+def start_pose(start: Start, what: str = "start") -> SE3:
+    """Return a pose given in any form as a rigid transform; float64.
+
+    Raises ``InputError``, which begins with ``what``, for anything that is not one pose.
+    """
     if isinstance(start, SE3):
         found, count = start.translation.shape, start.translation.numel() // 3
         if len(found) > 1 and found[-1] == 3:
-            raise InputError(f"start holds {count} poses, expected one")
+            raise InputError(f"{what} holds {count} poses, expected one")
         if found != (3,) or start.rotation.shape != (3, 3):
             shapes = f"{tuple(start.rotation.shape)} and {tuple(found)}"
             raise InputError(
-                f"start has a rotation and a translation of shapes {shapes}, expected (3, 3) and (3)"
+                f"{what} has a rotation and a translation of shapes {shapes}, expected (3, 3) and (3)"
             )
         return SE3(start.rotation.detach(), start.translation.detach()).to("cpu", torch.float64)
     if isinstance(start, torch.Tensor):
@@ -207,5 +216,5 @@ def start_pose(start: Start) -> SE3:
     try:
         matrix = torch.as_tensor(np.asarray(start, dtype=np.float64))
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"start is a {type(start).__name__}, expected an SE3 or a 4x4 matrix") from error
-    return pose_from_matrix(matrix, "start")
+        raise InputError(f"{what} is a {type(start).__name__}, expected an SE3 or a 4x4 matrix") from error
+    return pose_from_matrix(matrix, what)

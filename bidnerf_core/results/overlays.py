@@ -20,6 +20,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.images import reduced
 from bidnerf_core.localization import Localization, SceneMap
+from bidnerf_core.localization.localizer import Start, checked_map, start_pose
 
 PICTURE_SIDE = 240
 """Maximum pixels on the longer side; larger photos are reduced, since each rendered pixel takes time."""
@@ -38,16 +39,23 @@ TURBO = (
 
 
 def overlay(
-    scene: SceneMap, frame: Frame, found: Localization | SE3, start: SE3 | None = None
+    scene: SceneMap, frame: Frame, found: Localization | Start, start: Start | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return one picture of a photo, the map as rendered from a pose, and both blended with the edges of each.
 
     ``found`` is the answer for the photo, whose corrected intrinsics are used if it has any, or a pose ``T_world_camera``.
     With a ``start``, the picture also shows the rendering from there. The photo is reduced to at most 240 pixels a side.
+    Raises ``InputError`` for what is no map, frame or pose.
     """
+    scene = checked_map(scene, "overlay")
+    if not isinstance(frame, Frame):
+        raise InputError(
+            f"overlay: frame is a {type(frame).__name__}, expected a Frame, such as that of a View"
+        )
     if isinstance(found, Localization):
         frame, found = found.frame_as_taken(frame), found.T_world_camera
-    return Painter(scene, frame).overlay(start, found)
+    begun = None if start is None else start_pose(start)
+    return Painter(scene, frame).overlay(begun, start_pose(found, "found"))
 
 
 class Painter:
