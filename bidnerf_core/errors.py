@@ -34,6 +34,12 @@ def spelling_hint(name: str, known: Collection[str], otherwise: str = "") -> str
     return f", did you mean {near[0]!r}?" if near else otherwise
 
 
+def refuse_text(what: str, given: object) -> None:
+    """Raise ``InputError`` for one text where a list of texts is expected: each of its letters would count as one."""
+    if isinstance(given, str):
+        raise InputError(f"{what} is {given!r}, expected a list, such as [{given!r}]")
+
+
 def amount(count: int, noun: str) -> str:
     """Return a number with its noun, which takes an s unless the number is 1."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -199,7 +199,11 @@ def test_an_error_of_the_callback_is_the_callers_and_its_trial_is_kept(tmp_path:
     assert len(read_results([tmp_path / "r.jsonl"])) == 1
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_what_cannot_be_evaluated_is_refused() -> None:
+    for one in (BLOBS, Path("map"), closed_form_map(BLOBS)):
+        with pytest.raises(bn.InputError, match=r"scenes is the one map .*, expected a list of maps"):
+            bn.compare(one, BLOBS)  # type: ignore[arg-type]
     scene = closed_form_map(BLOBS)
     wrong: dict[str, dict[str, Any]] = {
         "workers is 2, expected 1": {"workers": 2},
@@ -212,6 +216,9 @@ def test_what_cannot_be_evaluated_is_refused() -> None:
         "did you mean 'rays'": {"config": {"ray": 3}},
         "names 0001 more than once": {"frames": ["0001", "0001"]},
         "no fault 'blurr'": {"faults": ["blurr:1"]},
+        r"faults is 'blur:1', expected a list, such as \['blur:1'\]": {"faults": "blur:1"},
+        "frames is '0001', expected a list": {"frames": "0001"},
+        "sizes is .*'far'.*, expected a list of numbers": {"sizes": ["far"]},
         "data is a int": {"data": 3},
         "data is a list": {"data": [1]},
     }

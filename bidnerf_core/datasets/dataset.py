@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol, TypeAlias, runtime_checkable
 
-from bidnerf_core.errors import InputError, spelling_hint
+from bidnerf_core.errors import InputError, refuse_text, spelling_hint
 from bidnerf_core.frames.frame import View
 
 ReadingProgress: TypeAlias = Callable[[int, int], None]
@@ -54,6 +54,7 @@ def positions(names: Sequence[str], stems: Sequence[str], asked: Sequence[str], 
 
     Raises ``InputError``, whose message begins with ``where``, for a name that is unknown or ambiguous.
     """
+    refuse_text(f"{where}: names", asked)
     index = {name: place for place, name in enumerate(names)}
     for name in asked:
         if name not in index:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from bidnerf_core.datasets import Dataset, ReadingProgress
 from bidnerf_core.datasets.dataset import positions
-from bidnerf_core.errors import Cancelled, InputError, amount
+from bidnerf_core.errors import Cancelled, InputError, amount, refuse_text
 from bidnerf_core.evaluation.bench import (
     Plan,
     changed_settings,
@@ -80,6 +80,8 @@ def evaluate(
     Raises ``InputError`` for an evaluation that cannot be carried out, and ``Cancelled`` once ``cancel`` returns True and the
     trials under way have ended.
     """
+    for what, given in (("faults", faults), ("frames", frames), ("sizes", sizes)):
+        refuse_text(what, given)
     plan = Plan(
         map=_name(scene), data=_name(data), protocol=protocol, sizes=_sizes(sizes), method=method,
         config=_config(method, config), trials=trials, seed=seed, split=split,
@@ -166,6 +168,7 @@ def compare(
     folders are tried in a process each, of which the peak memory is measured; maps in memory, and all maps where the data is in
     memory, are tried in this process. One trial runs at a time. Raises ``InputError`` and ``Cancelled`` as ``evaluate`` does.
     """
+    refuse_text("frames", frames)
     plan = Plan(
         map="", data=_name(data), protocol=protocol,
         sizes=find_protocol(protocol).sizes[:1] if size is None else _sizes([size]), method=method,
@@ -187,6 +190,10 @@ def run_comparison(
 
     ``data`` are by default those that the plan names.
     """
+    if isinstance(scenes, str | Path | Map):
+        raise InputError(
+            f"scenes is the one map {_name(scenes)}, expected a list of maps, or a dictionary of them"
+        )
     named = dict(scenes) if isinstance(scenes, Mapping) else _named(scenes)
     if not named:
         raise InputError("no maps to compare, expected at least one")
@@ -303,7 +310,12 @@ def _named(scenes: Sequence[Scene]) -> dict[str, Scene]:
 def _sizes(given: Sequence[float | Sequence[float]] | None) -> tuple[Size, ...] | None:
     if given is None:
         return None
-    return tuple(tuple(map(float, size)) if isinstance(size, Sequence) else (float(size),) for size in given)
+    try:
+        return tuple(
+            tuple(map(float, size)) if isinstance(size, Sequence) else (float(size),) for size in given
+        )
+    except (TypeError, ValueError) as error:
+        raise InputError(f"sizes is {given!r}, expected a list of numbers or of lists of numbers") from error
 
 
 def _config(method: str, config: Any) -> str:
