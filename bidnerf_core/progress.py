@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from bidnerf_core.errors import Cancelled
+from bidnerf_core.errors import Cancelled, InputError
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,11 @@ Cancel: TypeAlias = Callable[[], bool]
 
 
 def check_cancelled(cancel: Cancel | None, stage: str) -> None:
-    """Raise ``Cancelled`` if work is to stop."""
+    """Raise ``Cancelled`` if work is to stop, and ``InputError`` for what cannot be asked, such as an event itself."""
+    if cancel is not None and not callable(cancel):
+        raise InputError(
+            f"cancel is a {type(cancel).__name__}, expected a function, such as the is_set of an event"
+        )
     if cancel is not None and cancel():
         raise Cancelled(f"cancelled during stage {stage!r}")
 

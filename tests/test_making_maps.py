@@ -239,6 +239,14 @@ def test_a_description_is_for_people_and_for_json(scene: bn.Map) -> None:
     assert facts["surfels"] == summary.surfels > 0
 
 
+def test_a_notebook_shows_a_map_in_a_line(scene: bn.Map) -> None:
+    shown = repr(scene)
+    assert scene.surface is not None
+    assert len(shown) < 200
+    assert f"{len(scene.surface.surfels)} surfels" in shown
+
+
+@pytest.mark.usefixtures("unchecked")
 def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
     (view,) = tiny.views(1, seed=1)
     image = scene.render(view)
@@ -252,8 +260,11 @@ def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
     assert not torch.equal(scene.render(view, level=0).rgb, image.rgb)
     with pytest.raises(bn.InputError, match="no level 2, expected 0 to 1"):
         scene.render(view, level=2)
+    with pytest.raises(bn.InputError, match="view is a Frame, expected a View"):
+        scene.render(view.frame)  # type: ignore[arg-type]
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -266,6 +277,12 @@ def test_a_rendering_is_scored_against_the_photo(scene: bn.Map) -> None:
         ({"config": 7}, "config is a int, expected a HashGridConfig or a dict"),
         ({"device": "tpu:9"}, "device 'tpu:9' does not work here"),
         ({"checkpoint_seconds": -1.0}, "checkpoint_seconds is -1.0"),
+        ({"bake": "yes"}, "bake is 'yes', expected True, False or a BakeConfig"),
+        ({"progress": 3}, "progress is a int, expected a function"),
+        (
+            {"cancel": threading.Event()},
+            "cancel is a Event, expected a function, such as the is_set of an event",
+        ),
         ({"refine_poses": "maybe"}, "refine_poses is 'maybe', expected one of auto, always, never"),
     ],
 )

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from bidnerf_core.backend import Backend, load_backend
 from bidnerf_core.captures.cameras import at_stored_poses
 from bidnerf_core.captures.report import CaptureReport
-from bidnerf_core.errors import InputError
+from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
 from bidnerf_core.fields.rendering import RenderedImage, render_image
 from bidnerf_core.frames.frame import View
@@ -61,6 +61,14 @@ class Map:
     landmarks: LandmarkMap | None = None  # None where none were built
     folder: Path | None = None  # None for a map in memory
     record: CaptureReport | None = None  # of the photos, for a map in memory; see ``capture``
+
+    def __repr__(self) -> str:
+        """A line, in place of all tensors and cameras; ``describe`` has the facts."""
+        info = self.info
+        trained = f"{info.backend}, {amount(info.step, 'step')}{'' if info.complete else ' (not complete)'}"
+        surfels = amount(0 if self.surface is None else len(self.surface.surfels), "surfel")
+        landmarks = amount(0 if self.landmarks is None else len(self.landmarks), "landmark")
+        return f"<Map {self._name}: {trained}, {surfels}, {landmarks}>"
 
     @property
     def bounds(self) -> SceneBounds:
@@ -112,8 +120,12 @@ class Map:
         """Render colour (h, w, 3) in [0, 1] and depth (h, w), planar z in metres, with camera and pose of ``view``.
 
         ``level`` is the level of detail, 0 the coarsest; None is the field itself. Raises ``InputError`` for a level that the
-        field does not have.
+        field does not have, and for what is no view.
         """
+        if not isinstance(view, View):
+            raise InputError(
+                f"{self._name}: view is a {type(view).__name__}, expected a View(frame, T_world_camera)"
+            )
         field = self.field
         if level is not None:
             offered = levels(field)

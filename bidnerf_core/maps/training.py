@@ -191,6 +191,10 @@ def _work(
 ) -> _Work:  # fmt: skip
     if not seconds >= 0:
         raise InputError(f"checkpoint_seconds is {seconds}, expected 0 or more")
+    if not isinstance(bake, bool | BakeConfig):
+        raise InputError(f"bake is {bake!r}, expected True, False or a BakeConfig")
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress is a {type(progress).__name__}, expected a function of a Progress")
     config = bake if isinstance(bake, BakeConfig) else USUAL_BAKE if bake else None
     place = None if out is None else Path(out)
     return _Work(place, config, working_device(device), seconds, progress, cancel)
