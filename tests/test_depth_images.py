@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,8 +79,9 @@ def test_depth_without_any_measurement_has_no_median() -> None:
     assert saturated.remark(unit_assumed=True) == f"{said}; counted as not measured: 6 x 65535"
 
 
-@pytest.mark.parametrize("unit", [0.0, -1.0, np.nan, np.inf])
-def test_units_that_are_none(unit: float) -> None:
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("unit", [0.0, -1.0, np.nan, np.inf, "mm"])
+def test_units_that_are_none(unit: Any) -> None:
     with pytest.raises(InputError, match=r"depth: depth_unit is .*, expected a positive number of metres"):
         depth_image(np.ones((2, 2)), unit, "depth")
 

@@ -509,3 +509,11 @@ def test_a_covered_lens_shows_one_colour_and_measures_nothing(view: View) -> Non
     covered = faulty(view, "covered", 0)
     assert len(covered.frame.rgb.flatten(0, 1).unique(dim=0)) == 1
     assert not bool(depth_of(covered).any())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_fault_that_returns_no_frame_is_named(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = dataclasses.replace(FAULTS["blur"], change=lambda frame, size, generator: None)  # type: ignore[arg-type, return-value]
+    monkeypatch.setattr("bidnerf_core.registry.registered", {("faults", "nothing"): nothing})
+    with pytest.raises(InputError, match="fault nothing:2: returned a NoneType, expected a Frame"):
+        faulty(view, "nothing:2", seed=0)

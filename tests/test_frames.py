@@ -87,3 +87,10 @@ def test_depth_that_is_no_number_was_not_measured() -> None:
     found = Frame("a", GOOD["rgb"], LENS, depth).depth
     assert found is not None
     assert torch.equal(found, torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(16, 6))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("camera", [None, np.eye(3), (20.0, 20.0, 12.0, 8.0), "camera.json"])
+def test_arrays_need_intrinsics(camera: Any) -> None:
+    with pytest.raises(InputError, match=r"frame image: camera is a \w+, expected Intrinsics\(fx="):
+        Frame.from_numpy(np.zeros((16, 24, 3), np.uint8), camera)

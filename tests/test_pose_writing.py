@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -144,3 +145,11 @@ def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
         InputError, match=r"poses\.csv: expected a name that ends with transforms\.json, \.json, \.txt"
     ):
         write_poses(tmp_path / "poses.csv", images(["a", "b"]))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("given", [[SE3.identity()], SE3.identity(), images(["a", "b"])[0]])
+def test_what_is_no_list_of_posed_images_is_refused(given: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"got a \w+, expected a list of PosedImage\(name, number,"):
+        write_poses(tmp_path / "poses.txt", given)
+    assert not list(tmp_path.iterdir())

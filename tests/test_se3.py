@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from kornia.geometry.liegroup import Se3
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from bidnerf_core.errors import InputError
 from bidnerf_core.geometry.se3 import (
     SE3,
     se3_left_jacobian,
@@ -161,3 +163,10 @@ def test_a_linear_update_has_the_value_and_the_derivative_of_the_exact_one() -> 
     torch.testing.assert_close(parts[1](zero), parts[0](zero))
     exact, linear = (torch.autograd.functional.jacobian(part, zero) for part in parts)
     torch.testing.assert_close(linear, exact)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("matrix", [np.eye(4), [[1.0]], torch.eye(3), torch.eye(4)[0]])
+def test_what_is_no_tensor_of_matrices_is_refused(matrix: Any) -> None:
+    with pytest.raises(InputError, match=r"matrix (is a|has shape) .*, expected"):
+        SE3.from_matrix(matrix)

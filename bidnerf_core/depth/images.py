@@ -5,7 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -93,8 +95,9 @@ def depth_image(raw: np.ndarray | Tensor, unit: float | None, what: str) -> Dept
         raise InputError(f"{what} is {found}, expected one channel of whole or floating-point numbers")
     if unit is None:
         unit = FLOAT_UNIT if values.dtype.kind == "f" else INTEGER_UNIT
-    if not 0 < unit <= FARTHEST:
-        raise InputError(f"{what}: depth_unit is {unit}, expected a positive number of metres a step")
+    given: Any = unit
+    if not isinstance(given, Real) or not 0 < unit <= FARTHEST:
+        raise InputError(f"{what}: depth_unit is {unit!r}, expected a positive number of metres a step")
     metres = values.astype(np.float64) * unit
     absent = _absent(values, metres)
     unmeasured = np.logical_or.reduce([metres == 0, *absent.values()])

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -171,6 +172,12 @@ class Frame:
         an image of another aspect ratio.
         """
         where = f"frame {name}"
+        given: Any = camera
+        if not isinstance(given, Intrinsics):
+            found = type(given).__name__
+            raise InputError(
+                f"{where}: camera is a {found}, expected Intrinsics(fx=..., fy=..., cx=..., cy=..., width=..., height=...)"
+            )
         colour, cover = split_alpha(pixel_array(rgb, f"{where}: rgb"))
         if alpha is not None:
             if cover is not None:

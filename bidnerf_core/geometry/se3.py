@@ -37,7 +37,16 @@ class SE3:
 
     @staticmethod
     def from_matrix(matrix: Float[Tensor, "*b 4 4"]) -> SE3:
-        """Return the transform of a homogeneous matrix, which is not checked; ``is_rigid`` does that."""
+        """Return the transform of a homogeneous matrix. Its numbers are not checked; ``is_rigid`` does that.
+
+        Raises ``InputError`` for what is no tensor of 4x4 matrices.
+        """
+        if not isinstance(matrix, Tensor):
+            raise InputError(
+                f"matrix is a {type(matrix).__name__}, expected a tensor; torch.as_tensor makes one"
+            )
+        if matrix.shape[-2:] != (4, 4):
+            raise InputError(f"matrix has shape {tuple(matrix.shape)}, expected (..., 4, 4)")
         return SE3(matrix[..., :3, :3], matrix[..., :3, 3])
 
     @staticmethod

@@ -186,8 +186,18 @@ def pose_format(path: Path) -> str:
 
 
 def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
-    """Write poses in the format that the ending of the file's name selects. Raises ``InputError`` for an unknown ending."""
+    """Write poses in the format that the ending of the file's name selects.
+
+    Raises ``InputError`` for an unknown ending, and for images that are not ``PosedImage``.
+    """
     path = Path(path)
+    given = images if isinstance(images, Sequence) else [images]
+    wrong = [image for image in given if not isinstance(image, PosedImage)] if given is images else given
+    if wrong:
+        found = type(wrong[0]).__name__
+        raise InputError(
+            f"{path}: got a {found}, expected a list of PosedImage(name, number, intrinsics, T_world_camera)"
+        )
     POSE_WRITERS[pose_format(path)](path, images)
 
 

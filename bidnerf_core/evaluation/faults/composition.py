@@ -11,7 +11,7 @@ import torch
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation.faults.fault import find_fault
-from bidnerf_core.frames.frame import View
+from bidnerf_core.frames.frame import Frame, View
 
 NO_FAULT = "none"
 """The name that leaves a view as it is."""
@@ -40,7 +40,10 @@ class AppliedFault:
         T_ref_camera = view.T_ref_camera
         if fault.T_true_faulty is not None and self.size != fault.neutral:
             T_ref_camera = T_ref_camera.to(dtype=torch.float64) @ fault.T_true_faulty
-        return View(fault.change(view.frame, self.size, generator), T_ref_camera)
+        changed = fault.change(view.frame, self.size, generator)
+        if not isinstance(changed, Frame):
+            raise InputError(f"fault {self}: returned a {type(changed).__name__}, expected a Frame")
+        return View(changed, T_ref_camera)
 
 
 def expand_faults(words: Iterable[str]) -> tuple[str, ...]:
