@@ -191,10 +191,13 @@ def write_poses(path: str | Path, images: Sequence[PosedImage]) -> None:
     Raises ``InputError`` for an unknown ending, and for images that are not ``PosedImage``.
     """
     path = Path(path)
-    given = images if isinstance(images, Sequence) else [images]
-    wrong = [image for image in given if not isinstance(image, PosedImage)] if given is images else given
-    if wrong:
-        found = type(wrong[0]).__name__
+    strange = (
+        [image for image in images if not isinstance(image, PosedImage)]
+        if isinstance(images, Sequence)
+        else [images]
+    )
+    if strange:
+        found = type(strange[0]).__name__
         raise InputError(
             f"{path}: got a {found}, expected a list of PosedImage(name, number, intrinsics, T_world_camera)"
         )
