@@ -71,7 +71,7 @@ def _architecture(tensors: dict[str, Any], octaves: bool, where: str) -> Network
     shapes = {name: tuple(getattr(value, "shape", ())) for name, value in tensors.items()}
     width, seen = _sizes(shapes.get("layer1.weight"), where)
     inputs = [shapes.get(f"layers_xyz.{i}.weight", ()) for i in range(sum(map(_is_hidden, shapes)))]
-    turned = shapes.get("layers_dir.0.weight", (0, width + 27))[-1] - width
+    turned = (width + 27, *shapes.get("layers_dir.0.weight", ()))[-1] - width
     skips = tuple(i for i, shape in enumerate(inputs, 1) if shape[-1:] == (width + seen,))
     frequencies = *_frequencies(seen, where), *_frequencies(turned, where)
     try:

@@ -12,14 +12,14 @@ import tyro
 
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.io.images import background_colour
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.maps.description import MapInfo
-from bidnerf_core.maps.files import save_map
+from bidnerf_core.maps.files import map_folder, save_map
 from bidnerf_core.training import TrainingState
 from bidnerf_nerf_pytorch import NerfPytorchConfig, backend, read_checkpoint
 
 NAME = "bidnerf-import-nerf-pytorch"
-COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 DONE, BAD_INPUT, INTERRUPTED = 0, 1, 130
 
 Box = tuple[float, float, float, float, float, float]
@@ -53,18 +53,17 @@ def import_checkpoint(
         octaves: whether frequencies double (nerf-pytorch's log_sampling), which no weight shows
         overwrite: replace the map in --out
     """
-    bounds = SceneBounds(box[:3], box[3:], near, far, COLOURS[background])
+    bounds = SceneBounds(box[:3], box[3:], near, far, background_colour(background))
     found = read_checkpoint(checkpoint, octaves)
     config = NerfPytorchConfig(
         **asdict(found.network), coarse_samples=coarse_samples, fine_samples=fine_samples,
         steps=max(1, found.steps),
     )  # fmt: skip
-    if not overwrite and out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise InputError(f"{out}: exists already and is not empty; name another --out or pass --overwrite")
     field = backend.build(config, bounds)
     field.load_state_dict(found.tensors)
     info = MapInfo("nerf-pytorch", to_plain(config, "config"), bounds, found.steps, True, checkpoint.name)
-    save_map(out, info, TrainingState(found.steps, dict(field.state_dict()), {}))
+    with map_folder(out, overwrite):
+        save_map(out, info, TrainingState(found.steps, dict(field.state_dict()), {}))
     size = f"{config.layers} layers of {config.width}"
     print(f"{out}: coarse and fine network of {size}, {found.steps} steps", file=sys.stderr)
 

@@ -131,6 +131,7 @@ def changed(**shapes: tuple[int, ...] | None) -> dict[str, Any]:
         changed(layers_xyz__2__weight=(16, 16)),
         changed(layers_dir__0__weight=(8, 16)),
         changed(layers_dir__0__weight=(3,)),
+        changed(layers_dir__0__weight=()),
         changed(layers_dir__1__weight=(8, 8)),
         changed(fc_rgb__bias=None),
         changed(fc_rgb__bias=(4,)),

@@ -11,6 +11,7 @@ import torch
 from bidnerf_core.backend import load_backend
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
+from bidnerf_core.io.files import locked
 from bidnerf_core.maps.description import load_info
 from bidnerf_core.maps.map import load_map
 from bidnerf_core.testing.recipes import Recorder
@@ -67,7 +68,7 @@ def test_bad_input_is_told_in_one_line(
     assert "is not below" in refused(capsys, good, "--out", out, "--box", 0, 0, 0, 1, 1, 0)
     assert "coarse_samples is 0" in refused(capsys, good, "--out", out, "--coarse-samples", 0)
     assert not out.exists()
-    assert "exists already" in refused(capsys, good, "--out", good)
+    assert "is a file, expected the name of a folder" in refused(capsys, good, "--out", good)
 
 
 def test_a_map_is_replaced_only_where_that_is_wanted(
@@ -79,6 +80,9 @@ def test_a_map_is_replaced_only_where_that_is_wanted(
     assert "--overwrite" in refused(capsys, write(), "--out", out)
     assert main([str(write()), "--out", str(out), "--overwrite", "--near", "1"]) == 0
     assert load_map(out).bounds.near == 1.0
+    capsys.readouterr()
+    with locked(out):
+        assert "another bidnerf writes into it" in refused(capsys, write(), "--out", out, "--overwrite")
 
 
 def test_wrong_usage_has_a_status_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
