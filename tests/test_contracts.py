@@ -129,6 +129,20 @@ def test_a_mistake_of_a_reader_is_named(
     assert says in failing(ReaderContract, name="mistaken", folder=capture).get(test, "passed")
 
 
+class Deaf(Converting):
+    """A reader that ignores its options."""
+
+    def open(self, path: Path, options: ReadOptions) -> Dataset:
+        return super().open(path, ReadOptions())
+
+
+def test_a_reader_that_ignores_its_options_is_named(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(registered, ("readers", "mistaken"), Deaf(lambda view: view))
+    subject = type("Subject", (ReaderContract,), {"name": "mistaken", "folder": capture})()
+    with pytest.raises(AssertionError, match="the background is"):
+        subject.test_background_is_the_one_that_is_asked_for()
+
+
 def shifted(rgb: Float[Tensor, "h w 3"]) -> Keypoints:
     """Keypoints at places that do not depend on what the image shows."""
     found = SIFT(rgb)

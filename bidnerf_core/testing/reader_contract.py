@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
@@ -60,6 +61,15 @@ class ReaderContract:
                 read == names[: len(read)],
                 f"reader {self.name!r}: views of {split!r} have other names: {read[:3]}",
             )
+
+    def test_background_is_the_one_that_is_asked_for(self) -> None:
+        colour = (1.0, 0.5, 0.0)
+        with calling(f"reader {self.name!r}: open of {self.folder}"):
+            data = self._reader().open(Path(self.folder), replace(self.options, background=colour))
+        require_that(
+            tuple(data.background) == colour,
+            f"reader {self.name!r}: the background is {data.background}, expected {colour}, as its options say",
+        )
 
     def test_poses_are_rigid(self) -> None:
         for view in self._views():

@@ -15,7 +15,15 @@ from pathlib import Path
 import torch
 
 from bidnerf_core import SE3, Dataset, Frame, FrameSequence, InputError, View
-from bidnerf_core.datasets import FileSequence, Reader, ReadingProgress, ReadOptions, SequenceEntry
+from bidnerf_core.datasets import (
+    Background,
+    FileSequence,
+    Reader,
+    ReadingProgress,
+    ReadOptions,
+    SequenceEntry,
+)
+from bidnerf_core.io.images import background_colour
 
 TABLE, CAMERA = "poses.csv", "camera.json"
 
@@ -32,8 +40,9 @@ class Row:
 class PoseTable(Dataset):
     """The images of a folder, all in one split."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, background: Background | None) -> None:
         self._path, self._rows = path, {row.name: row for row in read_table(path / TABLE)}
+        self._background = background_colour("black" if background is None else background)
 
     @property
     def path(self) -> Path:
@@ -45,7 +54,7 @@ class PoseTable(Dataset):
 
     @property
     def background(self) -> tuple[float, float, float]:
-        return (0.0, 0.0, 0.0)
+        return self._background
 
     def frame_names(self, split: str) -> list[str]:
         if split not in self.splits:
@@ -72,6 +81,7 @@ class PoseTable(Dataset):
             depth=self.path / f"{name}.depth.png",
             depth_unit=0.001,
             camera=self.path / CAMERA,
+            background=self._background,
         )
         return View(frame, self._rows[name].T_world_camera)
 
@@ -95,10 +105,10 @@ class PoseTableReader(Reader):
         return (path / TABLE).is_file() and (path / CAMERA).is_file()
 
     def open(self, path: Path, options: ReadOptions) -> PoseTable:
-        return PoseTable(path)
+        return PoseTable(path, options.background)
 
     def open_sequence(self, path: Path, options: ReadOptions) -> FrameSequence:
-        return PoseTable(path).sequence()
+        return PoseTable(path, options.background).sequence()
 
 
 reader = PoseTableReader()
