@@ -139,6 +139,21 @@ def test_what_this_process_alone_has_registered_is_not_mistaken_for_what_is_inst
     assert len(bn.evaluate(BLOBS, BLOBS, trials=2, workers=2, **other).rows) == 2
 
 
+def test_results_say_where_a_map_in_memory_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever ``device`` says, which is for maps in folders. No trial is run: a meta device computes nothing."""
+    scene = bn.train(tiny.views(2), config=tiny.config(1), bake=False)
+    assert isinstance(scene.field, torch.nn.Module)
+    elsewhere = dataclasses.replace(scene, field=scene.field.to("meta"))
+    seen: list[Any] = []
+    monkeypatch.setattr("bidnerf_core.evaluation.evaluate.run_plan", lambda plan, *_, **__: seen.append(plan))
+    monkeypatch.setattr(
+        "bidnerf_core.evaluation.evaluate.compare_maps", lambda starts, *_: seen.extend(starts[0])
+    )
+    bn.evaluate(elsewhere, tiny.views(2), trials=1, **QUICK)
+    bn.compare([elsewhere, BLOBS], tiny.views(2), trials=1, method="bid", protocol="bid")
+    assert [found.device for found in seen] == ["meta", "meta", "cpu"]
+
+
 def test_frames_of_one_name_are_refused() -> None:
     views = [dataclasses.replace(v, frame=dataclasses.replace(v.frame, name="image")) for v in tiny.views(2)]
     with pytest.raises(bn.InputError, match="2 frames called 'image'"):

@@ -6,7 +6,7 @@ import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -30,6 +30,7 @@ from bidnerf_core.evaluation.results import ResultsFile, ResultTable, key_of
 from bidnerf_core.evaluation.trial import Trial
 from bidnerf_core.evaluation.trials import Opened, open_data, open_map
 from bidnerf_core.evaluation.workers import workers_for
+from bidnerf_core.fields.contract import device_of
 from bidnerf_core.frames.frame import View
 from bidnerf_core.localization import settings_of
 from bidnerf_core.maps.description import load_info
@@ -85,7 +86,8 @@ def evaluate(
     plan = Plan(
         map=_name(scene), data=_name(data), protocol=protocol, sizes=_sizes(sizes), method=method,
         config=_config(method, config), trials=trials, seed=seed, split=split,
-        frames=None if frames is None else tuple(frames), device=device, depth=depth, faults=tuple(faults),
+        frames=None if frames is None else tuple(frames), device=_device(scene, device), depth=depth,
+        faults=tuple(faults),
     )  # fmt: skip
     in_memory = isinstance(scene, Map) or not isinstance(data, str | Path)
     if in_memory and workers not in (1, None):
@@ -204,7 +206,11 @@ def run_comparison(
     }  # fmt: skip
     dataset = next((known[1] for known in opened.values() if known is not None), None) or _dataset(data)
     places = [name if opened[name] is not None else str(scene) for name, scene in named.items()]
-    starts = plan_comparison(plan, places, dataset)
+    devices = [_device(scene, plan.device) for scene in named.values()]
+    starts = [
+        [replace(trial, device=device) for trial, device in zip(trials, devices, strict=True)]
+        for trials in plan_comparison(plan, places, dataset)
+    ]
     folders = [place for place, known in zip(places, opened.values(), strict=True) if known is None]
     for folder in folders:
         if not is_closed_form(folder):
@@ -279,6 +285,11 @@ def _dataset(data: Data, stored: Map | None = None) -> Dataset:
     if count > 1:  # trials know their frames by name
         raise InputError(f"data holds {count} frames called {name!r}, expected names that differ")
     return _GivenViews(views)
+
+
+def _device(scene: Scene, asked: str) -> str:
+    """Return the device on which a map computes: that of a map in memory, else the one that is asked for."""
+    return str(device_of(scene.field)) if isinstance(scene, Map) else asked
 
 
 def _name(value: Scene | Data) -> str:

@@ -81,8 +81,9 @@ def train(
     the settings of baking.
 
     ``progress`` receives each step, and remarks go to the logger "bidnerf". Once ``cancel`` returns True, ``Cancelled`` is
-    raised; a map in a folder has then been saved, and ``resume`` goes on with it. An error that ``progress`` raises ends the
-    training as well; the map in the folder is then that of the last checkpoint, at most ``checkpoint_seconds`` old.
+    raised; a map in a folder whose training has begun is then saved, and ``resume`` goes on with it. An error that ``progress``
+    raises ends the training as well; the map in the folder is then that of the last checkpoint, at most
+    ``checkpoint_seconds`` old.
 
     ``background`` is the colour behind images with an alpha channel. Images without depth take that of the points of the COLMAP
     sparse model in folder ``depth_points``, of which ``point_choice`` uses the good ones. ``features`` is the name of the
