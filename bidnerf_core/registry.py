@@ -55,7 +55,7 @@ registered: dict[tuple[str, str], Any] = {}
 
 
 class PluginError(InputError):
-    """A plugin cannot be loaded; the message names it, its distribution and the cause."""
+    """A plugin cannot be loaded, or returns what its kind must not; the message names it and the cause."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ from bidnerf_core.io.files import FileInUse
 from bidnerf_core.io.json import to_plain
 from bidnerf_core.mapping import BakeConfig
 from bidnerf_core.maps.description import load_info
+from bidnerf_core.registry import PluginError
+from bidnerf_hashgrid import backend as hashgrid
 
 BAKE = BakeConfig(cells=20_000)
 DESCENT = bn.settings_of("bid", {"rays": 64, "max_steps": 3})
@@ -290,6 +292,32 @@ def test_wrong_arguments_are_refused_before_any_work(options: dict[str, Any], sa
     with pytest.raises(bn.InputError) as refused:
         bn.train(**({"data": tiny.views(1), "config": tiny.config(1), "bake": False} | options))
     assert said in str(refused.value)
+
+
+def test_a_backend_whose_module_is_no_field_is_refused_before_training(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Layers(type(hashgrid)):  # type: ignore[misc]
+        def build(self, config: Any, bounds: Any) -> Any:
+            return nn.Linear(3, 4)
+
+    kind = Layers(**vars(hashgrid))
+    monkeypatch.setattr("bidnerf_core.registry.registered", {("backends", "layers"): kind})
+    with pytest.raises(
+        bn.InputError, match=r"backend 'layers' built a Linear, expected .* query and sampler"
+    ):
+        bn.train(tiny.views(2), "layers", out=tmp_path / "map", bake=False)
+    assert not (tmp_path / "map").exists()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_broken_detector_ends_training_with_an_error_and_the_map_in_its_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("bidnerf_core.registry.registered", {("features", "blind"): lambda rgb: None})
+    with pytest.raises(PluginError, match="returned a NoneType, expected Keypoints"):
+        trained(tmp_path / "map", features="blind", refine_poses="never", bake=BAKE)
+    assert load_info(tmp_path / "map").complete
 
 
 def test_photos_to_map_to_pose_to_overlay(tmp_path: Path) -> None:

@@ -306,9 +306,11 @@ def build_field(backend: Backend, info: MapInfo, where: str) -> tuple[RadianceFi
         field = backend.build(config, info.bounds)
     except ValueError as error:
         raise InputError(f"{where}: backend {info.backend!r} refuses its config: {error}") from error
-    if not isinstance(field, nn.Module):
+    if not (isinstance(field, nn.Module) and isinstance(field, RadianceField)):
         found = type(field).__name__
-        raise InputError(f"{where}: backend {info.backend!r} built a {found}, expected an nn.Module")
+        raise InputError(
+            f"{where}: backend {info.backend!r} built a {found}, expected an nn.Module with query and sampler"
+        )
     return field, config
 
 

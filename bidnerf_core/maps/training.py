@@ -31,6 +31,7 @@ from bidnerf_core.maps.files import load_state, map_folder
 from bidnerf_core.maps.map import Map, build_field, frozen_field, load_map
 from bidnerf_core.maps.views import Images, ReadViews, read_views
 from bidnerf_core.progress import Cancel, ProgressCallback, check_cancelled
+from bidnerf_core.registry import PluginError
 from bidnerf_core.training import TrainingStopped
 
 log = logging.getLogger("bidnerf")
@@ -257,6 +258,8 @@ def _baked(
 ) -> Map:
     try:
         return scene.with_baked_parts(list(views), config, False, tracked, work.progress, work.cancel)
+    except PluginError:  # nothing that other images would mend
+        raise
     except InputError as error:  # the map itself is sound
         log.info(f"{scene.folder or 'map in memory'}: no surface baked: {error}")
         return scene if scene.folder is None else load_map(scene.folder, work.device)

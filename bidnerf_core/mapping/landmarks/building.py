@@ -47,6 +47,7 @@ from bidnerf_core.mapping.landmarks.tracks import (
     likely_pairs_of_poses,
     seen_landmarks,
 )
+from bidnerf_core.registry import PluginError
 from bidnerf_core.settings import Above, Range, Settings
 
 LEAST_VISIBLE_POINTS = 20
@@ -260,7 +261,7 @@ def tracked_views(
     """Detect the keypoints of ``views``, match those of likely neighbours, and join the matches into tracks.
 
     ``features`` is the name of a detector, which is stored with the landmarks and finds them in queries, or a detector itself.
-    Raises ``InputError`` if there are no views, for an unknown name, and for keypoints that are not usable.
+    Raises ``InputError`` if there are no views, for an unknown name, and for keypoints of which nothing can be made.
     """
     detector = find_features(features) if isinstance(features, str) else features
     if not views:
@@ -270,7 +271,7 @@ def tracked_views(
     images = counter.over(_mapped(lambda view: _detected(view, detector), views))
     lengths = sorted({image.keypoints.descriptors.shape[1] for image in images})
     if len(lengths) > 1:
-        raise InputError(
+        raise PluginError(
             f"descriptors have {enumeration([*map(str, lengths)])} channels in different images, expected one number"
         )
     depth = [measured_depth(v.frame, p.keypoints.pixels) for v, p in zip(views, images, strict=True)]

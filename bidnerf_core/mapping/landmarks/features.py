@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from bidnerf_core.errors import InputError, enumeration
-from bidnerf_core.registry import Plugins, interface_defects
+from bidnerf_core.errors import enumeration
+from bidnerf_core.registry import PluginError, Plugins, interface_defects
 from bidnerf_core.settings import Range, Settings
 
 NORM = 512.0
@@ -112,30 +112,30 @@ def find_features(name: str, wanted_by: str = "") -> Features:
 
 
 def detected(features: Features, rgb: Float[Tensor, "h w 3"]) -> Keypoints:
-    """Return the keypoints of an image. Raises ``InputError`` where the detector returns anything but keypoints in it."""
+    """Return the keypoints of an image. Raises ``PluginError`` where the detector returns anything but keypoints in it."""
     found, who = features(rgb), f"detector {getattr(features, '__name__', type(features).__name__)}"
     if not isinstance(found, Keypoints):
-        raise InputError(
+        raise PluginError(
             f"{who}: returned a {type(found).__name__}, expected Keypoints(pixels, sizes, descriptors)"
         )
     parts = (found.pixels, found.sizes, found.descriptors)
     if not all(isinstance(part, Tensor) for part in parts):
         kinds = enumeration([type(part).__name__ for part in parts])
-        raise InputError(f"{who}: pixels, sizes and descriptors are {kinds}, expected tensors")
+        raise PluginError(f"{who}: pixels, sizes and descriptors are {kinds}, expected tensors")
     shapes = tuple(tuple(part.shape) for part in parts)
     count = len(found.descriptors)
     if shapes[:2] != ((count, 2), (count,)) or found.descriptors.ndim != 2:
-        raise InputError(
+        raise PluginError(
             f"{who}: pixels, sizes and descriptors have shapes {enumeration([str(shape) for shape in shapes])},"
             " expected (n, 2), (n) and (n, d)"
         )
     if found.descriptors.dtype != torch.uint8:
-        raise InputError(
+        raise PluginError(
             f"{who}: descriptors are of {found.descriptors.dtype}, expected torch.uint8; quantized makes bytes of floats"
         )
     size = torch.tensor([rgb.shape[1], rgb.shape[0]])
     if not bool(((found.pixels >= 0) & (found.pixels <= size)).all()):
-        raise InputError(
+        raise PluginError(
             f"{who}: keypoints lie outside the image of {size[0]}x{size[1]} pixels, expected none"
         )
     return found
