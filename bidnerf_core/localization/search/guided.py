@@ -78,19 +78,28 @@ class ProjectedLandmarks:
         self._number, self._image, self._landmarks = number, image, landmarks
         focal = image.focal * calibration.focal_factor
         T_world_camera = T_world_rig @ image.T_rig_camera
-        local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions)
-        self._index = _visible(image, landmarks, T_world_camera, local, focal, margin).nonzero()[:, 0]
-        local = local[self._index]
+        self._index, local = _visible(image, landmarks, T_world_camera, focal, margin)
         self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
         if bool(motion.any()):
             times = exposure_times(_image_pixels(self._pixels, image), image.intrinsics)
             local = moved_points(local, times, motion)
             self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
-        self._tree = cKDTree(self._pixels.numpy()) if len(self._pixels) else None
         self._sizes = landmarks.sizes[self._index] * focal / local[:, 2]
+        self._visible = len(self._index)
+        kept = self._of_a_size_that_matches()
+        self._index, self._pixels, self._sizes = self._index[kept], self._pixels[kept], self._sizes[kept]
+        self._tree = cKDTree(self._pixels.numpy()) if len(self._pixels) else None
 
     def __len__(self) -> int:
-        return len(self._index)
+        return self._visible
+
+    def _of_a_size_that_matches(self) -> Bool[Tensor, "n"]:
+        """Return which landmarks have about the size of some keypoint: far beyond a wall there are many others."""
+        sizes = self._image.keypoints.sizes
+        if not len(sizes):
+            return torch.zeros(len(self._index), dtype=torch.bool)
+        least, most = sizes.aminmax()
+        return (self._sizes >= least / 2**OCTAVES) & (self._sizes <= most * 2**OCTAVES)
 
     def matches(
         self, radius: float, most_distance: float, shift: tuple[float, float] = (0.0, 0.0)
@@ -128,19 +137,26 @@ def _image_pixels(pixels: Float[Tensor, "m 2"], image: QueryImage) -> Float[Tens
 
 
 def _visible(
-    image: QueryImage, landmarks: LandmarkMap, T_world_camera: SE3, local: Tensor, focal: float, margin: float
-) -> Bool[Tensor, "n"]:
-    """Return which landmarks are in front of the camera, inside its image, and seen roughly from a mapped direction."""
+    image: QueryImage, landmarks: LandmarkMap, T_world_camera: SE3, focal: float, margin: float
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 3"]]:
+    """Return the landmarks in front of the camera, inside its image, and seen roughly from a mapped direction.
+
+    Their positions are in the camera's frame.
+    """
     camera = image.intrinsics
     half = torch.tensor([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
     # Distortion moves the edges of the image. A generous margin does no harm: landmarks outside match no keypoint.
-    inside = (local[:, :2].abs() * focal <= (1.3 * half + margin) * local[:, 2:]).all(-1) & (local[:, 2] > 0)
-    towards = T_world_camera.translation.float() - landmarks.positions
-    length = torch.linalg.vector_norm(towards, dim=-1).clamp(min=1e-12)
-    cosine = (towards * landmarks.directions).sum(-1) / length
+    slopes = (1.3 * half + margin) / focal
+    index = landmarks.seen_from(T_world_camera, slopes, OBLIQUE)
+    local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions[index])
+    inside = (local[:, :2].abs() <= slopes * local[:, 2:]).all(-1) & (local[:, 2] > 0)
+    index, local = index[inside], local[inside]
+    towards = T_world_camera.translation.float() - landmarks.positions[index]
+    cosine = (towards * landmarks.directions[index]).sum(-1) / torch.linalg.vector_norm(local, dim=-1)
+    seen = cosine >= (landmarks.cones[index] + OBLIQUE).clamp(max=torch.pi).cos()
     if image.hidden is not None:
-        inside[inside.clone()] &= ~_hidden(image.hidden, local[inside], camera)
-    return inside & (cosine >= (landmarks.cones + OBLIQUE).clamp(max=torch.pi).cos())
+        seen &= ~_hidden(image.hidden, local, camera)
+    return index[seen], local[seen]
 
 
 def _hidden(

@@ -102,6 +102,9 @@ class _Cells:
         order = cell.argsort(stable=True)
         self._order = order
         self._descriptors = descriptors[order]
+        self._squares = torch.cat(
+            [part.float().square().sum(-1) for part in self._descriptors.split(16 * ROWS)]
+        )
         self._last = torch.bincount(cell, minlength=count).cumsum(0).tolist()
 
     def nearest(
@@ -119,14 +122,18 @@ class _Cells:
             first, last = self._last[number - 1] if number else 0, self._last[number]
             if begin == end or first == last:
                 continue
-            found = _smallest(
-                squared_distances(values[query[begin:end]], self._descriptors[first:last]), count
-            )
+            others = self._descriptors[first:last].float()
+            # The squares of the keypoint's own descriptor do not change the order, and are added at the end.
+            partial = torch.addmm(self._squares[first:last], values[query[begin:end]], others.T, alpha=-2)
+            found = _smallest(partial, count)
             width = found[0].shape[1]
             distances[order[begin:end], :width] = found[0]
             index[order[begin:end], :width] = found[1] + first
         best = distances.view(queries, -1).topk(count, dim=1, largest=False)
-        return best.values, self._order[index.view(queries, -1).gather(1, best.indices)]
+        squares = values.square().sum(-1, keepdim=True)
+        return (best.values + squares).clamp_(min=0), self._order[
+            index.view(queries, -1).gather(1, best.indices)
+        ]
 
 
 def _k_means(

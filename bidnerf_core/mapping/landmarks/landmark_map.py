@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -12,7 +13,12 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.devices import moved, working_device
+from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
+from bidnerf_core.mapping.landmarks.landmark_cells import LandmarkCells
+
+FEW = 20_000
+"""The number of landmarks up to which looking at all of them is faster than looking for cells in view."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,17 @@ class LandmarkMap:
         if self.usual_matches <= 0:
             return self.correlation
         return 1 + max(self.correlation - 1, 0.0) * math.sqrt(matches / self.usual_matches)
+
+    @cached_property
+    def cells(self) -> LandmarkCells | None:
+        """The cells of the landmarks on the CPU, which take a second for a million; None for few landmarks."""
+        return LandmarkCells.of(self.positions, self.directions, self.cones) if len(self) > FEW else None
+
+    def seen_from(self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float) -> Int[Tensor, "m"]:
+        """Return the numbers of landmarks of which none else shows in an image; see ``LandmarkCells.seen_from``."""
+        if self.cells is None:
+            return torch.arange(len(self))
+        return self.cells.seen_from(T_world_camera, slopes, oblique)
 
     @property
     def megabytes(self) -> float:
