@@ -61,26 +61,27 @@ def evident_motion(
 ) -> EvidentMotion:
     """Return the more probable of a camera at rest and one that moved, and the doubt about the pose that is left.
 
-    ``fit`` is a fit to these points, and ``share`` the prior probability of a motion. The intrinsics are free in all
-    explanations that are compared, as far as the prior ``camera`` leaves them open: what they explain is not a motion.
+    ``fit`` is a fit to these points, with a motion or without one, and ``share`` the prior probability of a motion. The
+    intrinsics are free in all explanations that are compared, as far as the prior ``camera`` leaves them open: what they
+    explain is not a motion.
     """
     if len(data) < ENOUGH_POINTS:
         return EvidentMotion()
     motion = MotionPrior.usual(float(data.in_camera(fit.T_world_rig)[:, 2].median()))
-    errors, at_fit = ReprojectionErrors(data, fit.T_world_rig), State.of(fit.T_world_rig, fit.calibration)
-    transposed = errors.exposed_at(data.transposed_exposure_times)
+    errors = ReprojectionErrors(data, fit.T_world_rig)
+    given = State.of(fit.T_world_rig, fit.calibration)
 
     def explained(about: QuadraticFit, prior: MotionPrior) -> Explanation:
         free = CameraPrior(np.zeros(10), torch.cat([camera.deviations, prior.deviations]).numpy())
-        known = CameraPrior(at_fit.camera, torch.cat([FIXED.deviations, prior.deviations]).numpy())
+        known = CameraPrior(given.camera, torch.cat([FIXED.deviations, prior.deviations]).numpy())
         return Explanation.of(about, free, known)
 
-    about, about_transposed = (QuadraticFit(e, at_fit, fit.noise, correlation) for e in (errors, transposed))
-    still, moving, turned = (
-        explained(about, STILL),
-        explained(about, motion),
-        explained(about_transposed, motion),
+    about = QuadraticFit(
+        errors, State.of(fit.T_world_rig, fit.calibration, fit.motion), fit.noise, correlation
     )
+    still, moving = explained(about, STILL), explained(about, motion)
+    transposed = errors.exposed_at(data.transposed_exposure_times)
+    turned = explained(QuadraticFit(transposed, still.best, fit.noise, correlation), motion)
     log_odds = torch.tensor(
         [
             math.log(1 - share),

@@ -105,7 +105,7 @@ class ByLandmarks:
         threshold = pixel_threshold(frame.intrinsics)
         correlation = self.detector.landmarks.correlation_of(len(points))
         found = fit_pose(
-            points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation
+            points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation, state.moves
         )
         if found is not None:
             found = with_motion(found, correlation, share_moving(self.detector.landmarks))
@@ -200,7 +200,7 @@ class ByLandmarks:
     def _with_depth(
         self, frame: Frame, state: TrackerState, kept: FollowedPoints, found: LandmarkPose, verdict: Verdict
     ) -> Measurement:
-        state = replace(state, points=kept, noise=found.noise)
+        state = replace(state, points=kept, noise=found.noise, moves=bool(found.motion.any()))
         pose, surface = self._estimate(found), self.map.surface
         if not verdict.accepted or surface is None or not frame.has_depth:
             return Measurement(pose, verdict, found.noise, state)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
-from bidnerf_core.camera.rolling_shutter import STILL, exposure_times, transposed_exposure_times
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_times, transposed_exposure_times
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.evident_motion import SHARE_MOVING, EvidentMotion, evident_motion
@@ -115,16 +115,24 @@ class PointFit:
 
 
 def fit_pose(
-    data: ObservedPoints, start: SE3, noise: float, threshold: float, correlation: float = 1.0
+    data: ObservedPoints,
+    start: SE3,
+    noise: float,
+    threshold: float,
+    correlation: float = 1.0,
+    moves: bool = False,
 ) -> PointFit | None:
     """Return the pose that the points in one camera determine, from a start; None if they are too few.
 
     ``noise`` (pixels) is a first guess at that of the observations, ``correlation`` the number of them that count as one. Where
-    most points do not agree with the robust fit, a consensus of samples within ``threshold`` pixels replaces the start.
+    most points do not agree with the robust fit, a consensus of samples within ``threshold`` pixels replaces the start. ``moves``:
+    whether the camera is taken to have moved while its rows were exposed, until ``with_motion`` judges that.
     """
     if len(data) < LEAST_FOLLOWED:
         return None
-    fit = resect(data, _nearby(data, start, threshold), noise, correlation=correlation)
+    near = _nearby(data, start, threshold)
+    motion = MotionPrior.usual(float(data.in_camera(near)[:, 2].median())) if moves else STILL
+    fit = resect(data, near, noise, correlation=correlation, motion=motion)
     found = PointFit(fit, data, _inliers(data, fit))
     if found.share >= MAJORITY and found.fit.noise <= threshold:
         return found
@@ -142,10 +150,11 @@ def with_motion(found: PointFit, correlation: float, share: float = SHARE_MOVING
     ``share`` is the prior probability of a motion.
     """
     evident = evident_motion(found.data[found.inliers], found.fit, correlation, share=share)
-    if evident.prior == STILL:
+    if (evident.prior == STILL) == (not bool(found.fit.motion.any())):
         return replace(found, evident=evident)
-    start, noise, motion = found.T_world_camera, found.fit.noise, evident.prior
-    fit = resect(found.data, start, noise, correlation=correlation, motion=motion)
+    fit = resect(
+        found.data, found.T_world_camera, found.fit.noise, correlation=correlation, motion=evident.prior
+    )
     return PointFit(fit, found.data, _inliers(found.data, fit), evident)
 
 

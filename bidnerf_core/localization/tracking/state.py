@@ -25,7 +25,7 @@ from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.mapping.tensors import Kinds, check_kinds, check_range
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 5
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 6
 KINDS: Kinds = {
     "points.pixels": ((-1, 2), torch.float32), "points.positions": ((-1, 3), torch.float64),
     "points.deviations": ((-1, 2), torch.float64), "points.directions": ((-1, 3), torch.float64),
@@ -60,6 +60,7 @@ class TrackerState:
     calibrated: int | None = None  # the frame (of ``frames``) in which the intrinsics were last checked
     camera: CorrectedCamera | None = None  # found by searches; None while the given intrinsics are taken
     noise: float = 1.0  # pixels: of the points in the last image
+    moves: bool = False  # whether the camera moved while the rows of the last image were exposed
 
     @property
     def tracking(self) -> bool:
@@ -81,6 +82,7 @@ class StoredNumbers:
     age: int
     usual_distance: float | None  # None for infinity, which JSON does not have
     noise: float
+    moves: bool
     reach: float | None  # of the motion; None where there is none
     agility: float | None
     calibrated: int | None
@@ -103,7 +105,7 @@ def save_state(path: Path, state: TrackerState, key: str) -> None:
     motion = state.motion
     numbers = StoredNumbers(
         state.clock.now, state.clock.interval, state.frames, state.lost, state.searchable, state.waited, state.sought, state.age,
-        _written(state.usual_distance), state.noise, None if motion is None else motion.reach,
+        _written(state.usual_distance), state.noise, state.moves, None if motion is None else motion.reach,
         None if motion is None else motion.agility, state.calibrated, None if state.camera is None else state.camera.plain(),
     )  # fmt: skip
     tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
@@ -160,6 +162,7 @@ def _state(numbers: StoredNumbers, tensors: dict[str, Tensor]) -> TrackerState:
         tensors["image"].numpy() if "image" in tensors else None, numbers.sought, numbers.age,
         float("inf") if numbers.usual_distance is None else numbers.usual_distance, miscalibration, numbers.calibrated,
         None if numbers.camera is None else CorrectedCamera.from_plain(numbers.camera), numbers.noise,
+        numbers.moves,
     )  # fmt: skip
 
 
