@@ -15,7 +15,7 @@ from bidnerf_core.geometry.rotations import left_jacobian, rotation_vector
 from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.quadratic_fit import TIED, CameraPrior, QuadraticFit
-from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State
+from bidnerf_core.mapping.geometry.reprojection import LinearizedErrors, ReprojectionErrors, State
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
@@ -81,7 +81,7 @@ def evident_motion(
     )
     still, moving = explained(about, STILL), explained(about, motion)
     transposed = errors.exposed_at(data.transposed_exposure_times)
-    turned = explained(QuadraticFit(transposed, still.best, fit.noise, correlation), motion)
+    turned = explained(QuadraticFit(transposed, still.best.state, fit.noise, correlation), motion)
     log_odds = torch.tensor(
         [
             math.log(1 - share),
@@ -112,18 +112,18 @@ class Explanation:
     about: QuadraticFit  # the cost near the fit that the explanations start from
     free: CameraPrior  # with unknown intrinsics
     known: CameraPrior  # with the intrinsics with which the pose is found
-    best: State  # with unknown intrinsics
+    best: LinearizedErrors  # with unknown intrinsics
     noise: float  # pixels, of keypoints, there
 
     @staticmethod
     def of(about: QuadraticFit, free: CameraPrior, known: CameraPrior) -> Explanation:
-        best = about.best(free)
-        return Explanation(about, free, known, best, about.noise_at(best, free))
+        best = about.at_best(free)
+        return Explanation(about, free, known, best, about.noise(best))
 
     @property
     def motion_in_deviations(self) -> float:
         """The squared size of the motion, in standard deviations of its prior; 0 for a camera at rest."""
-        return float((self.best.camera[4:] ** 2 / self.free.deviations[4:].clip(min=TIED) ** 2).sum())
+        return float((self.best.state.camera[4:] ** 2 / self.free.deviations[4:].clip(min=TIED) ** 2).sum())
 
     def log_evidence_over(self, still: Explanation) -> float:
         """Return the logarithm of the Bayes factor over a camera at rest, in Laplace's approximation (MacKay 2003, ch. 28)."""

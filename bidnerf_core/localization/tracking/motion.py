@@ -115,7 +115,7 @@ class Motion:
         noise = kept @ self.noise @ kept.T + gain @ measured.noise @ gain.T  # Joseph's form stays positive
         shared = kept[:6, :6] @ _root(self.bias) + gain[:6] @ _root(measured.bias)
         return Motion(
-            retracted(self.T_world_camera, delta[:6]).normalized(),
+            retracted(self.T_world_camera, delta[:6]).polished(),
             self.velocity + delta[6:],
             _symmetric(noise),
             shared @ shared.T,

@@ -12,6 +12,7 @@ import numpy as np
 
 from bidnerf_core.mapping.geometry.reprojection import (
     Array,
+    LinearizedErrors,
     ReprojectionErrors,
     RobustEquations,
     State,
@@ -38,7 +39,7 @@ class QuadraticFit:
 
     def __init__(self, errors: ReprojectionErrors, state: State, noise: float, correlation: float) -> None:
         """``noise`` is that of keypoints (pixels), ``correlation`` the number of observations that count as one."""
-        self.state, self.noise, self._errors, self._correlation = state, noise, errors, correlation
+        self.state, self._noise, self._errors, self._correlation = state, noise, errors, correlation
         self._equations = errors.system(errors.linearized(state, EVERY), noise).weighted(1 / correlation)
 
     def under(self, prior: CameraPrior) -> RobustEquations:
@@ -50,12 +51,14 @@ class QuadraticFit:
         equations = self.under(prior)
         return self.state.retracted(-damped_solution(equations.hessian, 1e-9, equations.gradient), EVERY)
 
-    def noise_at(self, state: State, prior: CameraPrior) -> float:
-        """Return the noise of keypoints (pixels) that the residuals at a state show, where ``prior`` leaves unknowns open."""
-        here = self._errors.linearized(state, prior.deviations.nonzero()[0])
-        return max(LEAST_NOISE, self.noise * self._errors.system(here, self.noise).spread)
+    def at_best(self, prior: CameraPrior) -> LinearizedErrors:
+        """Return the exact errors at ``best``, linearized in what the prior leaves open."""
+        return self._errors.linearized(self.best(prior), prior.deviations.nonzero()[0])
 
-    def cost(self, state: State, noise: float) -> float:
-        """Return the exact cost of the observations at a state, for keypoints of this noise (pixels)."""
-        here = self._errors.linearized(state, EVERY[:0])
+    def noise(self, here: LinearizedErrors) -> float:
+        """Return the noise of keypoints (pixels) that errors show."""
+        return max(LEAST_NOISE, self._noise * self._errors.system(here, self._noise).spread)
+
+    def cost(self, here: LinearizedErrors, noise: float) -> float:
+        """Return the cost of errors, for keypoints of this noise (pixels)."""
         return self._errors.system(here, noise).cost / self._correlation

@@ -126,7 +126,7 @@ class State:
         return State(self.rotation @ rotation_matrix(step[3:6]), position, camera)
 
     def pose(self) -> SE3:
-        return SE3(torch.from_numpy(self.rotation), torch.from_numpy(self.position)).normalized()
+        return SE3(torch.from_numpy(self.rotation), torch.from_numpy(self.position)).polished()
 
 
 @dataclass(frozen=True, eq=False)
