@@ -16,8 +16,7 @@ from bidnerf_core import InputError, Localizer, Outcome, Tracker, TrackerConfig
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.tensors import read_tensors_and_metadata
-from bidnerf_core.localization.tracking.answers import METHOD
-from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
+from bidnerf_core.localization.tracking.state import METHOD, CorrectedCamera
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.testing.textured_field import CAMERA, textured_map, view
 from flights import (

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from bidnerf_core.localization import Outcome, Verdict
-from bidnerf_core.localization.tracking.alignment import measured_cloud
-from bidnerf_core.localization.tracking.judging import (
+from bidnerf_core.localization.tracking.measuring import (
     as_certain_as_usual,
     not_by_chance,
     precise_enough,
     shape_verdict,
     unconfirmed,
 )
+from bidnerf_core.localization.tracking.surface import measured_cloud
 from flights import flight_frame, without_depth
 
 ACCEPTED = Verdict(Outcome.CONVERGED, "30 landmarks agree")

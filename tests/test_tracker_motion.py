@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from bidnerf_core import SE3, InputError
-from bidnerf_core.localization.tracking.clock import Clock
-from bidnerf_core.localization.tracking.motion import LONGEST_GAP, Motion, PoseEstimate, pixel_radius
-from bidnerf_core.localization.tracking.single_pose import retracted, update_between
+from bidnerf_core.geometry.rotations import retracted, update_between
+from bidnerf_core.localization.tracking.motion import LONGEST_GAP, Clock, Motion, PoseEstimate, pixel_radius
 
 VELOCITY = torch.tensor([0.3, -0.1, 0.2, 0.2, 0.4, -0.1], dtype=torch.float64)
 

@@ -20,19 +20,19 @@ from bidnerf_core.localization import (
     descend,
 )
 from bidnerf_core.localization.covariance import FINEST
-from bidnerf_core.localization.tracking.alignment import (
-    DEPTH_MEASUREMENTS,
-    aligned,
-    fused_with_surface,
-    measured_cloud,
-)
 from bidnerf_core.localization.tracking.flow import alike
 from bidnerf_core.localization.tracking.measuring import followed
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
-from bidnerf_core.localization.tracking.odometry import LEAST_CORNERS, Odometry
 from bidnerf_core.localization.tracking.points import FollowedPoints
-from bidnerf_core.localization.tracking.shape import fit_shape
+from bidnerf_core.localization.tracking.recognition import LEAST_CORNERS, Odometry
 from bidnerf_core.localization.tracking.state import TrackerState
+from bidnerf_core.localization.tracking.surface import (
+    DEPTH_MEASUREMENTS,
+    aligned,
+    fit_shape,
+    fused_with_surface,
+    measured_cloud,
+)
 from bidnerf_core.mapping.landmarks.features import grey_image
 from bidnerf_core.results.errors import normalized_error_squared, pose_error
 from bidnerf_core.testing.textured_field import textured_map

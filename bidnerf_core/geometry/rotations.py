@@ -1,12 +1,16 @@
-"""Rotations of single poses in NumPy, in microseconds; ``SE3`` and SciPy, made for batches, take a millisecond."""
+"""Rotations and updates of single poses in NumPy, in microseconds; ``SE3`` and SciPy, made for batches, take a millisecond."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bidnerf_core.geometry.se3 import SE3
 
 SERIES_ANGLE = 1e-4
 """Angle (radians) below which coefficients come from their series."""
@@ -48,3 +52,19 @@ def left_jacobian(phi: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
         return np.eye(3) + cross / 2 + cross @ cross / 6
     b, c = 2 * (math.sin(angle / 2) / angle) ** 2, (angle - math.sin(angle)) / angle**3
     return np.eye(3) + b * cross + c * cross @ cross
+
+
+def retracted(T: SE3, tangent: Float[Tensor, "6"]) -> SE3:
+    """Return the right update ``T @ exp(tangent)``, as ``SE3.retract`` does; float64, without derivatives."""
+    step = tangent.numpy()
+    rotation, translation = T.rotation.numpy(), T.translation.numpy()
+    moved = translation + rotation @ (left_jacobian(step[3:]) @ step[:3])
+    return SE3(torch.from_numpy(rotation @ rotation_matrix(step[3:])), torch.from_numpy(moved))
+
+
+def update_between(a: SE3, b: SE3) -> Float[Tensor, "6"]:
+    """Return the right update that leads from ``a`` to ``b``: ``(a.inverse() @ b).log()``; float64, without derivatives."""
+    back = a.rotation.numpy().T
+    phi = rotation_vector(back @ b.rotation.numpy())
+    rho = np.linalg.solve(left_jacobian(phi), back @ (b.translation - a.translation).numpy())
+    return torch.from_numpy(np.concatenate([rho, phi]))

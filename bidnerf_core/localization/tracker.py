@@ -16,28 +16,21 @@ from bidnerf_core.localization.localizer import Localizer, Start, map_with_dista
 from bidnerf_core.localization.problem import SceneMap
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.settings import TrackerConfig
-from bidnerf_core.localization.tracking.answers import (
-    METHOD,
-    tracked_localization,
-    unknown,
-)
-from bidnerf_core.localization.tracking.clock import Clock
-from bidnerf_core.localization.tracking.corrected_camera import after_search
-from bidnerf_core.localization.tracking.detection import LandmarkDetector
 from bidnerf_core.localization.tracking.flow import Grey
-from bidnerf_core.localization.tracking.judging import determined, shape_verdict
 from bidnerf_core.localization.tracking.measuring import (
     ByLandmarks,
     Measurement,
     by_colour,
     by_shape,
     by_surface,
+    determined,
     followed,
     is_vague,
+    shape_verdict,
 )
-from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate
-from bidnerf_core.localization.tracking.odometry import Odometry
+from bidnerf_core.localization.tracking.motion import Clock, Motion, PoseEstimate
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints
+from bidnerf_core.localization.tracking.recognition import LandmarkDetector, Odometry
 from bidnerf_core.localization.tracking.relocalization import (
     has_points,
     is_searchable,
@@ -46,7 +39,15 @@ from bidnerf_core.localization.tracking.relocalization import (
     search_due,
     typical_error,
 )
-from bidnerf_core.localization.tracking.state import TrackerState, load_tracker_state, save_state
+from bidnerf_core.localization.tracking.state import (
+    METHOD,
+    TrackerState,
+    after_search,
+    load_tracker_state,
+    save_state,
+    tracked_localization,
+    unknown,
+)
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.landmarks.features import grey_image, strongest
 

@@ -6,15 +6,16 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Generator
+from jaxtyping import Float
+from torch import Generator, Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
-from bidnerf_core.localization.by_colour import refine_by_colour
-from bidnerf_core.localization.covariance import INDEPENDENT
+from bidnerf_core.localization.by_colour import TYPICAL_ERRORS, refine_by_colour
+from bidnerf_core.localization.covariance import INDEPENDENT, position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
@@ -24,25 +25,24 @@ from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.search.landmark_query import pixel_threshold
 from bidnerf_core.localization.search.miscalibration import Miscalibration
 from bidnerf_core.localization.settings import ByColourConfig, TrackerConfig
-from bidnerf_core.localization.tracking.alignment import (
-    SURFACE_BIAS,
-    aligned,
-    fused_with_surface,
-    measured_cloud,
-)
-from bidnerf_core.localization.tracking.detection import (
+from bidnerf_core.localization.tracking.flow import Grey, alike, flow
+from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
+from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
+from bidnerf_core.localization.tracking.recognition import (
     Evidence,
     LandmarkDetector,
     flow_evidence,
     landmark_pose,
     well_spread,
 )
-from bidnerf_core.localization.tracking.flow import Grey, alike, flow
-from bidnerf_core.localization.tracking.judging import not_by_chance, precise_enough, unconfirmed
-from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
-from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
-from bidnerf_core.localization.tracking.shape import fit_shape
 from bidnerf_core.localization.tracking.state import TrackerState
+from bidnerf_core.localization.tracking.surface import (
+    SURFACE_BIAS,
+    aligned,
+    fit_shape,
+    fused_with_surface,
+    measured_cloud,
+)
 from bidnerf_core.mapping import SurfaceMap
 
 WIDEST = 0.4
@@ -275,3 +275,73 @@ def by_colour(
         answer.refined.T.normalized(), (1 - SURFACE_BIAS) * covariance, SURFACE_BIAS * covariance
     )
     return Measurement(pose, answer.verdict, answer.refined.loss, state)
+
+
+DETERMINED = 0.02, math.radians(3)
+"""Largest standard deviations of an accepted pose by depth or colour: share of the scene's extent, and radians."""
+
+
+def not_by_chance(verdict: Verdict, noise: float, threshold: float) -> Verdict:
+    """Return the verdict on followed landmarks, or a rejection if their ``noise`` (pixels) is what chance would give.
+
+    Points spread evenly over a disc of radius ``threshold`` (pixels) have a standard deviation of half that radius along each
+    axis. Where the flow has gone astray over a long interval, the landmarks agree no better than that.
+    """
+    if not verdict.accepted or noise <= threshold / 2:
+        return verdict
+    return Verdict(Outcome.AMBIGUOUS, f"{verdict.reason}, hardly better than by chance")
+
+
+def unconfirmed(verdict: Verdict) -> Verdict:
+    """Reject a pose by few followed landmarks where none are recognised around it: it may have drifted away."""
+    if not verdict.accepted:
+        return verdict
+    return Verdict(
+        Outcome.TOO_FEW_MATCHES,
+        f"{verdict.reason}, but the image does not confirm these few that were followed",
+    )
+
+
+def precise_enough(verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float) -> Verdict:
+    """Return the verdict, or a rejection if the position is too uncertain for the ``distance`` (metres) of what is in view."""
+    deviation = position_deviation(covariance)
+    if not verdict.accepted or deviation <= LandmarkThresholds().precision * distance:
+        return verdict
+    why = f"but the position is uncertain by {deviation / distance:.1%} of the distance"
+    return Verdict(Outcome.IMPRECISE, f"{verdict.reason}, {why}")
+
+
+def determined(verdict: Verdict, covariance: Float[Tensor, "6 6"], extent: float) -> Verdict:
+    """Return the verdict, or a rejection if the pose's covariance is large for a scene of this ``extent`` (metres)."""
+    translation, rotation = (float(part.max().sqrt()) for part in covariance.diagonal().split(3))
+    if not verdict.accepted or (translation <= DETERMINED[0] * extent and rotation <= DETERMINED[1]):
+        return verdict
+    why = f"one standard deviation is {translation:.3g} m and {math.degrees(rotation):.2g} deg"
+    return Verdict(Outcome.UNDETERMINED, why)
+
+
+def as_certain_as_usual(verdict: Verdict, covariance: Float[Tensor, "6 6"], typical: float) -> Verdict:
+    """Return the verdict, or a rejection if the position is far less certain than those of the map's own images.
+
+    ``typical`` is their median error, metres; 0 where it is not known. Frames without colours are judged by it: along a
+    corridor, nothing in them shows the position, which is then predicted rather than measured.
+    """
+    deviation = position_deviation(covariance)
+    if not verdict.accepted or typical <= 0 or deviation <= TYPICAL_ERRORS * typical:
+        return verdict
+    why = f"but the position is uncertain by {deviation:.3g} m, that of images by {typical:.3g} m"
+    return Verdict(Outcome.IMPRECISE, f"{verdict.reason}, {why}")
+
+
+def shape_verdict(
+    verdict: Verdict, covariance: Float[Tensor, "6 6"], distance: float, typical: float, stamped: bool
+) -> Verdict:
+    """Judge a pose by depth without colours, which relies on the motion before it as well.
+
+    Without a time stamp, nothing determines how far the camera has moved in the directions that the shape leaves open.
+    """
+    if verdict.accepted and not stamped:
+        return Verdict(
+            Outcome.IMPRECISE, f"{verdict.reason}, but without a time stamp the motion is not known"
+        )
+    return as_certain_as_usual(precise_enough(verdict, covariance, distance), covariance, typical)

@@ -1,9 +1,10 @@
-"""The state of a tracker between two frames, and the file that it can be kept in."""
+"""What a tracker carries from frame to frame, the file that it can be kept in, and the answers that it gives."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, fields
+import math
+from dataclasses import astuple, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +12,96 @@ import torch
 from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
+from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import LARGEST_LENGTH
+from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import from_plain, parse_json, to_plain
 from bidnerf_core.io.tensors import read_tensors_and_metadata
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.miscalibration import Miscalibration
-from bidnerf_core.localization.tracking.clock import Clock
-from bidnerf_core.localization.tracking.corrected_camera import CorrectedCamera
 from bidnerf_core.localization.tracking.flow import Grey
-from bidnerf_core.localization.tracking.motion import Motion
+from bidnerf_core.localization.tracking.motion import Clock, Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.mapping.tensors import Kinds, check_kinds, check_range
+
+
+@dataclass(frozen=True)
+class CorrectedCamera:
+    """The intrinsics that a frame states, and the better ones that were found for it."""
+
+    given: Intrinsics
+    found: Intrinsics
+    # Whether the frame's focal length was approximate; frames of the other kind are from another source.
+    approximate: bool
+
+    def applies_to(self, frame: Frame) -> bool:
+        """Return whether the intrinsics of a frame come from the same source."""
+        return frame.focal_is_approximate == self.approximate
+
+    def focal_factor(self, frame: Frame) -> float:
+        """Return the ratio of a frame's corrected to its given focal length: the geometric mean across and down."""
+        if not self.applies_to(frame):
+            return 1.0
+        return math.sqrt(self.found.fx * self.found.fy / (self.given.fx * self.given.fy))
+
+    def corrected(self, frame: Frame) -> Frame:
+        """Return the frame with corrected intrinsics."""
+        return replace(frame, intrinsics=self.changed(frame.intrinsics)) if self.applies_to(frame) else frame
+
+    def stated_in(self, answer: Localization, frame: Frame) -> Localization:
+        """Return the answer for a frame, completed by the intrinsics that replace the frame's own, if any do."""
+        taken = self.corrected(frame).intrinsics
+        corrected = None if taken == frame.intrinsics else taken
+        return replace(answer, focal_factor=self.focal_factor(frame), intrinsics=corrected)
+
+    def changed(self, camera: Intrinsics) -> Intrinsics:
+        """Return corrected intrinsics; those of another focus or size are changed in the same proportion."""
+        given, found = self.given, self.found
+        if camera == given:
+            return found
+        x, y = camera.width / given.width, camera.height / given.height
+        return replace(
+            camera, fx=camera.fx * found.fx / given.fx, fy=camera.fy * found.fy / given.fy,
+            cx=camera.cx + x * (found.cx - given.cx), cy=camera.cy + y * (found.cy - given.cy),
+            distortion=found.distortion if camera.distortion == given.distortion else camera.distortion,
+        )  # fmt: skip
+
+    def then(self, later: CorrectedCamera) -> CorrectedCamera:
+        """Return this correction followed by the correction ``later``."""
+        return replace(self, found=later.changed(self.found))
+
+    def plain(self) -> list[Any]:
+        """Return the camera as JSON values."""
+        return [list(astuple(self.given)), list(astuple(self.found)), self.approximate]
+
+    @staticmethod
+    def from_plain(values: list[Any]) -> CorrectedCamera:
+        """Return the camera from JSON values as ``plain`` returns them."""
+        given, found = (_camera(*camera) for camera in values[:2])
+        return CorrectedCamera(given, found, values[2])
+
+
+def _camera(
+    fx: float, fy: float, cx: float, cy: float, width: int, height: int, distortion: list[float]
+) -> Intrinsics:
+    return Intrinsics(fx, fy, cx, cy, width, height, tuple(distortion))
+
+
+def after_search(
+    frame: Frame, found: Intrinsics, before: CorrectedCamera | None
+) -> tuple[Frame, CorrectedCamera]:
+    """Return a frame with the intrinsics that a search found for it, and the correction for later frames.
+
+    ``before`` is the correction that was already applied to the frame, if any.
+    """
+    later = CorrectedCamera(frame.intrinsics, found, frame.focal_is_approximate)
+    if before is not None and before.applies_to(frame):
+        return later.corrected(frame), before.then(later)
+    return later.corrected(frame), later
+
 
 STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 6
 KINDS: Kinds = {
@@ -196,3 +274,37 @@ def _pose_tensors(name: str, T: SE3) -> dict[str, Tensor]:
 
 def _pose(name: str, tensors: dict[str, Tensor]) -> SE3:
     return SE3(tensors[f"{name}.rotation"], tensors[f"{name}.translation"])
+
+
+METHOD = "track"
+"""Method name of the poses that a tracker finds."""
+
+
+def tracked_localization(motion: Motion, verdict: Verdict, predicted: Motion, loss: float) -> Localization:
+    """Return the state of the motion as the answer for a frame; its path leads from the prediction to the pose."""
+    T = motion.T_world_camera
+    return Localization(
+        T_world_camera=T,
+        outcome=verdict.outcome,
+        reason=verdict.reason,
+        steps=1,
+        seconds=0.0,
+        loss=loss,
+        method=METHOD,
+        poses=SE3.stack([predicted.T_world_camera, T]),
+        losses=torch.tensor([loss], dtype=torch.float64),
+        covariance=motion.covariance,
+    )
+
+
+def unknown(start: SE3 | None, extent: float) -> Localization:
+    """Return the answer for a frame when neither its pose nor that of any frame before it is known.
+
+    ``extent`` (metres) is the size of the scene, in which the camera may be anywhere.
+    """
+    T = SE3.identity() if start is None else start
+    covariance = torch.diag(torch.tensor([extent] * 3 + [math.pi] * 3).double() ** 2)
+    return Localization(
+        T, Outcome.TOO_FEW_MATCHES, "the beginning of the sequence has not been recognised yet", 0, 0.0, 1.0,
+        METHOD, T[None], torch.zeros(0, dtype=torch.float64), covariance,
+    )  # fmt: skip

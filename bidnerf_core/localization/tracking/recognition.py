@@ -1,4 +1,7 @@
-"""Recognition of the map's landmarks around a predicted pose, and the evidence that a pose by landmarks is right."""
+"""Points to follow: landmarks that are recognised around a predicted pose, and corners whose depth was measured.
+
+Landmarks tell where the camera is in the map; corners, the motion between consecutive frames with depth (odometry).
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.depth.sensors import UNKNOWN, DepthNoise
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.chance import log10_nfa
@@ -29,10 +33,13 @@ from bidnerf_core.localization.search.landmark_query import LandmarkQuery, pixel
 from bidnerf_core.localization.search.matching import EXHAUSTIVE, LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import Miscalibration, TakenIntrinsics
 from bidnerf_core.localization.search.unguided import unguided_matches
-from bidnerf_core.localization.tracking.points import FollowedPoints, PointFit, fit_pose, with_motion
+from bidnerf_core.localization.tracking.flow import Grey, corners
+from bidnerf_core.localization.tracking.motion import Motion
+from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, NOMINAL
 from bidnerf_core.mapping.geometry.resection import resect
 from bidnerf_core.mapping.landmarks.features import Features
+from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
 NEARBY = EXHAUSTIVE
@@ -235,3 +242,66 @@ def _matches_within(query: LandmarkQuery, T_world_camera: SE3, radius: float) ->
     return matches[
         torch.linalg.vector_norm(query.observed(matches).residuals(T_world_camera), dim=-1) <= radius
     ]
+
+
+LEAST_CORNERS = 20
+"""Least number of corners that must agree with a motion."""
+LEAST_SHARE = 0.5
+"""Least share of the corners that must agree with it."""
+SIGNIFICANT_NFA = -6.0
+"""Largest logarithm of the number of such agreements expected by chance."""
+REPLENISHED = 0.5
+"""Share of ``count`` below which new corners are detected."""
+CORRELATION = 4.0
+"""Number of corners that count as one, since the errors of neighbouring depths are correlated."""
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Follows up to ``count`` corners whose depth was measured, with errors of this ``noise``."""
+
+    count: int
+    noise: DepthNoise = UNKNOWN.noise
+
+    def moved(
+        self, frame: Frame, points: FollowedPoints, motion: Motion, start: SE3, seconds: float
+    ) -> tuple[Motion, FollowedPoints] | None:
+        """Return the state ``seconds`` after ``motion`` and the corners that agree with it; None if they are too few.
+
+        ``start`` is the predicted pose, at which the fit begins.
+        """
+        threshold = pixel_threshold(frame.intrinsics)
+        found = fit_pose(points.observed(frame), start, threshold / 2, threshold, CORRELATION)
+        if found is None:
+            return None
+        evidence = flow_evidence(found, frame.intrinsics)
+        if (
+            evidence.agreeing < max(LEAST_CORNERS, LEAST_SHARE * len(points))
+            or evidence.log10_nfa > SIGNIFICANT_NFA
+        ):
+            return None
+        relative = found.fit.covariance
+        if not bool(relative.isfinite().all()):
+            return None
+        return motion.moved(found.T_world_camera, relative, seconds), points[found.inliers]
+
+    def replenished(
+        self, frame: Frame, image: Grey | None, points: FollowedPoints, T_world_camera: SE3
+    ) -> FollowedPoints:
+        """Return the corners among ``points``, or new ones at the pose of this frame where they have become few."""
+        points = points[points.landmark == FRESH]
+        if image is None or not frame.has_depth or len(points) >= REPLENISHED * self.count:
+            return points
+        apart = 0.7 * (image.shape[0] * image.shape[1] / self.count) ** 0.5
+        pixels = corners(image, self.count, apart)
+        depth = measured_depth(frame, pixels)
+        pixels, depth = pixels[depth > 0], depth[depth > 0]
+        ray = frame.intrinsics.unproject(pixels.double())
+        across = 0.5 * depth / frame.intrinsics.fx
+        return FollowedPoints(
+            pixels,
+            T_world_camera.apply(ray * depth[:, None]),
+            torch.stack([across, self.noise.deviation(depth)], dim=-1),
+            -T_world_camera.rotate(torch.nn.functional.normalize(ray, dim=-1)),
+            torch.full((len(pixels),), FRESH, dtype=torch.long),
+        )
