@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import astuple, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
 from safetensors.torch import save as tensors_to_bytes
@@ -73,22 +73,6 @@ class CorrectedCamera:
         """Return this correction followed by the correction ``later``."""
         return replace(self, found=later.changed(self.found))
 
-    def plain(self) -> list[Any]:
-        """Return the camera as JSON values."""
-        return [list(astuple(self.given)), list(astuple(self.found)), self.approximate]
-
-    @staticmethod
-    def from_plain(values: list[Any]) -> CorrectedCamera:
-        """Return the camera from JSON values as ``plain`` returns them."""
-        given, found = (_camera(*camera) for camera in values[:2])
-        return CorrectedCamera(given, found, values[2])
-
-
-def _camera(
-    fx: float, fy: float, cx: float, cy: float, width: int, height: int, distortion: list[float]
-) -> Intrinsics:
-    return Intrinsics(fx, fy, cx, cy, width, height, tuple(distortion))
-
 
 def after_search(
     frame: Frame, found: Intrinsics, before: CorrectedCamera | None
@@ -102,6 +86,8 @@ def after_search(
         return later.corrected(frame), before.then(later)
     return later.corrected(frame), later
 
+
+R = TypeVar("R")
 
 STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 6
 KINDS: Kinds = {
@@ -148,54 +134,51 @@ class TrackerState:
 
 @dataclass(frozen=True)
 class StoredNumbers:
-    """The numbers of a state, as its file holds them."""
+    """The numbers of a state, as its file holds them; names as in ``TrackerState`` and ``Motion``."""
 
-    now: float | None
-    interval: float
+    clock: Clock
+    camera: CorrectedCamera | None
     frames: int
     lost: int
     searchable: int
     waited: float
     sought: int
     age: int
-    usual_distance: float | None  # None for infinity, which JSON does not have
+    calibrated: int | None
     noise: float
     moves: bool
-    reach: float | None  # of the motion; None where there is none
+    usual_distance: float | None  # None for infinity, which JSON does not have
+    reach: float | None  # None where there is no motion
     agility: float | None
-    calibrated: int | None
-    camera: list[Any] | None  # as ``CorrectedCamera.plain`` returns it
 
     def __post_init__(self) -> None:
         for name in ("frames", "lost", "searchable", "waited", "sought", "age"):
             if getattr(self, name) < 0:
                 raise InputError(f"{name} is {getattr(self, name)}, expected 0 or more")
-        if self.interval <= 0 or self.noise <= 0:
+        if self.clock.interval <= 0 or self.noise <= 0:
             raise InputError("an interval or a noise of 0 or less, expected positive numbers")
         if (self.reach is None) != (self.agility is None):
             raise InputError("half of a motion, expected both reach and agility, or neither")
         if self.reach is not None and not 0 < self.reach <= LARGEST_LENGTH:
             raise InputError(f"reach is {self.reach}, expected a distance")
 
+    @staticmethod
+    def of(state: TrackerState) -> StoredNumbers:
+        distance = None if math.isinf(state.usual_distance) else state.usual_distance
+        reach, agility = (None, None) if state.motion is None else (state.motion.reach, state.motion.agility)
+        same = {f.name: getattr(state, f.name) for f in fields(StoredNumbers) if hasattr(state, f.name)}
+        return StoredNumbers(**same | {"usual_distance": distance}, reach=reach, agility=agility)
+
 
 def save_state(path: Path, state: TrackerState, key: str) -> None:
     """Write a state as safetensors, atomically; ``key`` identifies the map."""
-    motion = state.motion
-    numbers = StoredNumbers(
-        state.clock.now, state.clock.interval, state.frames, state.lost, state.searchable, state.waited, state.sought, state.age,
-        _written(state.usual_distance), state.noise, state.moves, None if motion is None else motion.reach,
-        None if motion is None else motion.agility, state.calibrated, None if state.camera is None else state.camera.plain(),
-    )  # fmt: skip
-    tensors = {f"points.{f.name}": getattr(state.points, f.name) for f in fields(FollowedPoints)}
-    tensors |= {
-        f"miscalibration.{f.name}": getattr(state.miscalibration, f.name) for f in fields(Miscalibration)
-    }
+    tensors = _tensors_of("points", state.points) | _tensors_of("miscalibration", state.miscalibration)
     if state.image is not None:
         tensors["image"] = torch.from_numpy(state.image)
     if state.motion is not None:
-        tensors |= _pose_tensors("motion", state.motion.T_world_camera)
-        tensors |= {f"motion.{name}": getattr(state.motion, name) for name in ("velocity", "noise", "bias")}
-    content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": to_plain(numbers)}
+        tensors |= _tensors_of("motion", state.motion) | _tensors_of("motion", state.motion.T_world_camera)
+    numbers = to_plain(StoredNumbers.of(state))
+    content = {"format": STATE_FORMAT, "version": STATE_VERSION, "map": key, "state": numbers}
     metadata = {"bidnerf": json.dumps(content, allow_nan=False)}
     write_file(
         path,
@@ -229,18 +212,18 @@ def _read(path: Path, key: str) -> tuple[StoredNumbers, dict[str, Tensor]]:
 
 def _state(numbers: StoredNumbers, tensors: dict[str, Tensor]) -> TrackerState:
     _check_tensors(tensors, numbers.reach is not None)
-    motion = None
-    if numbers.reach is not None and numbers.agility is not None:
+    values = {f.name: getattr(numbers, f.name) for f in fields(numbers)}
+    reach, agility = values.pop("reach"), values.pop("agility")
+    if reach is not None:
         velocity, noise, bias = (tensors[f"motion.{name}"] for name in ("velocity", "noise", "bias"))
-        motion = Motion(_pose("motion", tensors), velocity, noise, bias, numbers.reach, numbers.agility)
-    points = FollowedPoints(*(tensors[f"points.{f.name}"] for f in fields(FollowedPoints)))
-    miscalibration = Miscalibration(*(tensors[f"miscalibration.{f.name}"] for f in fields(Miscalibration)))
+        T = _record(SE3, "motion", tensors)
+        values["motion"] = Motion(T, velocity, noise, bias, reach, agility)
+    if values["usual_distance"] is None:
+        del values["usual_distance"]
     return TrackerState(
-        Clock(numbers.now, numbers.interval), motion, numbers.frames, numbers.lost, numbers.searchable, numbers.waited, points,
-        tensors["image"].numpy() if "image" in tensors else None, numbers.sought, numbers.age,
-        float("inf") if numbers.usual_distance is None else numbers.usual_distance, miscalibration, numbers.calibrated,
-        None if numbers.camera is None else CorrectedCamera.from_plain(numbers.camera), numbers.noise,
-        numbers.moves,
+        **values, points=_record(FollowedPoints, "points", tensors),
+        miscalibration=_record(Miscalibration, "miscalibration", tensors),
+        image=tensors["image"].numpy() if "image" in tensors else None,
     )  # fmt: skip
 
 
@@ -258,22 +241,21 @@ def _check_tensors(tensors: dict[str, Tensor], moving: bool) -> None:
     if not moving:
         return
     check_range(tensors, "motion.velocity", -LARGEST_LENGTH, LARGEST_LENGTH)
-    if not bool(_pose("motion", tensors).is_rigid()):
+    if not bool(_record(SE3, "motion", tensors).is_rigid()):
         raise ValueError("the pose of the motion is not rigid")
     if any(bool((tensors[f"motion.{name}"].diagonal() < 0).any()) for name in ("noise", "bias")):
         raise ValueError("a variance of the motion is negative")
 
 
-def _written(number: float) -> float | None:
-    return None if number == float("inf") else number
+def _tensors_of(name: str, record: Any) -> dict[str, Tensor]:
+    """Return the tensors among a record's fields, under names that begin with ``name``."""
+    values = {f"{name}.{f.name}": getattr(record, f.name) for f in fields(record)}
+    return {key: value for key, value in values.items() if isinstance(value, Tensor)}
 
 
-def _pose_tensors(name: str, T: SE3) -> dict[str, Tensor]:
-    return {f"{name}.rotation": T.rotation, f"{name}.translation": T.translation}
-
-
-def _pose(name: str, tensors: dict[str, Tensor]) -> SE3:
-    return SE3(tensors[f"{name}.rotation"], tensors[f"{name}.translation"])
+def _record(kind: type[R], name: str, tensors: dict[str, Tensor]) -> R:
+    """Return a record all of whose fields are tensors, from those that ``_tensors_of`` returns."""
+    return kind(**{f.name: tensors[f"{name}.{f.name}"] for f in fields(cast(Any, kind))})
 
 
 METHOD = "track"

@@ -79,23 +79,9 @@ def fused_with_surface(
 
     A share ``SURFACE_BIAS`` of the variance that the points contribute is bias, as in ``aligned``.
     """
-    about = cloud.pivot
     cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
-    here, variance = cost.with_variance(pose.T_world_camera[None])
-    weight = DEPTH_MEASUREMENTS / max(float(variance[0]), LEAST_VARIANCE)
-    at_camera = about.update_at_camera(pose.T_world_camera)
-    prior = at_camera.T @ torch.linalg.inv(pose.covariance) @ at_camera
-    T, moved = pose.T_world_camera, torch.zeros(6, dtype=torch.float64)
-    for number in range(steps):
-        here = cost(T[None]) if number else here
-        hessian, gradient = weight * here.hessian[0], weight * here.gradient[0]
-        # The steps are short enough to be added as vectors; the prior pulls back by their sum.
-        step = -torch.linalg.solve(hessian + prior, gradient + prior @ moved)
-        T, moved = retracted(T, at_camera @ step), moved + step
-        if float(torch.linalg.vector_norm(step)) < ALIGNED_STEP:
-            break
-    to_pivot = torch.linalg.inv(at_camera)
-    information = to_pivot.T @ hessian @ to_pivot
+    unmoved = torch.zeros(6, dtype=torch.float64)
+    T, _, information, _ = _descended(cost, pose, pose.T_world_camera, unmoved, steps, whole=True)
     return fused_with_points(T, pose, information)
 
 
@@ -104,7 +90,7 @@ def fused_with_points(T: SE3, pose: PoseEstimate, information: Float[Tensor, "6 
     fused = torch.linalg.inv(torch.linalg.inv(pose.covariance) + information)
     kept, by_points = torch.eye(6).double() - fused @ information, fused @ information @ fused
     return PoseEstimate(
-        T.normalized(),
+        T.polished(),
         kept @ pose.noise @ kept.T + (1 - SURFACE_BIAS) * by_points,
         kept @ pose.bias @ kept.T + SURFACE_BIAS * by_points,
     )
@@ -186,7 +172,7 @@ def fit_shape(surface: SurfaceMap, cloud: PointCloud, predicted: PoseEstimate, s
     kept = information
     for distance in (spread, finest) if spread > 1.5 * finest else (finest,):
         cost = SurfaceCost(surface, cloud, PointScales(distance, colour_weight=0.0))
-        T, moved, information, kept = _descended(cost, predicted, T, moved)
+        T, moved, information, kept = _descended(cost, predicted, T, moved, SHAPE_STEPS)
     judge = SurfaceCost(
         surface, cloud, PointScales(min(JUDGED * surface.extent, JUDGED_CELLS * surface.cell))
     )
@@ -198,17 +184,25 @@ def fit_shape(surface: SurfaceMap, cloud: PointCloud, predicted: PoseEstimate, s
 
 
 def _descended(
-    cost: SurfaceCost, predicted: PoseEstimate, T: SE3, moved: Float[Tensor, "6"]
+    cost: SurfaceCost,
+    predicted: PoseEstimate,
+    T: SE3,
+    moved: Float[Tensor, "6"],
+    steps: int,
+    whole: bool = False,
 ) -> tuple[SE3, Float[Tensor, "6"], Float[Tensor, "6 6"], Float[Tensor, "6 6"]]:
-    """Return the pose, its update of the prediction, the points' information and the projection on what they determine."""
+    """Return the pose, its update of the prediction, the points' information and the projection on what they determine.
+
+    ``whole``: weak directions are not left to the prediction.
+    """
     about = cost.cloud.pivot
     at_pivot = torch.linalg.inv(about.update_at_camera(T))
     prior = torch.linalg.inv(predicted.covariance)
-    for _ in range(SHAPE_STEPS):
+    for _ in range(steps):
         here, variance = cost.with_variance(T[None])
         # The residuals at a prediction that is off do not reflect the noise, so it is estimated anew in each step.
         weight = DEPTH_MEASUREMENTS / max(float(variance[0]), LEAST_VARIANCE)
-        kept = _determined(here.hessian[0], cost.cloud)
+        kept = torch.eye(6).double() if whole else _determined(here.hessian[0], cost.cloud)
         hessian = weight * at_pivot.T @ kept.T @ here.hessian[0] @ kept @ at_pivot
         gradient = weight * at_pivot.T @ kept.T @ here.gradient[0]
         # The steps are short enough to be added as vectors; the prior pulls back by their sum.
