@@ -14,7 +14,7 @@ from bidnerf_core.localization.acceptance import is_blank
 from bidnerf_core.localization.by_image_search import MANY_LANDMARKS
 from bidnerf_core.localization.by_landmarks import answer_by_landmarks, localization_by_landmarks
 from bidnerf_core.localization.localizer import Localizer
-from bidnerf_core.localization.problem import SceneMap
+from bidnerf_core.localization.problem import Problem, SceneMap
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.settings import LEAST_POINTS
 from bidnerf_core.localization.twin_rejection import between_twins
@@ -48,16 +48,10 @@ def relocalized(
     that could be searched, 0 at the beginning of a sequence.
     """
     if localizer.matches_landmarks:
-        began, problem = time.perf_counter(), localizer.problem(frame)
-        assert problem.matcher is not None
-        answer = answer_by_landmarks(problem, problem.matcher, 0, seed)
-        if answer is not None:
-            near = predicted if lost <= FIRST_FULL_SEARCH else None  # later predictions have drifted
-            answer = between_twins(problem, problem.matcher, answer, near, 0, seed)
-        found = None if answer is None else localization_by_landmarks(problem, answer, began)
-        if found is not None and found.converged:
-            return found
-        if not _searched(localizer, frame, lost):
+        problem = localizer.problem(frame)
+        near = predicted if lost <= FIRST_FULL_SEARCH else None  # later predictions have drifted
+        found = _recognised(problem, near, seed)
+        if (found is not None and found.converged) or not _searched(localizer, frame, lost):
             return found
         return localizer.solved(replace(problem, start=predicted), seed)
     try:
@@ -66,6 +60,17 @@ def relocalized(
         if lost:  # the sequence has begun, so this frame is to blame and not the map or the settings
             return None
         raise
+
+
+def _recognised(problem: Problem, near: SE3 | None, seed: int) -> Localization | None:
+    """Return the pose by landmarks alone, without rendering; of two places that look alike, the one at ``near``."""
+    assert problem.matcher is not None
+    began = time.perf_counter()
+    answer = answer_by_landmarks(problem, problem.matcher, 0, seed)
+    if answer is None:
+        return None
+    answer = between_twins(problem, problem.matcher, answer, near, 0, seed)
+    return localization_by_landmarks(problem, answer, began)
 
 
 def typical_error(localizer: Localizer) -> float:
