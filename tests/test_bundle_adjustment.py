@@ -11,8 +11,8 @@ from torch import Tensor
 from bidnerf_core import SE3
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.mapping import Adjustment, PosePrior, adjusted
-from bidnerf_core.mapping.geometry.bundle_adjustment import MeasuredSightings, linearized
-from bidnerf_core.mapping.geometry.triangulation import Sightings
+from bidnerf_core.mapping.geometry.bundle_adjustment import SETTLED, linearized
+from bidnerf_core.mapping.geometry.observations import Sightings
 from landmark_scene import looking_in
 
 VIEWS, POINTS, FOCAL = 12, 150, 300.0
@@ -25,7 +25,6 @@ class Capture:
     """Cameras on a ring that see all points of a box, each with an error."""
 
     noise: float = 0.0  # pixels
-    depth: float = 0.0  # relative error; nothing is measured for 0
     outliers: float = 0.0  # share of the sightings that are anywhere
     moving: bool = False  # whether the cameras move while rows are exposed, by ``motions``
 
@@ -37,7 +36,7 @@ class Capture:
     def points(self) -> Tensor:
         return 2 * torch.rand(POINTS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 1
 
-    def seen(self, given: SE3, correlation: float = 1.0) -> MeasuredSightings:
+    def seen(self, given: SE3) -> Sightings:
         """What the true cameras saw, under the ``given`` poses."""
         generator = torch.Generator().manual_seed(2)
         image = torch.arange(VIEWS).repeat_interleave(POINTS)
@@ -49,11 +48,17 @@ class Capture:
         flat = local[:, :2] / local[:, 2:] + self.noise / FOCAL * noise[:, :2]
         wrong = torch.rand(len(image), generator=generator) < self.outliers
         flat = torch.where(wrong[:, None], 0.3 * noise[:, [1, 2]], flat)
-        depth = local[:, 2] * (1 + self.depth * noise[:, 2]) if self.depth else torch.zeros(len(image))
         focal = torch.full((len(image),), FOCAL, dtype=torch.float64)
-        sightings = Sightings(point, given.rotation[image].mT, given.translation[image], flat, focal)
-        accuracy = max(0.1, self.noise), max(1e-3, self.depth)
-        return MeasuredSightings(sightings, image, depth.double(), *accuracy, correlation, times)
+        T = given[image]
+        return Sightings(point, image, T.rotation.mT, T.translation, flat, focal, times)
+
+    def adjusted(self, given: SE3, prior: PosePrior, settled: float = SETTLED) -> Adjustment:
+        """What an adjustment finds, from the ``given`` poses and the true points."""
+        return adjusted(self.seen(given), at_rest(given, self.points), prior, self.accuracy, settled=settled)
+
+    @property
+    def accuracy(self) -> float:
+        return max(0.1, self.noise)
 
     def shifts(self, motion: Tensor) -> Tensor:
         """Where each camera sees each point in its last row, pixels; what image motions differ in, if translation and
@@ -62,6 +67,10 @@ class Capture:
         last = self.poses @ SE3.exp(0.5 * motion)
         local = last[:, None].inverse().apply(self.points)
         return FOCAL * local[..., :2] / local[..., 2:]
+
+
+def at_rest(T: SE3, points: Tensor) -> Adjustment:
+    return Adjustment(T, points, AT_REST_ALL)
 
 
 def errors(seed: int = 3) -> Tensor:
@@ -91,25 +100,19 @@ def off(found: SE3, true: SE3) -> tuple[float, float]:
     return translation, rotation
 
 
-def spread(T: SE3) -> float:
-    """The size of the arrangement of the cameras, metres."""
-    return float((T.translation - T.translation.mean(0)).norm())
-
-
-@pytest.mark.parametrize("depth", [0.0, 0.02])
 @pytest.mark.parametrize("motion", [STILL, MotionPrior(MILLIMETRES, RADIANS)])
-def test_the_gradient_is_the_numerical_one(depth: float, motion: MotionPrior) -> None:
-    capture = Capture(noise=1.0, depth=depth, outliers=0.1, moving=motion != STILL)
+def test_the_gradient_is_the_numerical_one(motion: MotionPrior) -> None:
+    capture = Capture(noise=1.0, outliers=0.1, moving=motion != STILL)
     given = capture.poses.retract(errors())
-    seen, held = capture.seen(given, correlation=3.0), prior(given, motion)
+    seen, held = capture.seen(given), prior(given, motion)
     points = capture.points + 0.01
 
     def cost(of_images: Tensor, of_points: Tensor) -> float:
         T = capture.poses.retract(of_images[:, :6])
         moved = Adjustment(T, points + of_points, AT_REST_ALL if motion == STILL else of_images[:, 6:])
-        return linearized(seen, moved, held).cost
+        return linearized(seen, moved, held, 1.0, 3.0).cost
 
-    system = linearized(seen, Adjustment(capture.poses, points, AT_REST_ALL), held)
+    system = linearized(seen, at_rest(capture.poses, points), held, 1.0, 3.0)
     unknowns = 6 if motion == STILL else 12
     still = torch.zeros(VIEWS, unknowns, dtype=torch.float64)
     fixed, step = torch.zeros(POINTS, 3, dtype=torch.float64), 1e-6
@@ -127,11 +130,9 @@ def test_the_gradient_is_the_numerical_one(depth: float, motion: MotionPrior) ->
 
 @pytest.mark.parametrize(("motion", "size"), [(STILL, 6), (MotionPrior(MILLIMETRES, RADIANS), 12)])
 def test_the_schur_complement_gives_the_step_of_the_whole_equations(motion: MotionPrior, size: int) -> None:
-    capture = Capture(noise=1.0, depth=0.02)
+    capture = Capture(noise=1.0)
     given = capture.poses.retract(errors())
-    system = linearized(
-        capture.seen(given), Adjustment(given, capture.points, AT_REST_ALL), prior(given, motion)
-    )
+    system = linearized(capture.seen(given), at_rest(given, capture.points), prior(given, motion), 1.0)
     rows, columns = size * VIEWS, 3 * POINTS
     whole = torch.zeros(rows + columns, rows + columns, dtype=torch.float64)
     for i, block in enumerate(system.image_blocks):
@@ -151,10 +152,9 @@ def test_the_schur_complement_gives_the_step_of_the_whole_equations(motion: Moti
     torch.testing.assert_close(found, torch.linalg.solve(whole, right), rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize("depth", [0.0, 0.02])
-def test_exact_poses_do_not_move(depth: float) -> None:
-    capture = replace(Capture(), depth=depth and 1e-12)
-    found = adjusted(capture.seen(capture.poses), capture.points, prior(capture.poses))
+def test_exact_poses_do_not_move() -> None:
+    capture = Capture()
+    found = capture.adjusted(capture.poses, prior(capture.poses))
     assert max(off(found.T_world_camera, capture.poses)) < 1e-9
     torch.testing.assert_close(found.points, capture.points, rtol=0, atol=1e-9)
 
@@ -163,7 +163,7 @@ def test_exact_sightings_take_errors_of_poses_back() -> None:
     """What is left is what no image shows: a motion and a scale of everything, about which the prior has an opinion."""
     capture = Capture()
     given = capture.poses.retract(errors())
-    found = adjusted(capture.seen(given), capture.points, prior(given), settled=1e-12).T_world_camera
+    found = capture.adjusted(given, prior(given), settled=1e-12).T_world_camera
     translation, rotation = off(relative(found), relative(capture.poses))
     before = off(relative(given), relative(capture.poses))
     assert translation < 0.15 * before[0]  # the scale
@@ -173,9 +173,8 @@ def test_exact_sightings_take_errors_of_poses_back() -> None:
 def test_motions_are_found_with_the_poses() -> None:
     capture = Capture(noise=0.3, moving=True)
     given = capture.poses.retract(errors())
-    seen = capture.seen(given)
-    still = adjusted(seen, capture.points, prior(given))
-    moving = adjusted(seen, capture.points, prior(given, MotionPrior(MILLIMETRES, RADIANS)))
+    still = capture.adjusted(given, prior(given))
+    moving = capture.adjusted(given, prior(given, MotionPrior(MILLIMETRES, RADIANS)))
     assert bool((still.motion == 0).all())
     assert moving.cost < 0.7 * still.cost
     true, found, none = (capture.shifts(m) for m in (motions(), moving.motion, AT_REST_ALL))
@@ -188,42 +187,29 @@ def test_motions_are_found_with_the_poses() -> None:
 
 def test_cameras_at_rest_are_found_at_rest() -> None:
     capture = Capture()
-    found = adjusted(
-        capture.seen(capture.poses), capture.points, prior(capture.poses, MotionPrior(MILLIMETRES, RADIANS))
-    )
+    found = capture.adjusted(capture.poses, prior(capture.poses, MotionPrior(MILLIMETRES, RADIANS)))
     assert float(found.motion.abs().max()) < 1e-9
 
 
 def test_the_mean_motion_is_zero() -> None:
     capture = Capture(noise=0.3)
     given = capture.poses.retract(errors())
-    found = adjusted(
-        capture.seen(given), capture.points, replace(prior(given), translation=1.0, rotation=0.5)
-    )
+    found = capture.adjusted(given, replace(prior(given), translation=1.0, rotation=0.5))
     mean = (found.T_world_camera.translation - given.translation).mean(0)
     typical = (found.T_world_camera.translation - given.translation).norm(dim=-1).median()
     assert float(mean.norm()) < 1e-2 * float(typical)
 
 
 def test_a_moved_world_has_moved_poses() -> None:
-    capture = Capture(noise=0.5, depth=0.02)
+    capture = Capture(noise=0.5)
     given = capture.poses.retract(errors())
     T = SE3.exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.3], dtype=torch.float64))
-    here = adjusted(capture.seen(given), capture.points, prior(given))
+    here = capture.adjusted(given, prior(given))
     moved = T @ given
-    there = adjusted(capture.seen(moved), T.apply(capture.points), prior(moved))
+    start = at_rest(moved, T.apply(capture.points))
+    there = adjusted(capture.seen(moved), start, prior(moved), capture.accuracy)
     assert max(off(there.T_world_camera, T @ here.T_world_camera)) < 1e-6
     assert there.cost == pytest.approx(here.cost, rel=1e-6)
-
-
-def test_depth_finds_the_scale_that_colour_leaves_open() -> None:
-    capture = Capture(depth=0.01)
-    larger = SE3(capture.poses.rotation, 1.02 * capture.poses.translation)
-    loose = PosePrior(larger, 0.1, RADIANS)
-    with_depth = adjusted(capture.seen(larger), capture.points, loose, settled=1e-12).T_world_camera
-    without = adjusted(Capture().seen(larger), capture.points, loose, settled=1e-12).T_world_camera
-    assert spread(with_depth) / spread(capture.poses) == pytest.approx(1, abs=2e-3)
-    assert spread(without) / spread(capture.poses) > 1.01
 
 
 def test_outliers_and_a_wrong_pose_do_not_pull_the_others_away() -> None:
@@ -231,7 +217,7 @@ def test_outliers_and_a_wrong_pose_do_not_pull_the_others_away() -> None:
     wrong = errors()
     wrong[5] = torch.tensor([0.2, 0, 0.1, 0, 0.05, 0], dtype=torch.float64)
     given = capture.poses.retract(wrong)
-    found = adjusted(capture.seen(given), capture.points, prior(given)).T_world_camera
+    found = capture.adjusted(given, prior(given)).T_world_camera
     translation, rotation = off(found, capture.poses)
     assert translation < 1.5 * MILLIMETRES  # the common motion remains
     assert rotation < RADIANS
@@ -241,12 +227,8 @@ def test_an_image_without_sightings_stays() -> None:
     capture = Capture(noise=0.3)
     given = capture.poses.retract(errors())
     seen = capture.seen(given)
-    kept = seen.image != 3
-    seen = replace(
-        seen, sightings=seen.sightings[kept], image=seen.image[kept], depth=seen.depth[kept],
-        exposure_times=None,
-    )  # fmt: skip
-    found = adjusted(seen, capture.points, prior(given)).T_world_camera
+    start = at_rest(given, capture.points)
+    found = adjusted(seen[seen.view != 3], start, prior(given), capture.accuracy).T_world_camera
     assert max(off(found[3], given[3])) < 1e-12
     assert max(off(found[4], given[4])) > 1e-3
 
@@ -262,9 +244,9 @@ def test_points_without_parallax_do_no_harm() -> None:
     )
     image = torch.arange(VIEWS).repeat_interleave(POINTS)
     local = turned[image].inverse().apply(capture.points.repeat(VIEWS, 1))
-    seen = capture.seen(turned)
-    seen = replace(seen, sightings=replace(seen.sightings, image=local[:, :2] / local[:, 2:]))
+    seen = replace(capture.seen(turned), image=local[:, :2] / local[:, 2:])
     given = turned.retract(errors())
-    found = adjusted(seen, capture.points, prior(given)).T_world_camera
+    start = at_rest(given, capture.points)
+    found = adjusted(seen, start, prior(given), capture.accuracy).T_world_camera
     assert bool(found.is_rigid().all())
     assert off(relative(found), relative(turned))[1] < 0.5 * off(relative(given), relative(turned))[1]

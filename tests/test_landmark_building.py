@@ -10,7 +10,8 @@ import torch
 
 from bidnerf_core import SE3, Frame, InputError, Intrinsics, View
 from bidnerf_core.mapping import LandmarkConfig, LandmarkMap, Sift, build_landmarks, tracked_views
-from bidnerf_core.mapping.geometry.triangulation import Sightings, intersected, parallax, refined_points
+from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.mapping.geometry.triangulation import intersected, parallax, refined_points
 from bidnerf_core.mapping.landmarks.building import robust_covariance, update_scatter
 from bidnerf_core.mapping.landmarks.tracks import Matches, joined_tracks, likely_pairs
 from landmark_scene import PINHOLE, Points, looking_in, ring
@@ -141,7 +142,9 @@ def sightings(point: torch.Tensor, cameras: list[SE3], noise: float, trials: int
     image = local[:, :2] / local[:, 2:]
     image = image + noise / 300 * torch.randn(image.shape, dtype=torch.float64, generator=generator)
     index = torch.arange(trials).repeat_interleave(len(cameras))
-    return Sightings(index, rotation, centre, image, torch.full((len(index),), 300.0, dtype=torch.float64))
+    view = torch.arange(len(index))
+    focal = torch.full((len(index),), 300.0, dtype=torch.float64)
+    return Sightings(index, view, rotation, centre, image, focal, torch.zeros_like(focal))
 
 
 def test_covariance_of_a_triangulated_point_is_that_of_many_trials() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, replace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -26,6 +26,7 @@ from bidnerf_core.localization.search.miscalibration import (
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping import Calibration, LandmarkMap, ReprojectionFit, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import GIVEN, NOMINAL
+from bidnerf_core.mapping.geometry.resection import Minimum
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 TRUE = looking_in(0.43, 0.45, 3.6)
@@ -154,9 +155,7 @@ def fit(apparent: float, deviation: float) -> ReprojectionFit:
         noise=0.3,
         covariance=torch.eye(6, dtype=torch.float64),
         calibration_deviations=torch.full((4,), deviation, dtype=torch.float64),
-        covariance_by_motion=zeros,
-        motion_posterior=zeros[:0, :0],
-        slope=zeros[:, :4],
+        minimum=cast(Minimum, None),
     )
 
 

@@ -272,7 +272,6 @@ def test_weaker_motions_are_believed_where_the_map_moved() -> None:
     for number in range(VIEWS):
         own = (seen.image == number).nonzero()[:, 0]
         data = observed_at_rest(seen.sightings[own], positions, true[number])
-        data = replace(data, exposure_times=seen.exposure_times[own])
         fit = resect(data, true[number], NOISE)
         for share in taken:
             taken[share] += evident_motion(data, fit, 1.0, FIXED, share).prior != STILL

@@ -167,11 +167,11 @@ def masked(value: Tensor) -> Tensor:
 
 FAULTS = {"copied between devices": copied, "reads a number": read, "mask": masked}
 PLANTED: list[tuple[str, str, Any, str]] = [
-    *(("aligning points", message, surface, "geman_mcclure_inlier") for message in FAULTS),
+    *(("aligning points", message, surface, "inlier_weight") for message in FAULTS),
     ("aligning points", "reads a number", NormalEquations, "solve"),
-    ("comparing images", "mask", images, "geman_mcclure_inlier"),
+    ("comparing images", "mask", images, "inlier_weight"),
     ("casting rays", "copied between devices", SurfelIndex, "__call__"),
-    ("aligning points and rendering", "reads a number", surface, "geman_mcclure_inlier"),
+    ("aligning points and rendering", "reads a number", surface, "inlier_weight"),
 ]
 """A kind of step, a fault, and the function into whose result it is put."""
 

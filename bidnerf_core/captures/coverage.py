@@ -12,7 +12,7 @@ from torch import Tensor
 from bidnerf_core.captures.report import Arrangement, CoverageRecord, Gap
 from bidnerf_core.frames.frame import View
 from bidnerf_core.mapping import DEFAULT_LANDMARKS, TrackedKeypoints, TrackedViews
-from bidnerf_core.mapping.geometry.triangulation import Sightings
+from bidnerf_core.mapping.geometry.observations import Sightings
 
 FACING = 0.9
 """Share of the cameras that must have the centre in front of them for the capture to be around it."""

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry.robust import mad_deviation
 from bidnerf_core.mapping import TrackedKeypoints
 from bidnerf_core.mapping.landmarks.tracks import likely_pairs
 
@@ -70,7 +70,7 @@ def detail_kept(views: Sequence[View]) -> Float[Tensor, "v"]:
 
 def standing_out(values: Float[Tensor, "v"], least: float) -> Bool[Tensor, "v"]:
     """Return which values exceed both ``least`` and ``OUTLYING`` robust standard deviations of all about zero."""
-    return values > max(least, OUTLYING * MAD_TO_SIGMA * float(values.abs().median()))
+    return values > max(least, OUTLYING * mad_deviation(values))
 
 
 def _measured(frame: Frame) -> tuple[float, float, float, float]:

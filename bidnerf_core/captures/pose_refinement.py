@@ -12,10 +12,17 @@ from torch import Tensor
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.captures.cameras import PoseConsistency
 from bidnerf_core.captures.shutter_evidence import common_motion
-from bidnerf_core.geometry.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry.robust import mad_deviation
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping import LandmarkConfig, PosePrior, TrackedKeypoints, TrackedViews, adjusted
-from bidnerf_core.mapping.geometry.bundle_adjustment import MeasuredSightings
+from bidnerf_core.mapping import (
+    Adjustment,
+    LandmarkConfig,
+    PosePrior,
+    TrackedKeypoints,
+    TrackedViews,
+    adjusted,
+)
+from bidnerf_core.mapping.geometry.projection import projected
 from bidnerf_core.mapping.geometry.resection import LEAST_NOISE
 from bidnerf_core.mapping.geometry.triangulation import noise
 from bidnerf_core.mapping.landmarks.building import ENOUGH_IMAGES, pose_updates
@@ -61,8 +68,10 @@ def adjusted_poses(
         return None
     motion = STILL
     for number in range(ROUNDS):
-        sightings, prior = _measured(seen, points), PosePrior(given, *deviations, motion)
-        fit = adjusted(sightings, points, prior, tracked.T_world_camera, motion=tracked.motion)
+        prior = PosePrior(given, *deviations, motion)
+        start = Adjustment(tracked.T_world_camera, points, tracked.motion)
+        pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
+        fit = adjusted(seen.sightings, start, prior, pixel_noise, CORRELATED_KEYPOINTS)
         step = _motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
         moved = (given.inverse() @ fit.T_world_camera).log()
         deviations = max(deviations[0], _spread(moved[:, :3])), max(deviations[1], _spread(moved[:, 3:]))
@@ -81,15 +90,6 @@ def adjusted_poses(
             break
         seen, points = tracked.triangulated(config)
     return _found(tracked, pixels, before, config)
-
-
-def _measured(seen: TrackedKeypoints, points: Float[Tensor, "n 3"]) -> MeasuredSightings:
-    """Return the keypoints without their measured depth, as sightings for an adjustment."""
-    pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
-    unmeasured = torch.zeros(len(seen.point), dtype=torch.float64)
-    return MeasuredSightings(
-        seen.sightings, seen.image, unmeasured, pixel_noise, 1.0, CORRELATED_KEYPOINTS, seen.exposure_times
-    )
 
 
 def _common_motion(tracked: TrackedViews, config: LandmarkConfig) -> MotionPrior:
@@ -117,7 +117,7 @@ def _deviations(
 
 def _spread(values: Float[Tensor, "v 3"]) -> float:
     """Return a robust standard deviation about zero."""
-    return max(LEAST_DEVIATION, MAD_TO_SIGMA * float(values.abs().median()))
+    return max(LEAST_DEVIATION, mad_deviation(values))
 
 
 def _motion(
@@ -126,14 +126,12 @@ def _motion(
     """Return the median motion (pixels) in each image of the points that it shows, between two poses of the image."""
     shown, image = points[seen.point], seen.image
     focal = seen.sightings.focal[:, None]
-    places = [_projected(T, image, shown) * focal for T in (given, found)]
+    places = [
+        torch.from_numpy(projected(T[image].inverse().apply(shown).numpy()).flat) * focal
+        for T in (given, found)
+    ]
     away = torch.linalg.vector_norm(places[1] - places[0], dim=-1)
     medians = torch.zeros(len(seen.images), dtype=torch.float64)
     for number in image.unique().tolist():
         medians[number] = away[image == number].median()
     return medians
-
-
-def _projected(T: SE3, image: Tensor, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 2"]:
-    local = T[image].inverse().apply(points)
-    return local[:, :2] / local[:, 2:].clamp(min=1e-9)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -37,7 +36,6 @@ def common_motion(seen: TrackedKeypoints, points: Float[Tensor, "n 3"], correlat
         own = (image == number).nonzero()[:, 0]
         T = seen.images[number].T_world_camera
         data = observed_at_rest(sightings[own], points, T)
-        data = replace(data, exposure_times=seen.exposure_times[own])
         still = resect(data, T, pixel_noise, correlation=correlation)
         moving = resect(data, T, pixel_noise, correlation=correlation, motion=prior)
         evidence = log_motion_evidence(data, moving, still, prior, correlation)

@@ -10,14 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.errors import InputError
 
+Values = TypeVar("Values", Tensor, np.ndarray)
 RobustName = Literal["huber", "l2", "l1", "cauchy", "geman-mcclure"]
 
 MAD_TO_SIGMA = 1.4826
@@ -59,18 +61,36 @@ WEIGHTS: dict[RobustName, Callable[[Tensor, float], Tensor]] = {
     "huber": lambda r, c: c / r.abs().clamp(min=c),
     "l2": lambda r, c: torch.ones_like(r),
     "l1": lambda r, c: c / r.abs().clamp(min=1e-6 * c),
-    "cauchy": lambda r, c: 1 / (1 + 0.5 * (r / c) ** 2),
-    "geman-mcclure": lambda r, c: (1 + 0.25 * (r / c) ** 2) ** -2,
+    "cauchy": lambda r, c: inlier_weight(r**2, math.sqrt(2) * c),
+    "geman-mcclure": lambda r, c: inlier_weight(r**2, 2 * c) ** 2,
 }
 """``rho'(r) / r`` of each; that of ``l1``, which is unbounded at 0, is limited there."""
 
 
-def geman_mcclure_inlier(squared: Float[Tensor, "*p"], scale: float) -> Float[Tensor, "*p"]:
-    """Return the degree to which a squared residual is an inlier: 1 at 0, a half at ``scale`` (Geman and McClure 1985).
+def inlier_weight(squared: Values, half: float) -> Values:
+    """Return ``1 / (1 + s / half^2)`` of squared residuals s: 1 at 0, a half where the residual is ``half``.
 
-    One minus this is their loss, and its square is that loss's weight in least squares.
+    This is the weight of ``cauchy_loss``. It is also the degree to which a residual is an inlier (Geman and McClure 1985): one
+    minus it is their loss, and its square is that loss's weight in least squares.
     """
-    return 1 / (1 + squared / scale**2)
+    return 1 / (1 + squared / half**2)
+
+
+def cauchy_loss(squared: np.ndarray, half: float) -> float:
+    """Return Cauchy's loss of squared residuals s, summed: ``half^2 / 2 log(1 + s / half^2)``; see ``inlier_weight``.
+
+    Unlike ``cauchy``, it takes vectors by their squared length, and its scale is where the weight is a half.
+    """
+    return 0.5 * half**2 * float(np.log1p(squared / half**2).sum())
+
+
+def mad_deviation(values: Tensor | np.ndarray) -> float:
+    """Return a robust standard deviation about zero: the median absolute value, scaled as for a Gaussian."""
+    sizes = np.abs(np.asarray(values)).ravel()
+    half, odd = divmod(len(sizes), 2)
+    # ``np.median`` without its checks, which take longer than the rest
+    ordered = np.partition(sizes, (half - 1 + odd, half))
+    return MAD_TO_SIGMA * float(ordered[half] if odd else 0.5 * (ordered[half - 1] + ordered[half]))
 
 
 @dataclass(frozen=True)

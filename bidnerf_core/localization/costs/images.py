@@ -24,7 +24,7 @@ from bidnerf_core.devices import constant
 from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.fields.rendering import render
 from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.robust import geman_mcclure_inlier
+from bidnerf_core.geometry.robust import inlier_weight
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.exposure import Exposure, clipped, fit_exposure
 from bidnerf_core.localization.normal_equations import NormalEquations
@@ -294,7 +294,7 @@ class ImageCost:
         measured, scale = small.rgb.flatten(1), self.scales.colour
         corrected = exposed(seen, measured, self.scales)
         error = corrected.clamp(0, 1) - measured
-        near = geman_mcclure_inlier((error**2).sum(1), scale)
+        near = inlier_weight((error**2).sum(1), scale)
         cost = (seen.known * (1 - near) + (1 - seen.known) * UNKNOWN_COST).mean(-1)
         weight = seen.known * near**2 / scale**2 / error.shape[-1]
         inside = (corrected - 0.5).abs() < 0.5  # where a camera clips, the colour does not depend on the pose
@@ -316,7 +316,7 @@ def uniform_cost(thumbnails: Sequence[Thumbnail], scale: float) -> float:
     for small in thumbnails:
         measured = small.rgb.flatten(1)
         squared = ((measured - measured.median(-1, keepdim=True).values) ** 2).sum(0)
-        costs.append((1 - geman_mcclure_inlier(squared, scale)).mean())
+        costs.append((1 - inlier_weight(squared, scale)).mean())
     return float(torch.stack(costs).mean())
 
 
@@ -332,7 +332,7 @@ def exposed(
     exposure: Exposure | None = None
     for _ in range(scales.exposure_rounds):
         rgb = seen.rgb if exposure is None else exposure.applied(seen.rgb)
-        near = geman_mcclure_inlier(((measured - rgb) ** 2).sum(1, keepdim=True), scales.colour)
+        near = inlier_weight(((measured - rgb) ** 2).sum(1, keepdim=True), scales.colour)
         weights = (seen.known[:, None] * near**2 / scales.colour**2) * ~clipped(rgb, measured)
         exposure = fit_exposure(seen.rgb, measured[None], weights, scales.gain**-2, scales.bias**-2)
     assert exposure is not None  # there is at least one round

@@ -13,7 +13,7 @@ from bidnerf_core.devices import moved
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import observe
-from bidnerf_core.geometry.robust import geman_mcclure_inlier
+from bidnerf_core.geometry.robust import inlier_weight
 from bidnerf_core.geometry.se3 import SE3, skew
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.solvers.pivots import Pivot
@@ -155,12 +155,12 @@ class SurfaceCost:
 
     def _equations(self, found: Correspondences) -> NormalEquations:
         scales = self.scales
-        near = geman_mcclure_inlier(found.squared, scales.distance)
+        near = inlier_weight(found.squared, scales.distance)
         weight = near**2 / scales.distance**2
         if not scales.colour_weight:
             return NormalEquations((1 - near).mean(-1).double(), *_distance_terms(found, self.cloud, weight))
         difference, derivative = self.colour_differences(found)
-        alike = geman_mcclure_inlier((difference**2).sum(-1), scales.colour)
+        alike = inlier_weight((difference**2).sum(-1), scales.colour)
         gradient, hessian = _distance_terms(found, self.cloud, weight * (1 + scales.colour_weight * alike))
         colour_weight = scales.colour_weight * near * alike**2 / scales.colour**2
         by_colour = _colour_terms(difference, derivative, colour_weight, found, self.cloud)
@@ -174,9 +174,9 @@ class SurfaceCost:
 
     def inliers(self, found: Correspondences) -> tuple[Float[Tensor, "h p"], Float[Tensor, "h p"]]:
         """Return each point's inlier weights: that of its distance and that of its colour."""
-        near = geman_mcclure_inlier(found.squared, self.scales.distance)
+        near = inlier_weight(found.squared, self.scales.distance)
         difference, _ = self.colour_differences(found)
-        return near, geman_mcclure_inlier((difference**2).sum(-1), self.scales.colour)
+        return near, inlier_weight((difference**2).sum(-1), self.scales.colour)
 
     def residual_variance(self, T: SE3) -> Float[Tensor, "h"]:
         """Return the weighted mean of the squared residuals, in units of their scales."""
@@ -188,7 +188,7 @@ class SurfaceCost:
         squared = torch.stack(
             [found.squared / scales.distance**2, (difference**2).sum(-1) / scales.colour**2]
         )
-        near, alike = geman_mcclure_inlier(squared, 1.0)
+        near, alike = inlier_weight(squared, 1.0)
         by_colour = scales.colour_weight * self.cloud.coloured * near * alike**2
         weights = torch.stack([near**2, by_colour])
         total = (weights * squared).sum((0, -1))

@@ -130,7 +130,7 @@ class Explanation:
         noise = min(self.noise, still.noise)
         ratio = still.about.cost(still.best, noise) - self.about.cost(self.best, noise)
         width = self.free.deviations[4:]
-        posterior = self.about.under(self.free).inverse_curvature()[10:, 10:]
+        posterior = self.about.under(self.free).inverse_curvature[10:, 10:]
         narrowed = float(np.linalg.slogdet(posterior / np.outer(width, width))[1])
         return ratio + 0.5 * (narrowed - self.motion_in_deviations)
 
@@ -144,7 +144,7 @@ class Explanation:
         """The part of the pose's covariance due to the motion, to which the pose adapts."""
         equations = self.about.under(self.known)
         follows = -np.linalg.solve(equations.hessian[:6, :6], equations.hessian[:6, 10:])
-        found = follows @ equations.covariance()[10:, 10:] @ follows.T
+        found = follows @ equations.covariance[10:, 10:] @ follows.T
         return torch.from_numpy((found + found.T) / 2)
 
 

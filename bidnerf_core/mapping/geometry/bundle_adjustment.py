@@ -1,7 +1,6 @@
 """Bundle adjustment: estimate the poses of images and the points that they show together (Triggs et al. 2000).
 
-The given poses are a prior, which also fixes what the images leave free: the position, orientation and, without depth, scale
-of everything. The motions of the cameras while the rows of their images are exposed may be estimated too (Hedborg et al.,
+The given poses are a prior, which also fixes what the images leave free: the position, orientation and scale of everything. The motions of the cameras while the rows of their images are exposed may be estimated too (Hedborg et al.,
 Rolling shutter bundle adjustment, CVPR 2012). Robust Levenberg-Marquardt; the points are eliminated by the Schur complement.
 """
 
@@ -17,8 +16,10 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
+from bidnerf_core.geometry.robust import cauchy_loss, inlier_weight
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.geometry.triangulation import Sightings
+from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.mapping.geometry.projection import by_update, projected
 
 ADJUSTMENT_STEPS = 30
 """Largest number of steps; from poses that are off by a few pixels, about ten suffice."""
@@ -27,8 +28,7 @@ SETTLED = 1e-4
 LARGEST_DAMPING = 1e6
 """Damping (relative to the diagonal) beyond which no smaller step is tried."""
 RESIDUAL_SCALE, PRIOR_SCALE = 2.0, 5.0
-"""Scales of the Cauchy losses in standard deviations: that of a sighting or depth, and that of a pose, which has six
-components. A pose that is plainly wrong is hardly held by its prior.
+"""Scales of the Cauchy losses in standard deviations: that of a sighting, and that of a pose, which has six components. A pose that is plainly wrong is hardly held by its prior.
 """
 ALMOST_SINGULAR = 1e-9
 """Damping, relative to the mean diagonal, which makes the blocks of points without parallax invertible."""
@@ -45,19 +45,6 @@ class PosePrior:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredSightings:
-    """Sightings of points by numbered images, the depth measured at each, and how accurate both are."""
-
-    sightings: Sightings  # their poses serve as a start
-    image: Int[Tensor, "m"]
-    depth: Float[Tensor, "m"]  # metres, planar z; 0 where none was measured
-    noise: float  # pixels: standard deviation of a sighting along each axis
-    relative_depth_noise: float
-    correlation: float = 1.0  # the number of sightings that count as one, because their errors are correlated
-    exposure_times: Float[Tensor, "m"] | None = None  # see ``rolling_shutter``; needed to estimate motions
-
-
-@dataclass(frozen=True, eq=False)
 class Adjustment:
     """Poses, points and motions that fit the sightings best."""
 
@@ -68,25 +55,24 @@ class Adjustment:
 
 
 def adjusted(
-    seen: MeasuredSightings,
-    points: Float[Tensor, "n 3"],
+    sightings: Sightings,
+    start: Adjustment,
     prior: PosePrior,
-    start: SE3 | None = None,
+    noise: float,
+    correlation: float = 1.0,
     settled: float = SETTLED,
-    motion: Float[Tensor, "v 6"] | None = None,
 ) -> Adjustment:
-    """Minimize the robust reprojection and depth errors and the prior, from ``points`` and ``start`` or the given poses.
+    """Minimize the robust reprojection errors and the prior, from ``start``; the poses in ``sightings`` have no part in it.
 
-    Images without sightings keep their given poses. ``settled`` is the relative decrease of the cost that ends the
-    iteration. ``motion`` is where the motions start, by default at rest; they stay there if ``prior`` leaves none free.
+    ``noise`` is the standard deviation of a sighting along each axis (pixels), and ``correlation`` the number of sightings that
+    count as one, because their errors are correlated. Images without sightings keep their given poses. ``settled`` is the
+    relative decrease of the cost that ends the iteration. Motions stay where they are if ``prior`` leaves none free.
     """
-    T = start or prior.T_world_camera
-    motion = torch.zeros(len(T.translation), 6, dtype=torch.float64) if motion is None else motion
-    state, damping = Adjustment(T, points, motion), 1e-4
-    system = linearized(seen, state, prior)
+    state, damping = start, 1e-4
+    system = linearized(sightings, state, prior, noise, correlation)
     for _ in range(ADJUSTMENT_STEPS):
         moved = _retracted(state, *system.step(damping))
-        tried = linearized(seen, moved, prior)
+        tried = linearized(sightings, moved, prior, noise, correlation)
         if not tried.cost <= system.cost:
             damping *= 10
             if damping > LARGEST_DAMPING:
@@ -147,64 +133,40 @@ class AdjustmentSystem:
         return bsr_array(parts, shape=(blocks.shape[1] * rows, 3 * columns))
 
 
-def linearized(seen: MeasuredSightings, state: Adjustment, prior: PosePrior) -> AdjustmentSystem:
+def linearized(
+    sightings: Sightings, state: Adjustment, prior: PosePrior, noise: float, correlation: float = 1.0
+) -> AdjustmentSystem:
     """Return the normal equations about a state, with weights of iteratively reweighted least squares."""
-    image, point, points = seen.image, seen.sightings.point, state.points
-    views, count = len(state.motion), len(points)
-    T = _poses_at_exposure(seen, state)
+    view, point, times = sightings.view, sightings.point, sightings.exposure_times
+    T = state.T_world_camera[view]
+    if bool(state.motion.any()):
+        T = T @ poses_of_rows(times, state.motion[view])
     rotation = T.rotation.mT
-    local = (rotation @ (points[point] - T.translation)[..., None])[..., 0]
-    residual, by_local = _measured(seen, local)
-    squared = torch.stack([residual[:, :2].square().sum(-1), residual[:, 2].square()], dim=-1)
-    weight = (1 / (1 + squared / RESIDUAL_SCALE**2))[:, [0, 0, 1]] / seen.correlation
-    cost = 0.5 * RESIDUAL_SCALE**2 * float(torch.log1p(squared / RESIDUAL_SCALE**2).sum()) / seen.correlation
-    # A point of the camera's frame moves by -rho + p x phi under T exp(rho, phi), and r (p x phi) = (r x p) phi.
-    turned = torch.linalg.cross(by_local, local[:, None].expand_as(by_local))
-    by_image, by_point = torch.cat([-by_local, turned], dim=-1), by_local @ rotation
+    local = (rotation @ (state.points[point] - T.translation)[..., None])[..., 0].numpy()
+    seen = projected(local)
+    scale = np.where(seen.front, sightings.focal.numpy() / noise, 0)
+    off = torch.from_numpy((seen.flat - sightings.image.numpy()) * scale[:, None])
+    squared = off.square().sum(-1)
+    weight = inlier_weight(squared, RESIDUAL_SCALE) / correlation
+    cost = cauchy_loss(squared.numpy(), RESIDUAL_SCALE) / correlation
+    by_local = seen.by_point(scale)
+    by_view = torch.from_numpy(by_update(by_local, local))
+    by_point = torch.from_numpy(by_local) @ rotation
     if prior.motion != STILL:
-        assert seen.exposure_times is not None
         # To first order in the motion, an update of the pose of the middle row is one of the pose at any other row.
-        by_image = torch.cat([by_image, seen.exposure_times[:, None, None] * by_image], dim=-1)
-    image_weighted, point_weighted = by_image.mT * weight[:, None], by_point.mT * weight[:, None]
+        by_view = torch.cat([by_view, times[:, None, None] * by_view], dim=-1)
+    views, count = len(state.motion), len(state.points)
+    view_weighted, point_weighted = (by.mT * weight[:, None, None] for by in (by_view, by_point))
     held = _held(state, prior)
-    column = residual[..., None]
+    column = off[..., None]
     return AdjustmentSystem(
         cost + held.cost,
-        _summed((image_weighted @ column)[..., 0], image, views) + held.gradient,
+        _summed((view_weighted @ column)[..., 0], view, views) + held.gradient,
         _summed((point_weighted @ column)[..., 0], point, count),
-        _summed(image_weighted @ by_image, image, views) + torch.diag_embed(held.precision),
+        _summed(view_weighted @ by_view, view, views) + torch.diag_embed(held.precision),
         _summed(point_weighted @ by_point, point, count),
-        image_weighted @ by_point, image, point,
+        view_weighted @ by_point, view, point,
     )  # fmt: skip
-
-
-def _poses_at_exposure(seen: MeasuredSightings, state: Adjustment) -> SE3:
-    """Return the pose of the camera at each sighting, when its row was exposed."""
-    T = state.T_world_camera[seen.image]
-    if seen.exposure_times is None or not bool(state.motion.any()):
-        return T
-    return T @ poses_of_rows(seen.exposure_times, state.motion[seen.image])
-
-
-def _measured(
-    seen: MeasuredSightings, local: Float[Tensor, "m 3"]
-) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 3"]]:
-    """Return the residuals (u, v, depth) in standard deviations, and their Jacobian with respect to points in the camera.
-
-    Points behind the camera and depth that was not measured have zeros.
-    """
-    front = local[:, 2] > 0
-    z = torch.where(front, local[:, 2], 1)
-    flat = local[:, :2] / z[:, None]
-    scale = torch.where(front, seen.sightings.focal / seen.noise, 0)
-    inverse, zero = scale / z, torch.zeros_like(z)
-    known = seen.depth > 0
-    deeper = torch.where(known, 1 / (torch.where(known, seen.depth, 1) * seen.relative_depth_noise), 0)
-    off = torch.cat(
-        [(flat - seen.sightings.image) * scale[:, None], ((local[:, 2] - seen.depth) * deeper)[:, None]], 1
-    )
-    rows = [inverse, zero, -flat[:, 0] * inverse, zero, inverse, -flat[:, 1] * inverse, zero, zero, deeper]
-    return off, torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +186,8 @@ def _held(state: Adjustment, prior: PosePrior) -> _Held:
     off = torch.cat([away, turned], dim=-1)
     deviations = torch.tensor([prior.translation] * 3 + [prior.rotation] * 3, dtype=off.dtype)
     squared = (off / deviations).square().sum(-1)
-    precision = deviations**-2 / (1 + squared / PRIOR_SCALE**2)[:, None]
-    cost = 0.5 * PRIOR_SCALE**2 * float(torch.log1p(squared / PRIOR_SCALE**2).sum())
+    precision = deviations**-2 * inlier_weight(squared, PRIOR_SCALE)[:, None]
+    cost = cauchy_loss(squared.numpy(), PRIOR_SCALE)
     if prior.motion != STILL:
         of_motion = (prior.motion.deviations**-2).expand_as(state.motion)
         cost += 0.5 * float((of_motion * state.motion.square()).sum())

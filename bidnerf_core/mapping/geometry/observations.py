@@ -1,16 +1,17 @@
-"""Points of the world and where the cameras of a rig observed them."""
+"""Observations of points: by the cameras of a rig whose pose is sought, and by posed cameras of which the points are."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import moved_points
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.calibration import Calibration
+from bidnerf_core.mapping.geometry.projection import NEAREST, reprojection_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +54,7 @@ class ObservedPoints:
 
     def residuals(self, T_world_rig: SE3) -> Float[Tensor, "m 2"]:
         """Return projection minus observation, pixels; infinite for points behind the camera."""
-        local = self.in_camera(T_world_rig)
-        z = local[:, 2:]
-        off = (local[:, :2] / torch.where(z > 0, z, 1) - self.image) * self.focal[:, None]
-        return torch.where(z > 0, off, torch.inf)
+        return reprojection_errors(self.in_camera(T_world_rig), self.image, self.focal)
 
     def normalized_residuals(self, T_world_rig: SE3, noise: float) -> Float[Tensor, "m 2"]:
         """Return the residuals in standard deviations, which combine the keypoints' ``noise`` (pixels) with the points'."""
@@ -70,13 +68,45 @@ class ObservedPoints:
         other axis it is a mixture of the variances across and along, by the squared cosine and sine of the angle between the
         line of sight and ``directions``.
         """
-        rig = T_world_rig.inverse().apply(self.points)
-        local = (self.rotation @ rig[..., None])[..., 0] + self.translation
+        local = self.in_camera(T_world_rig)
         centres = T_world_rig.apply(-(self.rotation.mT @ self.translation[..., None])[..., 0])
         sight = self.points - centres
         cosine = (sight * self.directions).sum(-1) / torch.linalg.vector_norm(sight, dim=-1).clamp(min=1e-12)
         across, along = self.deviations.square().unbind(-1)
         seen = cosine.square().clamp(max=1)
         metres = (across * (1 + seen) + along * (1 - seen)) / 2
-        z = torch.where(local[:, 2] > 1e-9, local[:, 2], 1)
+        z = torch.where(local[:, 2] > NEAREST, local[:, 2], 1)
         return metres * (self.focal / z).square()
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Observations of numbered points by numbered images whose poses are known. Float64."""
+
+    point: Int[Tensor, "m"]
+    view: Int[Tensor, "m"]  # number of the image
+    rotation: Float[Tensor, "m 3 3"]  # R_camera_world, when the observation's row was exposed
+    centre: Float[Tensor, "m 3"]  # of the camera then, metres, world
+    image: Float[Tensor, "m 2"]  # on the plane z = 1 of the camera
+    focal: Float[Tensor, "m"]  # pixels; residuals are multiplied by it
+    exposure_times: Float[Tensor, "m"]  # see the function ``exposure_times``
+
+    def __getitem__(self, index: Tensor) -> Sightings:
+        return Sightings(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def directions(self) -> Float[Tensor, "m 3"]:
+        """Return unit vectors (world) from the cameras towards the observed points."""
+        ray = torch.cat([self.image, torch.ones_like(self.image[:, :1])], dim=-1)
+        world = (self.rotation.mT @ ray[..., None])[..., 0]
+        return world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
+
+    def in_camera(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
+        """Return the observed point of each observation in the frame of its camera."""
+        return (self.rotation @ (points[self.point] - self.centre)[..., None])[..., 0]
+
+    def residuals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 2"]:
+        """Return projection minus observation, pixels; infinite for points behind the camera."""
+        return reprojection_errors(self.in_camera(points), self.image, self.focal)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bidnerf_core.mapping.geometry.projection import Array
 from bidnerf_core.mapping.geometry.reprojection import (
-    Array,
     LinearizedErrors,
     ReprojectionErrors,
     RobustEquations,

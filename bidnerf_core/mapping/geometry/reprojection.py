@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import astuple, dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -12,13 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.camera.rolling_shutter import AT_REST, moved_array
-from bidnerf_core.geometry.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry.robust import cauchy_loss, inlier_weight, mad_deviation
 from bidnerf_core.geometry.rotations import rotation_matrix
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.projection import Array, by_update, projected
 
-Array = np.ndarray
 SCALE = 2.0
 """Scale of the Cauchy loss: the residual, in standard deviations, whose weight is one half."""
 BEHIND = 30.0
@@ -50,20 +51,22 @@ class RobustEquations:
         information[first:, first:] = np.diag(precision)
         gradient[first:] += precision * value
         cost = self.cost + 0.5 * float((precision * value**2).sum())
-        return RobustEquations(
-            cost, gradient, self.hessian + information, self.curvature + information,
-            self.scatter + information, self.spread,
-        )  # fmt: skip
+        hessian, curvature, scatter = (
+            part + information for part in (self.hessian, self.curvature, self.scatter)
+        )
+        return RobustEquations(cost, gradient, hessian, curvature, scatter, self.spread)
 
+    @cached_property
     def covariance(self) -> Array:
-        """Return the covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3)."""
-        inverse = self.inverse_curvature()
+        """The covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3)."""
+        inverse = self.inverse_curvature
         with np.errstate(over="ignore", invalid="ignore"):
             found: Array = inverse @ self.scatter @ inverse
             return (found + found.T) / 2
 
+    @cached_property
     def inverse_curvature(self) -> Array:
-        """Return the inverse of the curvature: the covariance of the posterior in Laplace's approximation."""
+        """The inverse of the curvature: the covariance of the posterior in Laplace's approximation."""
         # With few residuals or many outliers the curvature may be indefinite; well-behaved residuals keep it near the Hessian.
         unit = 1 / np.sqrt(np.diag(self.hessian).clip(min=1e-300))
         values, vectors = np.linalg.eigh(unit[:, None] * self.curvature * unit)
@@ -73,19 +76,6 @@ class RobustEquations:
         with np.errstate(over="ignore", invalid="ignore"):
             found: Array = unit[:, None] * inverse * unit
             return found
-
-
-def robust_spread(residual: Array, unknowns: int) -> float:
-    """Return a robust standard deviation along an axis, corrected for the number of unknowns that were fitted."""
-    spare = max(1.0, residual.size - unknowns) / residual.size
-    return MAD_TO_SIGMA * _median(np.abs(residual).ravel()) / spare**0.5
-
-
-def _median(values: Array) -> float:
-    """Return ``np.median`` of finite values, without the checks that make it slow."""
-    half, odd = divmod(len(values), 2)
-    ordered = np.partition(values, (half - 1 + odd, half))
-    return float(ordered[half]) if odd else float(0.5 * (ordered[half - 1] + ordered[half]))
 
 
 def damped_solution(hessian: Array, damping: float, right: Array) -> Array:
@@ -147,8 +137,8 @@ class ReprojectionErrors:
         self._rotation, self._translation = data.rotation.numpy(), data.translation.numpy()
         self._exposure_times = data.exposure_times.numpy()
         self._turned = bool((self._rotation != np.eye(3)).any())
-        self._focal = data.focal.numpy()[:, None]
-        self._observed = data.image.numpy() * self._focal
+        self._focal = data.focal.numpy()
+        self._observed = data.image.numpy() * self._focal[:, None]
         self._variance = data.point_variance(start).numpy()  # it hardly changes on the way
 
     def exposed_at(self, times: Float[Tensor, "m"]) -> ReprojectionErrors:
@@ -164,63 +154,39 @@ class ReprojectionErrors:
         if motion.any():
             rig = moved_array(rig, self._exposure_times, motion)
         turned = np.einsum("mij,mj->mi", self._rotation, rig) if self._turned else rig
-        local = turned + self._translation
-        front = local[:, 2] > 1e-9
-        z = np.where(front, local[:, 2], 1)[:, None]
-        flat = local[:, :2] / z
+        seen, focal = projected(turned + self._translation), self._focal[:, None]
         log_focal, shift, radial = state.camera[0], state.camera[1:3], state.camera[3]
-        bend = radial * (flat**2).sum(1, keepdims=True)
-        scale = self._focal * math.exp(log_focal)
-        projected = flat * (1 + bend) * scale + self._focal * shift
-        jacobian = self._jacobian(rig, flat, z, scale, radial, bend, free)
-        return LinearizedErrors(state, front, projected - self._observed, jacobian)
+        bend = radial * (seen.flat**2).sum(1, keepdims=True)
+        bent = seen.flat * (1 + bend) * focal * math.exp(log_focal)
+        by_point = seen.by_point(self._focal * math.exp(log_focal))
+        if radial:
+            across = 2 * radial * seen.flat[:, :, None] * seen.flat[:, None]
+            by_point = (np.eye(2) * (1 + bend)[..., None] + across) @ by_point
+        by_rig = by_point @ self._rotation if self._turned else by_point
+        by_pose = by_update(by_rig, rig)
+        off = bent + focal * shift - self._observed
+        if not len(free):
+            return LinearizedErrors(state, seen.front, off, by_pose)
+        by_shift = np.eye(2)[..., None] * self._focal
+        distorted = seen.flat * (seen.flat**2).sum(1, keepdims=True) * focal * math.exp(log_focal)
+        by_motion = np.moveaxis(by_pose * self._exposure_times[:, None, None], -1, 0)
+        by_camera = [bent, by_shift[0].T, by_shift[1].T, distorted, *by_motion]
+        jacobian = np.concatenate([by_pose, np.stack([by_camera[i] for i in free], axis=-1)], axis=-1)
+        return LinearizedErrors(state, seen.front, off, jacobian)
 
     def system(self, here: LinearizedErrors, noise: float) -> RobustEquations:
         """Return the normal equations for keypoints of this noise (pixels)."""
         deviation = np.sqrt(noise**2 + self._variance)[:, None]
         residual = np.where(here.front[:, None], here.off / deviation, BEHIND)
         squared = (residual**2).sum(1)
-        weight = here.front / (1 + squared / SCALE**2)
+        weight = here.front * inlier_weight(squared, SCALE)
         jacobian = here.jacobian / deviation[..., None]
         single = ((weight[:, None] * residual)[:, None] @ jacobian)[:, 0]
         weighted = (jacobian * np.sqrt(weight)[:, None, None]).reshape(-1, jacobian.shape[-1])
         hessian, scatter = weighted.T @ weighted, single.T @ single
-        cost = 0.5 * SCALE**2 * float(np.log1p(squared / SCALE**2).sum())
+        cost = cauchy_loss(squared, SCALE)
         # d(w r)/dr = w I - 2 w^2 r r^T / c^2 for w = 1 / (1 + r^2 / c^2).
         curvature = hessian - 2 / SCALE**2 * scatter
-        spread = robust_spread(residual, jacobian.shape[-1])
+        spare = max(1.0, residual.size - jacobian.shape[-1]) / residual.size
+        spread = mad_deviation(residual) / spare**0.5
         return RobustEquations(cost, single.sum(0), hessian, curvature, scatter, spread)
-
-    def _jacobian(
-        self, rig: Array, flat: Array, z: Array, scale: Array, radial: float, bend: Array, free: Array
-    ) -> Array:
-        """Return the Jacobian (m, 2, p) of the projection in pixels: a right update, then the camera's ``free`` parameters."""
-        x, y = flat[:, 0], flat[:, 1]
-        zero, one = np.zeros_like(x), np.ones_like(x)
-        by_rig = np.stack([one, zero, -x, zero, one, -y], axis=1).reshape(-1, 2, 3) * (scale / z)[..., None]
-        if radial:
-            by_rig = (
-                np.eye(2) * (1 + bend)[..., None] + 2 * radial * flat[:, :, None] * flat[:, None]
-            ) @ by_rig
-        if self._turned:
-            by_rig = by_rig @ self._rotation
-        # A point of the rig's frame moves by -rho + p x phi under T exp(rho, phi), and r (p x phi) = (r x p) phi.
-        by_pose = np.concatenate([-by_rig, _cross(by_rig, rig[:, None])], axis=-1)
-        if not len(free):
-            return by_pose
-        focal = self._focal[:, 0]
-        by_calibration = [
-            flat * (1 + bend) * scale,
-            np.stack([focal, zero], axis=1),
-            np.stack([zero, focal], axis=1),
-            flat * (flat**2).sum(1, keepdims=True) * scale,
-        ]
-        by_motion = np.moveaxis(by_pose * self._exposure_times[:, None, None], -1, 0)
-        by_camera = [*by_calibration, *by_motion]
-        return np.concatenate([by_pose, np.stack([by_camera[i] for i in free], axis=-1)], axis=-1)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return ``np.cross`` along the last axis; NumPy's takes five times as long for small arrays."""
-    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)

@@ -7,6 +7,7 @@ the pose, as far as priors leave them open. The general solver on batches of pos
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -17,8 +18,8 @@ from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.projection import Array
 from bidnerf_core.mapping.geometry.reprojection import (
-    Array,
     LinearizedErrors,
     ReprojectionErrors,
     RobustEquations,
@@ -47,10 +48,26 @@ class ReprojectionFit:
     # Of the right update (translation, rotation), with the uncertainty of the calibration and of the motion.
     covariance: Float[Tensor, "6 6"]
     calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
-    covariance_by_motion: Float[Tensor, "6 6"]  # the part of the pose's covariance due to the motion
-    # Covariance of the motion, from the curvature of the cost; 0x0 for a camera at rest.
-    motion_posterior: Float[Tensor, "k k"]
-    slope: Float[Tensor, "6 4"]  # derivative of the pose (right update) with respect to the calibration
+    minimum: Minimum
+
+    @cached_property
+    def covariance_by_motion(self) -> Float[Tensor, "6 6"]:
+        """The part of the pose's covariance due to the motion, to which the other unknowns adapt."""
+        system, first = self.minimum.system, self.minimum.first_of_motion
+        adapt = -damped_solution(system.hessian[:first, :first], 1e-9, system.hessian[:first, first:])[:6]
+        found = torch.from_numpy(adapt @ system.covariance[first:, first:] @ adapt.T)
+        return (found + found.mT) / 2
+
+    @cached_property
+    def motion_posterior(self) -> Float[Tensor, "k k"]:
+        """The covariance of the motion, from the curvature of the cost; 0x0 for a camera at rest."""
+        first = self.minimum.first_of_motion
+        return torch.from_numpy(self.minimum.system.inverse_curvature[first:, first:].copy())
+
+    @cached_property
+    def slope(self) -> Float[Tensor, "6 4"]:
+        """The derivative of the pose (right update) with respect to the calibration, with the best motion if it is unknown."""
+        return self.minimum.slope(self.noise)
 
     def log_occam_factor(self, prior: MotionPrior) -> float:
         """Return the logarithm of the Occam factor of an estimated motion: how much the observations narrow its prior.
@@ -64,6 +81,34 @@ class ReprojectionFit:
     def motion_in_deviations(self, prior: MotionPrior) -> float:
         """Return the squared size of the motion, in standard deviations of its prior."""
         return float((self.motion / prior.deviations).square().sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """The equations at the pose that was found, from which more about it is computed where it is asked for."""
+
+    errors: ReprojectionErrors
+    system: RobustEquations
+    state: State
+    correlation: float
+    deviations: Array  # (10,) of the priors of the calibration and the motion
+
+    @property
+    def first_of_motion(self) -> int:
+        """The number of the first unknown that belongs to the motion."""
+        return 6 + int(np.count_nonzero(self.deviations[:4]))
+
+    def slope(self, noise: float) -> Float[Tensor, "6 4"]:
+        moving = 4 + self.deviations[4:].nonzero()[0]
+        free = np.concatenate([np.arange(4), moving])
+        system = self.errors.system(self.errors.linearized(self.state, free), noise)
+        system = system.weighted(1 / self.correlation)
+        hessian = system.with_prior(self.state.camera[moving], self.deviations[moving]).hessian
+        follows = np.concatenate([np.arange(6), np.arange(10, len(hessian))])
+        by_calibration = hessian[follows[:, None], np.arange(6, 10)]
+        return torch.from_numpy(
+            -damped_solution(hessian[follows[:, None], follows], 1e-9, by_calibration)[:6]
+        )
 
 
 def resect(
@@ -110,37 +155,13 @@ def resect(
             system = equations(here, noise)
         elif size < SMALL_STEP:
             break
-    covariance, state = torch.from_numpy(system.covariance()), here.state
+    state, covariance = here.state, torch.from_numpy(system.covariance)
     of_calibration = covariance.new_zeros(10)
     of_calibration[torch.from_numpy(free)] = covariance.diagonal()[6:].clamp(min=0).sqrt()
-    moving = 6 + len(prior.deviations.nonzero())  # where the motion begins, if it is free
     return ReprojectionFit(
         state.pose(), state.calibration, state.motion, noise, covariance[:6, :6].clone(), of_calibration[:4].clone(),
-        _marginal_of_last(system.hessian, covariance, moving),
-        torch.from_numpy(system.inverse_curvature())[moving:, moving:].clone(),
-        _slope(errors, state, noise, correlation, motion),
+        Minimum(errors, system, state, correlation, deviations),
     )  # fmt: skip
-
-
-def _marginal_of_last(hessian: Array, covariance: Float[Tensor, "p p"], first: int) -> Float[Tensor, "6 6"]:
-    """Return the part of the pose's covariance due to the unknowns from number ``first`` on, to which the others adapt."""
-    follows = torch.from_numpy(-damped_solution(hessian[:first, :first], 1e-9, hessian[:first, first:])[:6])
-    by_last = follows @ covariance[first:, first:] @ follows.mT
-    return (by_last + by_last.mT) / 2
-
-
-def _slope(
-    errors: ReprojectionErrors, state: State, noise: float, correlation: float, motion: MotionPrior
-) -> Float[Tensor, "6 4"]:
-    """Return the derivative of the best pose with respect to the calibration, with the best motion if that is unknown."""
-    deviations = motion.deviations.numpy()
-    free = np.concatenate([np.arange(4), 4 + deviations.nonzero()[0]])
-    system = errors.system(errors.linearized(state, free), noise).weighted(1 / correlation)
-    hessian = system.with_prior(state.camera[free[4:]], deviations[free[4:] - 4]).hessian
-    follows = np.concatenate([np.arange(6), np.arange(10, len(hessian))])
-    by_calibration = hessian[follows[:, None], np.arange(6, 10)]
-    slope = -damped_solution(hessian[follows[:, None], follows], 1e-9, by_calibration)
-    return torch.from_numpy(slope[:6])
 
 
 def log_likelihood_ratio(

@@ -2,52 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bidnerf_core.geometry.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry.robust import inlier_weight, mad_deviation
+from bidnerf_core.mapping.geometry.observations import Sightings
+from bidnerf_core.mapping.geometry.projection import projected
 
 TRIANGULATION_STEPS = 8
 """Number of Gauss-Newton steps; from the linear solution, four or five are enough."""
 DAMPING = 1e-6
 """Damping relative to the mean diagonal, which keeps the equations solvable for rays without parallax."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sightings:
-    """Observations of points: the point, the camera's pose, and the image position. Float64."""
-
-    point: Int[Tensor, "m"]
-    rotation: Float[Tensor, "m 3 3"]  # R_camera_world
-    centre: Float[Tensor, "m 3"]  # of the camera, metres, world
-    image: Float[Tensor, "m 2"]  # on the plane z = 1 of the camera
-    focal: Float[Tensor, "m"]  # pixels; residuals are multiplied by it
-
-    def __getitem__(self, index: Tensor) -> Sightings:
-        return Sightings(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    def __len__(self) -> int:
-        return len(self.point)
-
-    def directions(self) -> Float[Tensor, "m 3"]:
-        """Return unit vectors (world) from the cameras towards the observed points."""
-        ray = torch.cat([self.image, torch.ones_like(self.image[:, :1])], dim=-1)
-        world = (self.rotation.mT @ ray[..., None])[..., 0]
-        return world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
-
-    def in_camera(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
-        """Return the observed point of each observation in the frame of its camera."""
-        return (self.rotation @ (points[self.point] - self.centre)[..., None])[..., 0]
-
-    def residuals(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 2"]:
-        """Return projection minus observation, pixels; infinite for points behind the camera."""
-        local = self.in_camera(points)
-        z = local[:, 2:]
-        off = local[:, :2] / torch.where(z > 0, z, 1) - self.image
-        return torch.where(z > 0, off * self.focal[:, None], torch.inf)
 
 
 def intersected(sightings: Sightings, count: int) -> Float[Tensor, "n 3"]:
@@ -76,20 +42,14 @@ def refined_points(
 def _normal_equations(
     sightings: Sightings, points: Float[Tensor, "n 3"], scale: float
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
-    local = sightings.in_camera(points)
-    front = local[:, 2] > 0
-    z = torch.where(front, local[:, 2], 1)
-    residual = torch.where(front[:, None], sightings.residuals(points), 0)
-    weight = front / (1 + residual.square().sum(-1) / scale**2)
-    x, y, zero = local[:, 0] / z, local[:, 1] / z, torch.zeros_like(z)
-    inverse = sightings.focal / z
-    rows = torch.stack([inverse, zero, -x * inverse, zero, inverse, -y * inverse], dim=-1).unflatten(
-        -1, (2, 3)
-    )
-    jacobian = rows @ sightings.rotation
+    seen = projected(sightings.in_camera(points).numpy())
+    front = torch.from_numpy(seen.front)
+    off = (torch.from_numpy(seen.flat) - sightings.image) * sightings.focal[:, None]
+    weight = front * inlier_weight(off.square().sum(-1), scale)
+    jacobian = torch.from_numpy(seen.by_point(sightings.focal.numpy())) @ sightings.rotation
     weighted = jacobian.mT * weight[:, None, None]
     matrix = _summed(weighted @ jacobian, sightings.point, len(points))
-    return matrix, _summed((weighted @ residual[..., None])[..., 0], sightings.point, len(points))
+    return matrix, _summed((weighted @ off[..., None])[..., 0], sightings.point, len(points))
 
 
 def parallax(sightings: Sightings, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -119,7 +79,7 @@ def noise(sightings: Sightings, points: Float[Tensor, "n 3"]) -> float:
     seen = observations_per_point(sightings, len(points))
     spare = (1 - 1.5 / seen[sightings.point]).clamp(min=0.25)  # (2 m - 3) / 2 m for m observations
     residual = sightings.residuals(points) / spare.sqrt()[:, None]
-    return MAD_TO_SIGMA * float(residual.abs().median())
+    return mad_deviation(residual)
 
 
 def _damped(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:

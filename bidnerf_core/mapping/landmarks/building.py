@@ -15,12 +15,11 @@ from torch import Tensor
 from bidnerf_core.camera.rolling_shutter import AT_REST, exposure_times
 from bidnerf_core.errors import InputError, enumeration
 from bidnerf_core.frames.frame import SeenLandmarks, View
-from bidnerf_core.geometry.robust import chi_squared_quantile
+from bidnerf_core.geometry.robust import chi_squared_quantile, inlier_weight
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.observations import ObservedPoints, Sightings
 from bidnerf_core.mapping.geometry.resection import resect
 from bidnerf_core.mapping.geometry.triangulation import (
-    Sightings,
     fitting,
     intersected,
     noise,
@@ -111,7 +110,7 @@ def observed_at_rest(sightings: Sightings, positions: Float[Tensor, "n 3"], T: S
     eye = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
     return ObservedPoints(
         T.apply(sightings.in_camera(positions)), zeros[:, :2], zeros + torch.tensor([0.0, 0.0, 1.0]),
-        sightings.image, sightings.focal, zeros[:, 0], eye, zeros, zeros[:, 0], zeros[:, 0],
+        sightings.image, sightings.focal, zeros[:, 0], eye, zeros, sightings.exposure_times, zeros[:, 0],
     )  # fmt: skip
 
 
@@ -127,7 +126,7 @@ def robust_covariance(values: Float[Tensor, "n c"]) -> Float[Tensor, "c c"]:
     for _ in range(WEIGHT_ROUNDS):
         squared = (values @ torch.linalg.inv(covariance) * values).sum(-1).clamp(min=1e-12)
         squared = squared * (chi_squared_quantile(0.5, channels) / float(squared.median()))
-        weight = 1 / (1 + squared / channels)
+        weight = inlier_weight(squared, channels**0.5)
         covariance = (values.mT * weight) @ values / weight.sum() + 1e-9 * torch.diag(scale)
     squared = (values @ torch.linalg.inv(covariance) * values).sum(-1)
     covariance = covariance * (float(squared.median()) / chi_squared_quantile(0.5, channels))

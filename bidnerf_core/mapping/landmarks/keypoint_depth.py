@@ -8,8 +8,8 @@ from torch import Tensor
 
 from bidnerf_core.depth.sensors import UNKNOWN
 from bidnerf_core.frames.frame import Frame
-from bidnerf_core.geometry.robust import MAD_TO_SIGMA
-from bidnerf_core.mapping.geometry.triangulation import Sightings
+from bidnerf_core.geometry.robust import mad_deviation
+from bidnerf_core.mapping.geometry.observations import Sightings
 from bidnerf_core.mapping.landmarks.tracks import TrackedKeypoints
 
 DEPTH_EDGE = 0.05
@@ -56,7 +56,7 @@ def keypoint_depth_noise(
     if int(known.sum()) < ENOUGH_DEPTHS:
         return UNKNOWN.noise.linear
     off = depth[known] / sightings.in_camera(points)[known, 2] - 1
-    return max(1e-4, MAD_TO_SIGMA * float(off.abs().median()))
+    return max(1e-4, mad_deviation(off))
 
 
 def depth_ratio(

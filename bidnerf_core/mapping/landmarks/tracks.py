@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 from bidnerf_core.camera.rolling_shutter import AT_REST, poses_of_rows
 from bidnerf_core.frames.frame import SeenLandmarks, View
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.mapping.geometry.triangulation import Sightings
+from bidnerf_core.mapping.geometry.observations import Sightings
 from bidnerf_core.mapping.landmarks.features import Keypoints, squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
@@ -192,25 +193,21 @@ class TrackedKeypoints:
         return torch.searchsorted(last, self.number, right=True)
 
     @property
-    def exposure_times(self) -> Float[Tensor, "m"]:
-        """The times at which the keypoints were exposed, see ``rolling_shutter``."""
-        return torch.cat([p.exposure_times for p in self.images])[self.number]
-
-    @property
     def motion(self) -> Float[Tensor, "v 6"]:
         """The motion of each image's camera while its rows were exposed."""
         return torch.stack([p.motion for p in self.images])
 
-    @property
+    @cached_property
     def sightings(self) -> Sightings:
         """The keypoints as observations by cameras at the poses at which their rows were exposed."""
         image, motion = self.image, self.motion
+        times = torch.cat([p.exposure_times for p in self.images])[self.number]
         T = SE3.stack([p.T_world_camera for p in self.images])[image]
         if bool(motion.any()):
-            T = T @ poses_of_rows(self.exposure_times, motion[image])
+            T = T @ poses_of_rows(times, motion[image])
         focal = torch.tensor([p.focal for p in self.images], dtype=torch.float64)
         rays = torch.cat([p.rays for p in self.images])[self.number]
-        return Sightings(self.point, T.rotation.mT, T.translation, rays[:, :2], focal[image])
+        return Sightings(self.point, image, T.rotation.mT, T.translation, rays[:, :2], focal[image], times)
 
     @property
     def sizes(self) -> Float[Tensor, "m"]:

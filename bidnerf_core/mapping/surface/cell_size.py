@@ -15,7 +15,7 @@ from bidnerf_core.depth.sensors import UNKNOWN
 from bidnerf_core.errors import InputError, InputWarning
 from bidnerf_core.fields.contract import SceneBounds
 from bidnerf_core.fields.voxel_grid import VoxelGrid
-from bidnerf_core.geometry.robust import MAD_TO_SIGMA
+from bidnerf_core.geometry.robust import mad_deviation
 from bidnerf_core.mapping.surface.posed_depth import PosedDepthImage, witnesses
 from bidnerf_core.mapping.surface.surface_map import surfel_bytes
 from bidnerf_core.mapping.surface.surfel_index import BLOCK_SIDE, MOST_CELLS, block_levels, index_bytes
@@ -86,9 +86,7 @@ def _spread(
         return 0.0
     near = differences[differences <= GROSS * differences.median()]
     distance = _median([float(depths.median()) for _, depths in _depths(images, opacity)])
-    return min(
-        MAD_TO_SIGMA * float(near.median()) / math.sqrt(2), MOST_NOISE * UNKNOWN.noise.deviation(distance)
-    )
+    return min(mad_deviation(near) / math.sqrt(2), MOST_NOISE * UNKNOWN.noise.deviation(distance))
 
 
 def chosen_grid(
