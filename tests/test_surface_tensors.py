@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
 import baked
 from bidnerf_core.mapping import surface_from_tensors, surface_tensors
-from bidnerf_core.mapping.tensors import INDEX_KINDS
-from voxels import cell_centres
 
 
 def test_there_and_back() -> None:
@@ -78,23 +76,3 @@ def test_a_missing_tensor_is_named(name: str) -> None:
     del tensors[name]
     with pytest.raises(KeyError, match=name):
         surface_from_tensors(tensors)
-
-
-def dense_tensors(generator: Generator) -> tuple[dict[str, Tensor], Tensor]:
-    """Return a surface as older versions stored it, and the surfel of each of its cells."""
-    tensors = surface_tensors(baked.toy())
-    for name in INDEX_KINDS:
-        del tensors[name]
-    nearest = torch.randint(0, len(tensors["positions"]), (13, 8, 21), generator=generator, dtype=torch.int32)
-    return tensors | {"nearest": nearest}, nearest
-
-
-def test_a_dense_index_of_an_older_version_gives_the_same_answers(generator: Generator) -> None:
-    tensors, nearest = dense_tensors(generator)
-    surface = surface_from_tensors(tensors)
-    assert surface.grid.shape == (13, 8, 21)
-    assert torch.equal(surface.nearest(cell_centres(surface.grid)), nearest.long())
-    stored = surface_from_tensors(surface_tensors(surface))
-    assert torch.equal(stored.nearest(cell_centres(surface.grid)), nearest.long())
-    with pytest.raises(ValueError, match="nearest has indices"):
-        surface_from_tensors(tensors | {"nearest": -1 - nearest})

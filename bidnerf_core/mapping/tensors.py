@@ -36,9 +36,7 @@ INDEX_KINDS: Kinds = {
     "level": ((-1, -1, -1), torch.uint8),
     "entries": ((-1,), torch.int32),
 }
-DENSE_KINDS: Kinds = {"nearest": ((-1, -1, -1), torch.int32)}
-"""The index of surfaces that older versions baked: one surfel for each cell of the grid."""
-LANDMARK_KINDS = {
+LANDMARK_KINDS: Kinds = {
     "positions": ((-1, 3), torch.float32),
     "deviations": ((-1, 2), torch.float32),
     "descriptors": ((-1, -1), torch.uint8),
@@ -48,16 +46,12 @@ LANDMARK_KINDS = {
     "views": ((-1,), torch.int32),
     "noise": ((), torch.float64),
     "pose_covariance": ((6, 6), torch.float64),
-}
-"""Shape (-1: any length) and dtype of each tensor."""
-LATER_KINDS = {
     "correlation": ((), torch.float64),
     "usual_matches": ((), torch.float64),
     "calibration_scatter": ((4,), torch.float64),
     "trial": ((4,), torch.float64),  # the fields of ``HeldOutTrial`` in order
     "moving": ((), torch.float64),
 }
-"""Shape and dtype of the tensors that maps of earlier versions lack."""
 
 
 def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
@@ -76,16 +70,17 @@ def surface_tensors(surface: SurfaceMap) -> dict[str, Tensor]:
 
 
 def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
-    """Return the surface from the tensors that ``surface_tensors`` of this or an older version returned.
+    """Return the surface from the tensors that ``surface_tensors`` returned.
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """
-    dense = "nearest" in tensors
-    check_kinds(tensors, SURFACE_KINDS | (DENSE_KINDS if dense else INDEX_KINDS))
+    check_kinds(tensors, SURFACE_KINDS | INDEX_KINDS)
     count = len(tensors["positions"])
     if any(len(tensors[name]) != count for name in ("normals", "rgb", "rgb_gradient")) or not count:
         raise ValueError("expected equally many positions, normals and colours of surfels, and at least one")
-    _check_surfels_exist(tensors, "nearest" if dense else "entries", count)
+    entries = tensors["entries"]
+    if not entries.numel() or not 0 <= int(entries.min()) <= int(entries.max()) < count:
+        raise ValueError(f"entries has indices of surfels that do not exist, expected 0 to {count - 1}")
     if not float(tensors["cell"]) > 0:
         raise ValueError(f"cell is {float(tensors['cell'])}, expected a length")
     check_range(tensors, "positions", -LARGEST_LENGTH, LARGEST_LENGTH)
@@ -96,8 +91,7 @@ def surface_from_tensors(tensors: dict[str, Tensor]) -> SurfaceMap:
     if not len(tensors["keyframes"]) or not bool(SE3.from_matrix(tensors["keyframes"]).is_rigid().all()):
         raise ValueError("no keyframe, or one that is not rigid")
     surfels = Surfels(*(tensors[name] for name in ("positions", "normals", "rgb", "rgb_gradient")))
-    index = _dense_index(tensors) if dense else _index(tensors)
-    return SurfaceMap(surfels, index, tensors["keyframes"])
+    return SurfaceMap(surfels, _index(tensors), tensors["keyframes"])
 
 
 def check_kinds(tensors: dict[str, Tensor], kinds: Kinds) -> None:
@@ -129,27 +123,14 @@ def check_unit_length(tensors: dict[str, Tensor], name: str) -> None:
         raise ValueError(f"{name} are not of unit length")
 
 
-def _check_surfels_exist(tensors: dict[str, Tensor], name: str, count: int) -> None:
-    named = tensors[name]
-    if not named.numel() or not 0 <= int(named.min()) <= int(named.max()) < count:
-        raise ValueError(f"{name} has indices of surfels that do not exist, expected 0 to {count - 1}")
-
-
-def _grid(tensors: dict[str, Tensor], shape: list[int]) -> VoxelGrid:
-    (x, y, z), (nx, ny, nz) = tensors["lower"].tolist(), shape
-    return VoxelGrid((x, y, z), float(tensors["cell"]), (nx, ny, nz))
-
-
-def _dense_index(tensors: dict[str, Tensor]) -> SurfelIndex:
-    return SurfelIndex.of_cells(_grid(tensors, list(tensors["nearest"].shape)), tensors["nearest"])
-
-
 def _index(tensors: dict[str, Tensor]) -> SurfelIndex:
     """Return the index, checked so that no look-up reads outside of it."""
     shape: list[int] = tensors["shape"].tolist()
     if min(shape) < 1 or max(shape) > 2**31:
         raise ValueError(f"shape is {shape}, expected numbers of cells")
-    grid, level, first = _grid(tensors, shape), tensors["level"], tensors["first"]
+    (x, y, z), (nx, ny, nz) = tensors["lower"].tolist(), shape
+    grid = VoxelGrid((x, y, z), float(tensors["cell"]), (nx, ny, nz))
+    level, first = tensors["level"], tensors["first"]
     if not block_shape(grid) == tuple(level.shape) == tuple(first.shape):
         raise ValueError(f"level and first are of other blocks than those of a grid of {shape} cells")
     if int(level.max()) > len(COARSER_FROM):
@@ -162,12 +143,8 @@ def _index(tensors: dict[str, Tensor]) -> SurfelIndex:
 
 def landmark_tensors(landmarks: LandmarkMap) -> dict[str, Tensor]:
     """Return copies of the tensors of ``landmarks``, by name and in the dtypes of ``LANDMARK_KINDS``."""
-    values = {name: getattr(landmarks, name) for name in LANDMARK_KINDS | LATER_KINDS}
-    values["trial"] = astuple(landmarks.trial)
-    found = {
-        name: torch.as_tensor(values[name], dtype=kind)
-        for name, (_, kind) in (LANDMARK_KINDS | LATER_KINDS).items()
-    }
+    values = {name: getattr(landmarks, name) for name in LANDMARK_KINDS} | {"trial": astuple(landmarks.trial)}
+    found = {name: torch.as_tensor(values[name], dtype=kind) for name, (_, kind) in LANDMARK_KINDS.items()}
     return {name: value.contiguous().clone() for name, value in found.items()}
 
 
@@ -176,15 +153,12 @@ def landmarks_from_tensors(tensors: dict[str, Tensor]) -> LandmarkMap:
 
     Raises ``KeyError`` for a missing tensor, ``ValueError`` for one of a wrong shape, dtype or content.
     """
-    present = LANDMARK_KINDS | {name: kind for name, kind in LATER_KINDS.items() if name in tensors}
-    check_kinds(tensors, present)
+    check_kinds(tensors, LANDMARK_KINDS)
     _check_contents(tensors)
-    parts: dict[str, Any] = {name: tensors[name] for name in present}
-    for name in {"noise", "correlation", "usual_matches", "moving"} & present.keys():
-        parts[name] = float(tensors[name])
-    if "trial" in parts:
-        images, found, translation, rotation_deg = parts["trial"].tolist()
-        parts["trial"] = HeldOutTrial(int(images), int(found), translation, rotation_deg)
+    parts: dict[str, Any] = {name: tensors[name] for name in LANDMARK_KINDS}
+    parts |= {name: float(tensors[name]) for name in ("noise", "correlation", "usual_matches", "moving")}
+    images, found, translation, rotation_deg = tensors["trial"].tolist()
+    parts["trial"] = HeldOutTrial(int(images), int(found), translation, rotation_deg)
     return LandmarkMap(**parts)
 
 
@@ -197,13 +171,13 @@ def _check_contents(tensors: dict[str, Tensor]) -> None:
         raise ValueError("descriptors have no channels")
     if not float(tensors["noise"]) > 0:
         raise ValueError(f"noise is {float(tensors['noise'])}, expected a positive number of pixels")
-    if "correlation" in tensors and not float(tensors["correlation"]) > 0:
+    if not float(tensors["correlation"]) > 0:
         raise ValueError(f"correlation is {float(tensors['correlation'])}, expected a positive number")
-    if "usual_matches" in tensors and not float(tensors["usual_matches"]) >= 0:
+    if not float(tensors["usual_matches"]) >= 0:
         raise ValueError(f"usual_matches is {float(tensors['usual_matches'])}, expected 0 or more")
-    if "moving" in tensors and not 0 <= float(tensors["moving"]) <= 1:
+    if not 0 <= float(tensors["moving"]) <= 1:
         raise ValueError(f"moving is {float(tensors['moving'])}, expected a share of the images")
-    if "calibration_scatter" in tensors and not bool((tensors["calibration_scatter"] > 0).all()):
+    if not bool((tensors["calibration_scatter"] > 0).all()):
         raise ValueError(
             f"calibration_scatter is {tensors['calibration_scatter'].tolist()}, expected positive"
         )

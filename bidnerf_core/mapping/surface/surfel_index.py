@@ -59,23 +59,6 @@ class SurfelIndex:
         tree = cKDTree(positions.numpy(), leafsize=LEAF)
         return SurfelIndex(grid, first, level, _nearest_to_middles(tree, grid, level))
 
-    @staticmethod
-    def of_cells(grid: VoxelGrid, nearest: Int[Tensor, "x y z"]) -> SurfelIndex:
-        """Return the index in which each cell of ``grid`` has an entry of its own: its surfel in ``nearest``."""
-        shape = block_shape(grid)
-        padded = torch.zeros([BLOCK_SIDE * count for count in shape], dtype=torch.int32)
-        padded[tuple(slice(count) for count in grid.shape)] = nearest
-        x, y, z = shape
-        blocks = (
-            padded.view(x, BLOCK_SIDE, y, BLOCK_SIDE, z, BLOCK_SIDE)
-            .permute(0, 2, 4, 1, 3, 5)
-            .reshape(-1, CELLS_OF_BLOCK)
-        )
-        entries = torch.empty_like(blocks)
-        entries[:, _morton(torch.cartesian_prod(*3 * [torch.arange(BLOCK_SIDE)]))] = blocks
-        level = torch.zeros(shape, dtype=torch.uint8)
-        return SurfelIndex(grid, _firsts(level), level, entries.view(-1))
-
     @property
     def bytes(self) -> int:
         """Memory that the index takes once it is in use."""
