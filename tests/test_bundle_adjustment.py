@@ -11,7 +11,7 @@ from torch import Tensor
 from bidnerf_core import SE3
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, poses_of_rows
 from bidnerf_core.mapping import Adjustment, PosePrior, adjusted
-from bidnerf_core.mapping.geometry.bundle_adjustment import SETTLED, linearized
+from bidnerf_core.mapping.geometry.bundle_adjustment import SMALL_DECREASE, linearized
 from bidnerf_core.mapping.geometry.observations import Sightings
 from landmark_scene import looking_in
 
@@ -52,9 +52,11 @@ class Capture:
         T = given[image]
         return Sightings(point, image, T.rotation.mT, T.translation, flat, focal, times)
 
-    def adjusted(self, given: SE3, prior: PosePrior, settled: float = SETTLED) -> Adjustment:
+    def adjusted(self, given: SE3, prior: PosePrior, tolerance: float = SMALL_DECREASE) -> Adjustment:
         """What an adjustment finds, from the ``given`` poses and the true points."""
-        return adjusted(self.seen(given), at_rest(given, self.points), prior, self.accuracy, settled=settled)
+        return adjusted(
+            self.seen(given), at_rest(given, self.points), prior, self.accuracy, tolerance=tolerance
+        )
 
     @property
     def accuracy(self) -> float:
@@ -163,7 +165,7 @@ def test_exact_sightings_take_errors_of_poses_back() -> None:
     """What is left is what no image shows: a motion and a scale of everything, about which the prior has an opinion."""
     capture = Capture()
     given = capture.poses.retract(errors())
-    found = capture.adjusted(given, prior(given), settled=1e-12).T_world_camera
+    found = capture.adjusted(given, prior(given), tolerance=1e-12).T_world_camera
     translation, rotation = off(relative(found), relative(capture.poses))
     before = off(relative(given), relative(capture.poses))
     assert translation < 0.15 * before[0]  # the scale

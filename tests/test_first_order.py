@@ -157,12 +157,12 @@ def test_updates_are_written_where_the_pivot_is(problem: Problem) -> None:
 
 
 def test_a_turn_moves_the_camera_as_far_as_a_shift(problem: Problem) -> None:
-    assert pivot("camera", problem).reach == 1
-    assert pivot("world", problem).reach == 1
+    assert pivot("camera", problem).lever_arm == 1
+    assert pivot("world", problem).lever_arm == 1
     about = pivot("scene", problem)
     turn = torch.tensor([0, 0, 0, 1e-4, 0, 0], dtype=torch.float64)
     shift = float((about.moved(TRUTH, turn).translation - TRUTH.translation).norm())
-    assert shift == pytest.approx(1e-4 * about.reach, rel=0.05)
+    assert shift == pytest.approx(1e-4 * about.lever_arm, rel=0.05)
 
 
 def test_fixed_pixels_are_drawn_once(problem: Problem) -> None:

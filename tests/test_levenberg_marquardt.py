@@ -105,7 +105,7 @@ def test_no_unit_matters() -> None:
 def test_it_stops_where_steps_are_short() -> None:
     found = descend(evaluate, starts(4), 50, stop=1e-6)
     assert len(found.accepted) < 15
-    assert bool(found.settled.all())
+    assert bool(found.converged.all())
     longer = descend(evaluate, found.T, 5)
     torch.testing.assert_close(longer.T.matrix(), found.T.matrix(), rtol=0, atol=1e-5)
 
@@ -113,7 +113,7 @@ def test_it_stops_where_steps_are_short() -> None:
 def test_no_step_is_a_descent_of_its_own() -> None:
     found = descend(evaluate, starts(3), 0)
     assert found.accepted.shape == (0, 3)
-    assert not bool(found.settled.any())
+    assert not bool(found.converged.any())
     assert torch.equal(found.T.matrix(), starts(3).matrix())
 
 

@@ -74,7 +74,7 @@ class Place:
         with without_waiting(), self.checked():
             done = descend(cost, first.T, 2, about.moved, stop=1e-4)
             scores = score(done.T)
-        parts = (done.T.matrix(), done.costs, done.equations.gradient, done.equations.hessian, done.settled)
+        parts = (done.T.matrix(), done.costs, done.equations.gradient, done.equations.hessian, done.converged)
         return [*parts, done.accepted, scores]
 
 

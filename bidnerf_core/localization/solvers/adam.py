@@ -85,7 +85,7 @@ class AdamSteps:
     def __init__(self, loss: Loss, pivot: Pivot, config: AdamSettings, start: SE3) -> None:
         device = start.translation.device
         self._loss, self._pivot, self._config = loss, pivot.to(device), config
-        turning = config.learning_rate / pivot.reach
+        turning = config.learning_rate / pivot.lever_arm
         self._rate = torch.tensor([config.learning_rate] * 3 + [turning] * 3, dtype=torch.float64).to(device)
         self._T = SE3(start.rotation.clone(), start.translation.clone())
         self._steps, self._updates = (torch.zeros((), dtype=torch.float64, device=device) for _ in range(2))

@@ -25,7 +25,7 @@ class Descent:
     accepted: Bool[Tensor, "s h"]  # which steps lowered the cost
     poses: SE3  # (s + 1, h)
     costs: Float[Tensor, "t h"]  # of these poses
-    settled: Bool[Tensor, "h"]  # which poses reached a place where a step is shorter than ``stop``
+    converged: Bool[Tensor, "h"]  # which poses reached a place where a step is shorter than ``stop``
 
 
 def descend(
@@ -38,29 +38,29 @@ def descend(
 ) -> Descent:
     """Take ``steps`` steps from the poses ``start`` (h); a step that does not lower its pose's cost is undone.
 
-    Damping scales with the diagonal (Marquardt 1963), so that units do not matter. ``stop``: a pose has settled once a
+    Damping scales with the diagonal (Marquardt 1963), so that units do not matter. ``stop``: a pose has converged once a
     lightly damped step is shorter than this (norm of the tangent), whether or not it still lowers the cost; the descent
     ends when all poses have, unless the host must not wait for the device to find out. 0: never.
     """
     T, here = start, cost(start)
     factor = torch.full_like(here.cost, damping)
-    settled = torch.zeros_like(here.cost, dtype=torch.bool)
+    converged = torch.zeros_like(here.cost, dtype=torch.bool)
     accepted, poses, costs = [], [T], [here.cost]
     for _ in range(steps):
         delta = here.solve(factor)
         trial = retract(T, delta)
         there = cost(trial)
         better = there.cost < here.cost  # never where it is NaN
-        settled |= _short(delta, factor, here, stop)
+        converged |= _short(delta, factor, here, stop)
         T, here = _chosen(better, trial, T), there.chosen(better, here)
         factor = torch.where(better, factor / 4, factor * 6).clamp(LEAST_DAMPING, MOST_DAMPING)
         accepted.append(better)
         poses.append(T)
         costs.append(here.cost)
-        if stop and may_wait(settled.device) and bool(settled.all()):
+        if stop and may_wait(converged.device) and bool(converged.all()):
             break
-    history = torch.stack(accepted) if accepted else torch.zeros((0, len(settled))).to(settled)
-    return Descent(T, here, history, SE3.stack(poses), torch.stack(costs), settled)
+    history = torch.stack(accepted) if accepted else torch.zeros((0, len(converged))).to(converged)
+    return Descent(T, here, history, SE3.stack(poses), torch.stack(costs), converged)
 
 
 def _short(

@@ -32,7 +32,7 @@ class Pivot:
         return self if self.T_camera_pivot is None else Pivot(self.T_camera_pivot.to(device))
 
     @property
-    def reach(self) -> float:
+    def lever_arm(self) -> float:
         """Distance (metres) by which a rotation of one radian moves the camera, but at least 1.
 
         It balances steps of translation and rotation. In the world's frame it is 1, since iNeRF does not balance them.

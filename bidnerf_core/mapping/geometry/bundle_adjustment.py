@@ -23,7 +23,7 @@ from bidnerf_core.mapping.geometry.projection import by_update, projected
 
 ADJUSTMENT_STEPS = 30
 """Largest number of steps; from poses that are off by a few pixels, about ten suffice."""
-SETTLED = 1e-4
+SMALL_DECREASE = 1e-4
 """Relative decrease of the cost below which the iteration has converged."""
 LARGEST_DAMPING = 1e6
 """Damping (relative to the diagonal) beyond which no smaller step is tried."""
@@ -60,12 +60,12 @@ def adjusted(
     prior: PosePrior,
     noise: float,
     correlation: float = 1.0,
-    settled: float = SETTLED,
+    tolerance: float = SMALL_DECREASE,
 ) -> Adjustment:
     """Minimize the robust reprojection errors and the prior, from ``start``; the poses in ``sightings`` have no part in it.
 
     ``noise`` is the standard deviation of a sighting along each axis (pixels), and ``correlation`` the number of sightings that
-    count as one, because their errors are correlated. Images without sightings keep their given poses. ``settled`` is the
+    count as one, because their errors are correlated. Images without sightings keep their given poses. ``tolerance`` is the
     relative decrease of the cost that ends the iteration. Motions stay where they are if ``prior`` leaves none free.
     """
     state, damping = start, 1e-4
@@ -80,7 +80,7 @@ def adjusted(
             continue
         gained = system.cost - tried.cost
         state, system, damping = moved, tried, max(damping / 10, 1e-9)
-        if gained <= settled * system.cost:
+        if gained <= tolerance * system.cost:
             break
     return replace(state, T_world_camera=state.T_world_camera.normalized(), cost=system.cost)
 
@@ -157,26 +157,26 @@ def linearized(
         by_view = torch.cat([by_view, times[:, None, None] * by_view], dim=-1)
     views, count = len(state.motion), len(state.points)
     view_weighted, point_weighted = (by.mT * weight[:, None, None] for by in (by_view, by_point))
-    held = _held(state, prior)
+    term = _prior_term(state, prior)
     column = off[..., None]
     return AdjustmentSystem(
-        cost + held.cost,
-        _summed((view_weighted @ column)[..., 0], view, views) + held.gradient,
+        cost + term.cost,
+        _summed((view_weighted @ column)[..., 0], view, views) + term.gradient,
         _summed((point_weighted @ column)[..., 0], point, count),
-        _summed(view_weighted @ by_view, view, views) + torch.diag_embed(held.precision),
+        _summed(view_weighted @ by_view, view, views) + torch.diag_embed(term.precision),
         _summed(point_weighted @ by_point, point, count),
         view_weighted @ by_point, view, point,
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class _Held:
+class _PriorTerm:
     cost: float
     gradient: Float[Tensor, "v k"]
     precision: Float[Tensor, "v k"]
 
 
-def _held(state: Adjustment, prior: PosePrior) -> _Held:
+def _prior_term(state: Adjustment, prior: PosePrior) -> _PriorTerm:
     """Return the prior's part: the distances from the given poses in standard deviations, under a Cauchy loss, and the
     motions under a quadratic one.
     """
@@ -192,7 +192,7 @@ def _held(state: Adjustment, prior: PosePrior) -> _Held:
         of_motion = (prior.motion.deviations**-2).expand_as(state.motion)
         cost += 0.5 * float((of_motion * state.motion.square()).sum())
         off, precision = torch.cat([off, state.motion], dim=-1), torch.cat([precision, of_motion], dim=-1)
-    return _Held(cost, precision * off, precision)
+    return _PriorTerm(cost, precision * off, precision)
 
 
 def _damped(blocks: Float[Tensor, "b k k"], damping: float) -> Float[Tensor, "b k k"]:

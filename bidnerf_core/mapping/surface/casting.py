@@ -29,15 +29,15 @@ def cast(
     origins: Float[Tensor, "r 3"],
     directions: Float[Tensor, "r 3"],
     steps: int = 36,
-    reach: float | None = None,
+    radius: float | None = None,
 ) -> Cast:
-    """Trace rays (metres, world; unit directions) until they are within ``reach`` of a surfel (metres; by default the
-    surface's own). A step is as long as the clearance, and a cell at least.
+    """Trace rays (metres, world; unit directions) until they are within ``radius`` of a surfel (metres; by default that of the
+    surface's discs). A step is as long as the clearance, and a cell at least.
 
     A ray that does not cross the grid counts as closest where it is nearest to the grid's centre. Rays must be on the surface's
     device. Where the host must not wait, rays that are done are not dropped but traced to the end, without effect.
     """
-    reach = surface.reach if reach is None else reach
+    radius = surface.surfel_radius if radius is None else radius
     rays, cell = surface.grid.rays(origins, directions), surface.grid.cell
     best = ((constant(surface.grid.centre, origins) - origins) * directions).sum(-1).clamp(min=0)
     index = surface.nearest(rays.at(best[:, None])[:, 0])
@@ -53,7 +53,7 @@ def cast(
         points = o + here[:, None] * d
         nearest = surface.nearest(points)
         clearance = torch.linalg.vector_norm(points - surface.surfels.positions[nearest], dim=-1)
-        hit = clearance < reach
+        hit = clearance < radius
         angle = torch.where(hit, 0, clearance / here.clamp(min=cell))
         closer = on & (angle < least[left])
         for values, new in ((least, angle), (best, here), (index, nearest)):

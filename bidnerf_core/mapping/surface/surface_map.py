@@ -17,7 +17,7 @@ from bidnerf_core.mapping.surface.surfel_index import SurfelIndex
 
 SURFEL_NEIGHBOURS = 12
 """Number of surfels to which the plane and the colour gradient of each surfel are fitted."""
-REACH = 0.7
+RADIUS = 0.7
 """Radius of a surfel, as a fraction of its distance from its fourth neighbour."""
 
 
@@ -134,7 +134,7 @@ class SurfaceMap:
         return float(torch.linalg.vector_norm(high - low))
 
     @cached_property
-    def reach(self) -> float:
+    def surfel_radius(self) -> float:
         """Distance from a surfel at which a ray counts as having met it (metres).
 
         It is a share of the distance to the fourth neighbour, which nine tenths of the surfels do not exceed: large enough
@@ -143,7 +143,7 @@ class SurfaceMap:
         points = self.surfels.positions.cpu().numpy()  # scipy's tree is the host's
         away, _ = cKDTree(points).query(points[:: max(1, len(points) // 5000)], k=min(5, len(points)))
         return (
-            REACH * float(np.quantile(np.asarray(away).reshape(-1, min(5, len(points)))[:, -1], 0.9))
+            RADIUS * float(np.quantile(np.asarray(away).reshape(-1, min(5, len(points)))[:, -1], 0.9))
             or self.cell
         )
 
@@ -155,8 +155,8 @@ class SurfaceMap:
         return ordered[round(0.05 * last)], ordered[round(0.95 * last)]
 
     def warm_up(self) -> None:
-        """Compute the cached extent and reach now, so that the first localization takes no longer than the others."""
-        _ = self.extent, self.reach
+        """Compute the cached extent and radius now, so that the first localization takes no longer than the others."""
+        _ = self.extent, self.surfel_radius
         self.index.warm_up()
 
     def nearest(self, points: Float[Tensor, "*p 3"]) -> Int[Tensor, "*p"]:
