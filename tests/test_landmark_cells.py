@@ -17,16 +17,17 @@ from bidnerf_core.mapping.landmarks.building import build_landmarks
 from bidnerf_core.mapping.landmarks.landmark_cells import MOST_IN_CELL, LandmarkCells
 from landmark_scene import Points, looking_in, ring
 
-OBLIQUE = 0.7
+OBLIQUE, SIZE = 0.7, 0.01
 
 
-def some(count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Return positions in a long house, directions in which they were seen, and cones about these."""
+def some(count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return positions in a long house, directions in which they were seen, cones about these, and sizes."""
     generator = torch.Generator().manual_seed(seed)
     positions = torch.rand(count, 3, generator=generator) * torch.tensor([40.0, 10.0, 3.0])
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     directions[: count // 2] = torch.tensor([0.0, 0.0, 1.0])
-    return positions, directions, torch.rand(count, generator=generator)
+    cones, sizes = torch.rand(2, count, generator=generator)
+    return positions, directions, cones, 0.2 * sizes
 
 
 def poses(count: int) -> SE3:
@@ -36,13 +37,18 @@ def poses(count: int) -> SE3:
     return SE3(SE3.exp(torch.cat([torch.zeros_like(turn), turn], dim=-1)).rotation, place)
 
 
-def shown(T: SE3, slopes: Tensor, positions: Tensor, directions: Tensor, cones: Tensor) -> Tensor:
+def shown(
+    T: SE3, slopes: Tensor, positions: Tensor, directions: Tensor, cones: Tensor, sizes: Tensor
+) -> Tensor:
     """Return which landmarks an image shows, from the definition."""
     local = T.inverse().to(torch.float32).apply(positions)
     towards = torch.nn.functional.normalize(T.translation.float() - positions, dim=-1)
     angle = (towards * directions).sum(-1).clamp(-1, 1).acos()
     return (
-        (local[:, :2].abs() <= slopes * local[:, 2:]).all(-1) & (local[:, 2] > 0) & (angle <= cones + OBLIQUE)
+        (local[:, :2].abs() <= slopes * local[:, 2:]).all(-1)
+        & (local[:, 2] > 0)
+        & (sizes >= SIZE * local[:, 2])
+        & (angle <= cones + OBLIQUE)
     )
 
 
@@ -52,7 +58,7 @@ def test_no_landmark_in_the_image_is_left_out(count: int) -> None:
     cells, looked_at = LandmarkCells.of(*landmarks), 0
     for number in range(40):
         T = poses(40)[number]
-        found = cells.seen_from(T, slopes, OBLIQUE)
+        found = cells.seen_from(T, slopes, OBLIQUE, SIZE)
         assert len(found.unique()) == len(found)
         assert not torch.isin(shown(T, slopes, *landmarks).nonzero()[:, 0], found, invert=True).any()
         looked_at += len(found)
@@ -60,8 +66,8 @@ def test_no_landmark_in_the_image_is_left_out(count: int) -> None:
 
 
 def test_each_landmark_is_in_one_cell_which_holds_it() -> None:
-    positions, directions, cones = some(5000)
-    cells = LandmarkCells.of(positions, directions, cones)
+    positions, *others = some(5000)
+    cells = LandmarkCells.of(positions, *others)
     assert torch.equal(cells.order.sort().values, torch.arange(5000))
     assert int(cells.counts.max()) <= MOST_IN_CELL
     cell = torch.arange(len(cells.counts)).repeat_interleave(cells.counts)

@@ -85,21 +85,10 @@ class ProjectedLandmarks:
             local = moved_points(local, times, motion)
             self._pixels = calibration.pixels(local[:, :2] / local[:, 2:], image.focal)
         self._sizes = landmarks.sizes[self._index] * focal / local[:, 2]
-        self._visible = len(self._index)
-        kept = self._of_a_size_that_matches()
-        self._index, self._pixels, self._sizes = self._index[kept], self._pixels[kept], self._sizes[kept]
         self._tree = cKDTree(self._pixels.numpy()) if len(self._pixels) else None
 
     def __len__(self) -> int:
-        return self._visible
-
-    def _of_a_size_that_matches(self) -> Bool[Tensor, "n"]:
-        """Return which landmarks have about the size of some keypoint: far beyond a wall there are many others."""
-        sizes = self._image.keypoints.sizes
-        if not len(sizes):
-            return torch.zeros(len(self._index), dtype=torch.bool)
-        least, most = sizes.aminmax()
-        return (self._sizes >= least / 2**OCTAVES) & (self._sizes <= most * 2**OCTAVES)
+        return len(self._index)
 
     def matches(
         self, radius: float, most_distance: float, shift: tuple[float, float] = (0.0, 0.0)
@@ -141,15 +130,19 @@ def _visible(
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 3"]]:
     """Return the landmarks in front of the camera, inside its image, and seen roughly from a mapped direction.
 
-    Their positions are in the camera's frame.
+    They are not much smaller than the smallest keypoint: beyond a wall there may be many. Their positions are in the camera's
+    frame.
     """
     camera = image.intrinsics
     half = torch.tensor([max(camera.cx, camera.width - camera.cx), max(camera.cy, camera.height - camera.cy)])
     # Distortion moves the edges of the image. A generous margin does no harm: landmarks outside match no keypoint.
     slopes = (1.3 * half + margin) / focal
-    index = landmarks.seen_from(T_world_camera, slopes, OBLIQUE)
+    found = image.keypoints.sizes
+    size = float(found.min()) / (2**OCTAVES * focal) if len(found) else 0.0
+    index = landmarks.seen_from(T_world_camera, slopes, OBLIQUE, size)
     local = T_world_camera.inverse().to(torch.float32).apply(landmarks.positions[index])
     inside = (local[:, :2].abs() <= slopes * local[:, 2:]).all(-1) & (local[:, 2] > 0)
+    inside &= landmarks.sizes[index] >= size * local[:, 2]
     index, local = index[inside], local[inside]
     towards = T_world_camera.translation.float() - landmarks.positions[index]
     cosine = (towards * landmarks.directions[index]).sum(-1) / torch.linalg.vector_norm(local, dim=-1)

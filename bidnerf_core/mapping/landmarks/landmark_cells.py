@@ -27,15 +27,17 @@ class LandmarkCells:
     centres: Float[Tensor, "c 3"]
     radii: Float[Tensor, "c"]  # metres
     directions: Float[Tensor, "c 3"]  # unit
-    cones: Float[
-        Tensor, "c"
-    ]  # radians: greatest angle between ``directions`` and a camera that saw a landmark
+    cones: Float[Tensor, "c"]  # radians: greatest angle between ``directions`` and a camera
+    sizes: Float[Tensor, "c"]  # metres: of the largest landmark
 
     @staticmethod
     def of(
-        positions: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], cones: Float[Tensor, "n"]
+        positions: Float[Tensor, "n 3"],
+        directions: Float[Tensor, "n 3"],
+        cones: Float[Tensor, "n"],
+        sizes: Float[Tensor, "n"],
     ) -> LandmarkCells:
-        """Sort landmarks into cells; ``directions`` and ``cones`` are those of ``LandmarkMap``."""
+        """Sort landmarks into cells; all tensors are as in ``LandmarkMap``."""
         tree = cKDTree(positions.numpy(), leafsize=MOST_IN_CELL)
         bounds = np.array(list(_leaves(tree.tree)), dtype=np.int64)
         first, counts, order = bounds[:, 0], bounds[:, 1] - bounds[:, 0], tree.indices
@@ -46,17 +48,21 @@ class LandmarkCells:
         rounding = 1e-6 * np.abs(points).max()
         apart = 1.001 * np.linalg.norm(points - centres[cell], axis=-1) + rounding
         angle = np.arccos((towards * mean.numpy()[cell]).sum(-1).clip(-1, 1)) + cones.numpy()[order]
-        radii, widest = (torch.from_numpy(np.maximum.reduceat(of, first)) for of in (apart, angle))
+        radii, widest, largest = (
+            torch.from_numpy(np.maximum.reduceat(of, first)) for of in (apart, angle, sizes.numpy()[order])
+        )
         return LandmarkCells(
             torch.from_numpy(order), torch.from_numpy(first), torch.from_numpy(counts), torch.from_numpy(centres),
-            radii, mean, widest.clamp(max=torch.pi),
+            radii, mean, widest.clamp(max=torch.pi), largest,
         )  # fmt: skip
 
-    def seen_from(self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float) -> Int[Tensor, "m"]:
+    def seen_from(
+        self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float, size: float = 0.0
+    ) -> Int[Tensor, "m"]:
         """Return the numbers of the landmarks in all cells that may show in an image, in no particular order.
 
         In the image is what has ``|x| <= slopes[0] z`` and ``|y| <= slopes[1] z`` in the camera's frame, and is seen from at
-        most ``oblique`` (radians) outside the cone of its directions.
+        most ``oblique`` (radians) outside the cone of its directions. Landmarks smaller than ``size`` z do not show.
         """
         local = T_world_camera.inverse().to(torch.float32).apply(self.centres)
         beyond = (local[:, :2].abs() - slopes * local[:, 2:]) / (1 + slopes.square()).sqrt()
@@ -66,7 +72,8 @@ class LandmarkCells:
         angle = ((towards * self.directions).sum(-1) / distance.clamp(min=1e-12)).clamp(-1, 1).acos()
         swing = (self.radii / distance.clamp(min=1e-12)).clamp(max=1).asin()
         facing = (angle <= self.cones + oblique + swing + 1e-3) | (distance <= self.radii)
-        kept = (inside & facing).nonzero()[:, 0]
+        large = self.sizes >= size * (local[:, 2] - self.radii)
+        kept = (inside & facing & large).nonzero()[:, 0]
         counts = self.counts[kept]
         start = self.first[kept] - counts.cumsum(0) + counts
         return self.order[torch.arange(int(counts.sum())) + start.repeat_interleave(counts)]

@@ -89,13 +89,19 @@ class LandmarkMap:
     @cached_property
     def cells(self) -> LandmarkCells | None:
         """The cells of the landmarks on the CPU, which take a second for a million; None for few landmarks."""
-        return LandmarkCells.of(self.positions, self.directions, self.cones) if len(self) > FEW else None
+        return (
+            LandmarkCells.of(self.positions, self.directions, self.cones, self.sizes)
+            if len(self) > FEW
+            else None
+        )
 
-    def seen_from(self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float) -> Int[Tensor, "m"]:
+    def seen_from(
+        self, T_world_camera: SE3, slopes: Float[Tensor, "2"], oblique: float, size: float = 0.0
+    ) -> Int[Tensor, "m"]:
         """Return the numbers of landmarks of which none else shows in an image; see ``LandmarkCells.seen_from``."""
         if self.cells is None:
             return torch.arange(len(self))
-        return self.cells.seen_from(T_world_camera, slopes, oblique)
+        return self.cells.seen_from(T_world_camera, slopes, oblique, size)
 
     @property
     def megabytes(self) -> float:
