@@ -25,11 +25,11 @@ EXHAUSTIVE = 4_000
 """The number of landmarks up to which the search is exhaustive, and no cells are built."""
 COMPARISONS = 4_000_000
 """The number of keypoint-landmark pairs up to which comparing all of them is faster than searching cells."""
-QUERY_BLOCK = 64
-"""Width of the blocks of columns whose minima are ranked first, because ranking all columns is slower."""
+USUAL_IN_CELL = 500
+"""Mean number of landmarks of a cell in large maps, where comparing them would otherwise take most of the time."""
 PROBED = 12
 """Number of cells that are searched for each keypoint."""
-SAMPLE = 40
+SAMPLE = 20
 """Number of landmarks per cell in the sample on which k-means runs."""
 K_MEANS_ROUNDS = 6
 """Iterations of Lloyd's algorithm; the cells need to be balanced, not optimal."""
@@ -40,14 +40,16 @@ ROWS = 256
 class LandmarkMatcher:
     """Finds the landmarks whose descriptors are nearest to those of keypoints.
 
-    Above ``EXHAUSTIVE`` landmarks it uses an inverted file: k-means divides the landmarks into about sqrt(n) cells, and only the
-    cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a matcher.
+    Above ``EXHAUSTIVE`` landmarks it uses an inverted file: k-means divides the landmarks into sqrt(n) cells, in large maps into
+    more, and only the cells nearest to a keypoint are searched (Sivic and Zisserman 2003; Jegou et al. 2011). Threads may share a
+    matcher. What guided matching needs is prepared too, see ``LandmarkMap.cells``.
 
     Descriptors are compared on the device of those of ``landmarks``; all else that is done with landmarks is done on the CPU.
     """
 
     def __init__(self, landmarks: LandmarkMap, seed: int = 0) -> None:
         self.landmarks = landmarks.to("cpu")
+        _ = self.landmarks.cells
         self._descriptors = landmarks.descriptors
         self._cells: _Cells | None = None
         self._found_once: FoundOnce | None = None
@@ -95,7 +97,7 @@ class _Cells:
     """An inverted file: descriptors sorted by cell."""
 
     def __init__(self, descriptors: UInt8[Tensor, "n d"], seed: int) -> None:
-        count = round(math.sqrt(len(descriptors)))
+        count = round(max(math.sqrt(len(descriptors)), len(descriptors) / USUAL_IN_CELL))
         generator = torch.Generator().manual_seed(seed)
         self._centres = _k_means(descriptors, count, generator)
         cell = _nearest_centre(descriptors, self._centres)
@@ -157,16 +159,5 @@ def _nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[T
 
 def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
     """Return the ``count`` smallest values of each row (all, if there are fewer), ascending, and their columns."""
-    columns = distances.shape[1]
-    if columns <= 4 * QUERY_BLOCK * count:
-        found = distances.topk(min(count, columns), dim=1, largest=False)
-        return found.values, found.indices
-    blocks = torch.nn.functional.pad(distances, (0, -columns % QUERY_BLOCK), value=torch.inf).unflatten(
-        1, (-1, QUERY_BLOCK)
-    )
-    block = blocks.amin(-1).topk(count, dim=1, largest=False).indices
-    candidates = blocks.gather(1, block[..., None].expand(-1, -1, QUERY_BLOCK)).flatten(1)
-    best = candidates.topk(count, dim=1, largest=False)
-    return best.values, block.gather(
-        1, best.indices // QUERY_BLOCK
-    ) * QUERY_BLOCK + best.indices % QUERY_BLOCK
+    found = distances.topk(min(count, distances.shape[1]), dim=1, largest=False)
+    return found.values, found.indices
