@@ -47,10 +47,10 @@ MOST = {
     "RGB, rendered, cropped":              Most(2, 6, 22, 2, 53),
     "RGB, rendered, moving rows":          Most(1, 3, 14, 1, 52),
     "RGB, rendered, mirrored":             Most(2, 4, 16, 2, 52),
-    "first tracked frame, RGB-D":          Most(2, 3, 20, 1, 55),
-    "tracked frame, RGB-D":                Most(0, 0, 7, 0, 34),
-    "tracked frame, RGB":                  Most(0, 0, 7, 0, 28),
-    "tracked frame with detection, RGB":   Most(1, 0, 14, 0, 30),
+    "first tracked frame, RGB-D":          Most(2, 3, 8, 1, 53),
+    "tracked frame, RGB-D":                Most(0, 0, 2, 0, 32),
+    "tracked frame, RGB":                  Most(0, 0, 2, 0, 26),
+    "tracked frame with detection, RGB":   Most(1, 0, 3, 0, 28),
 }  # fmt: skip
 
 QUERIES: dict[str, Callable[[], Case]] = {

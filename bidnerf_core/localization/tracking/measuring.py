@@ -109,6 +109,7 @@ class ByLandmarks:
         )
         if found is not None:
             found = with_motion(found, correlation, share_moving(self.detector.landmarks))
+            state = replace(state, moves=found.moves)
         judged = measured = None
         state = replace(state, age=state.age + 1)
         if found is not None:
@@ -162,8 +163,9 @@ class ByLandmarks:
                 return None
         due = state.calibrated is None or state.frames - state.calibrated >= INTRINSICS_CHECKED_EVERY
         seen = self.detector(
-            frame, T, radius, state.usual_distance, state.noise, state.miscalibration if not due else None
-        )
+            frame, T, radius, state.usual_distance, state.noise, state.moves,
+            None if due else state.miscalibration,
+        )  # fmt: skip
         if seen is None:
             return None
         pose, verdict = self._judged(frame, seen.points, seen.found, seen.evidence, seen.miscalibration)

@@ -100,6 +100,11 @@ class PointFit:
         return self.fit.T_world_rig
 
     @property
+    def moves(self) -> bool:
+        """Whether the camera moved while its rows were exposed, as the fit has it."""
+        return bool(self.fit.motion.any())
+
+    @property
     def still_data(self) -> ObservedPoints:
         """The points as a camera at rest at the pose would have observed them."""
         return self.data.without_motion(self.fit.T_world_rig, self.fit.motion)
@@ -150,7 +155,7 @@ def with_motion(found: PointFit, correlation: float, share: float = SHARE_MOVING
     ``share`` is the prior probability of a motion.
     """
     evident = evident_motion(found.data[found.inliers], found.fit, correlation, share=share)
-    if (evident.prior == STILL) == (not bool(found.fit.motion.any())):
+    if (evident.prior != STILL) == found.moves:
         return replace(found, evident=evident)
     fit = resect(
         found.data, found.T_world_camera, found.fit.noise, correlation=correlation, motion=evident.prior

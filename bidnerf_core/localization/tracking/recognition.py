@@ -89,19 +89,20 @@ class LandmarkDetector:
         radius: float,
         most_distance: float,
         noise: float,
+        moves: bool = False,
         known: Miscalibration | None = None,
     ) -> Recognized | None:
         """Match keypoints with landmarks that project within ``radius`` pixels of them, and fit the pose to the matches.
 
         ``most_distance`` is the largest squared distance between the descriptors of a match, ``noise`` a first guess at that
-        of keypoints (pixels), ``known`` the result of an earlier check of the intrinsics; without it, they are checked now.
-        Returns None if too few keypoints match.
+        of keypoints (pixels), ``moves`` a guess as for ``fit_pose``, ``known`` the result of an earlier check of the
+        intrinsics; without it, they are checked now. Returns None if too few keypoints match.
         """
         number = self._near(frame.intrinsics, T_world_camera)
         image = query_image(frame, SE3.identity(), self.features)
         query = LandmarkQuery([image], self.landmarks[number], FIXED)
         tight = RADII[-1] * query.threshold
-        seen = self._seen(frame, query, T_world_camera, radius, most_distance, noise)
+        seen = self._seen(frame, query, T_world_camera, radius, most_distance, noise, moves)
         surprise = 0.0
         if seen is not None and (radius > tight or math.isinf(most_distance)):
             if radius > WIDE * tight:
@@ -109,7 +110,7 @@ class LandmarkDetector:
                 surprise = log10_nfa(len(seen[0]), seen[1].within(query.threshold), within)
             T, noise = seen[1].T_world_camera, seen[1].fit.noise
             most_distance = seen[2] if math.isinf(most_distance) else most_distance
-            seen = self._seen(frame, query, T, tight, most_distance, noise)
+            seen = self._seen(frame, query, T, tight, most_distance, noise, moves)
         if seen is None:
             return None
         points, found, _ = seen
@@ -122,7 +123,14 @@ class LandmarkDetector:
         return Recognized(points, found, evidence, most_distance, wrong)
 
     def _seen(
-        self, frame: Frame, query: LandmarkQuery, T: SE3, radius: float, most_distance: float, noise: float
+        self,
+        frame: Frame,
+        query: LandmarkQuery,
+        T: SE3,
+        radius: float,
+        most_distance: float,
+        noise: float,
+        moves: bool,
     ) -> tuple[FollowedPoints, PointFit, float] | None:
         """Return the matches within a radius, the pose that they determine, and ``usual_distance`` of its inliers."""
         if radius > WIDE * RADII[-1] * query.threshold:
@@ -131,7 +139,7 @@ class LandmarkDetector:
             matches = guided_matches(query.images, query.landmarks, T, radius, most_distance)
         points = FollowedPoints.of_landmarks(query.landmarks, matches.landmark, query.pixels(matches))
         correlation = self.landmarks.correlation_of(len(points))
-        found = fit_pose(points.observed(frame), T, noise, query.threshold, correlation)
+        found = fit_pose(points.observed(frame), T, noise, query.threshold, correlation, moves)
         if found is None or not bool(found.inliers.any()):
             return None
         return points, found, usual_distance(query, matches[found.inliers])
