@@ -33,8 +33,8 @@ SAMPLE = 20
 """Number of landmarks per cell in the sample on which k-means runs."""
 K_MEANS_ROUNDS = 6
 """Iterations of Lloyd's algorithm; the cells need to be balanced, not optimal."""
-ROWS = 256
-"""One sixteenth of the descriptors that are assigned to cells at a time, which bounds the memory."""
+BLOCK = 2**20
+"""Number of distances to centres of cells that are computed at a time, which bounds the memory."""
 
 
 class LandmarkMatcher:
@@ -105,7 +105,7 @@ class _Cells:
         self._order = order
         self._descriptors = descriptors[order]
         self._squares = torch.cat(
-            [part.float().square().sum(-1) for part in self._descriptors.split(16 * ROWS)]
+            [part.float().square().sum(-1) for part in self._descriptors.split(BLOCK // 256)]
         )
         self._last = torch.bincount(cell, minlength=count).cumsum(0).tolist()
 
@@ -154,7 +154,8 @@ def _k_means(
 
 
 def _nearest_centre(descriptors: Tensor, centres: Float[Tensor, "c d"]) -> Int[Tensor, "n"]:
-    return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(16 * ROWS)])
+    rows = max(1, BLOCK // len(centres))
+    return torch.cat([squared_distances(part, centres).argmin(1) for part in descriptors.split(rows)])
 
 
 def _smallest(distances: Float[Tensor, "q n"], count: int) -> tuple[Float[Tensor, "q k"], Int[Tensor, "q k"]]:
