@@ -142,10 +142,7 @@ class Explanation:
     @property
     def covariance_by_motion(self) -> Float[Tensor, "6 6"]:
         """The part of the pose's covariance due to the motion, to which the pose adapts."""
-        equations = self.about.under(self.known)
-        follows = -np.linalg.solve(equations.hessian[:6, :6], equations.hessian[:6, 10:])
-        found = follows @ equations.covariance[10:, 10:] @ follows.T
-        return torch.from_numpy((found + found.T) / 2)
+        return torch.from_numpy(self.about.under(self.known).covariance_by_last(10))
 
 
 def _square(a: State, b: State) -> Float[Tensor, "6 6"]:

@@ -64,6 +64,16 @@ class RobustEquations:
             found: Array = inverse @ self.scatter @ inverse
             return (found + found.T) / 2
 
+    def covariance_by_last(self, first: int) -> Array:
+        """Return the part (6, 6) of the pose's covariance that is due to the unknowns from number ``first`` on.
+
+        The pose is that of the first six unknowns. All before ``first`` adapt to the others.
+        """
+        before, after = self.hessian[:first, :first], self.hessian[:first, first:]
+        adapt = -damped_solution(before, 1e-9, after)[:6]
+        found: Array = adapt @ self.covariance[first:, first:] @ adapt.T
+        return (found + found.T) / 2
+
     @cached_property
     def inverse_curvature(self) -> Array:
         """The inverse of the curvature: the covariance of the posterior in Laplace's approximation."""

@@ -53,10 +53,8 @@ class ReprojectionFit:
     @cached_property
     def covariance_by_motion(self) -> Float[Tensor, "6 6"]:
         """The part of the pose's covariance due to the motion, to which the other unknowns adapt."""
-        system, first = self.minimum.system, self.minimum.first_of_motion
-        adapt = -damped_solution(system.hessian[:first, :first], 1e-9, system.hessian[:first, first:])[:6]
-        found = torch.from_numpy(adapt @ system.covariance[first:, first:] @ adapt.T)
-        return (found + found.mT) / 2
+        minimum = self.minimum
+        return torch.from_numpy(minimum.system.covariance_by_last(minimum.first_of_motion))
 
     @cached_property
     def motion_posterior(self) -> Float[Tensor, "k k"]:
