@@ -20,9 +20,9 @@ from bidnerf_core.localization.acceptance import (
     rendered_verdict,
     surface_diagnostics,
 )
+from bidnerf_core.localization.beyond_chance import NONE, Support
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.search.by_points import PointSearch
-from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import RenderedThresholds
 from bidnerf_core.scenes.demo import demo_room
 
@@ -85,43 +85,51 @@ def test_diagnostics_of_points_lead_to_an_outcome(
     assert verdict.accepted == (expected is Outcome.CONVERGED)
 
 
+SUPPORTED = Support(explained=1.0, plain=10.0, displaced=10.0, other=10.0)
+
+
 def refined(
-    inliers: float = 1.0, step: float = 0.0, covariance: float = 1.0, contrast: float = math.inf
+    inliers: float = 1.0, step: float = 0.0, covariance: float = 1.0, support: Support = SUPPORTED
 ) -> RefinementResult:
     T = SE3.identity()
     losses = torch.zeros(0, dtype=torch.float64)
     return RefinementResult(
-        T, 0.0, inliers, covariance * torch.eye(6, dtype=torch.float64), step, T[None], losses, contrast
+        T, 0.0, inliers, covariance * torch.eye(6, dtype=torch.float64), step, T[None], losses, support
     )
 
 
-def searched_images(best: float, margin: float) -> SearchResult:
-    nothing = torch.zeros(0, dtype=torch.float64)
-    T = SE3.identity()[None]
-    return SearchResult(T, torch.tensor([best], dtype=torch.float64), margin, T, nothing)
-
-
 @pytest.mark.parametrize(
-    ("found", "search", "expected", "words"),
+    ("found", "expected", "words"),
     [
-        (refined(), None, Outcome.CONVERGED, "100% of fresh rays agree"),
-        (refined(inliers=0.93, step=0.02), None, Outcome.CONVERGED, "93%"),
-        (refined(inliers=0.9), None, Outcome.RENDERING_MISMATCH, "90% of fresh rays agree .*, expected 93%"),
-        (refined(inliers=math.nan), None, Outcome.RENDERING_MISMATCH, "expected 93%"),
-        (refined(step=0.03), None, Outcome.NOT_SETTLED, "a step of 0.03, expected 0.02 at most"),
-        (refined(step=math.nan), None, Outcome.NOT_SETTLED, "expected 0.02 at most"),
-        (refined(covariance=math.inf), None, Outcome.UNDETERMINED, "does not determine the pose"),
-        (refined(contrast=0.019), None, Outcome.UNDETERMINED, "of a single colour"),
-        (refined(contrast=0.021), None, Outcome.CONVERGED, "100%"),
-        (refined(), searched_images(0.2, 0.001), Outcome.AMBIGUOUS, "another pose fits about as well"),
-        (refined(), searched_images(0.2, 0.003), Outcome.CONVERGED, "100%"),
-        (refined(), searched_images(0.2, math.inf), Outcome.CONVERGED, "100%"),
+        (refined(), Outcome.CONVERGED, "100% of fresh rays agree"),
+        (refined(inliers=0.93, step=0.02), Outcome.CONVERGED, "93%"),
+        (refined(inliers=0.9), Outcome.RENDERING_MISMATCH, "90% of fresh rays agree .*, expected 93%"),
+        (refined(inliers=math.nan), Outcome.RENDERING_MISMATCH, "expected 93%"),
+        (refined(step=0.03), Outcome.NOT_SETTLED, "a step of 0.03, expected 0.02 at most"),
+        (refined(step=math.nan), Outcome.NOT_SETTLED, "expected 0.02 at most"),
+        (refined(covariance=math.inf), Outcome.UNDETERMINED, "does not determine the pose"),
+        (refined(support=replace(SUPPORTED, plain=0.5)), Outcome.UNDETERMINED, "of a single colour"),
+        (refined(support=replace(SUPPORTED, displaced=0.5)), Outcome.UNDETERMINED, "displaced by 10%"),
+        (
+            refined(support=replace(SUPPORTED, other=0.5)),
+            Outcome.AMBIGUOUS,
+            "another pose fits about as well",
+        ),
+        (
+            refined(support=replace(SUPPORTED, explained=0.4)),
+            Outcome.RENDERING_MISMATCH,
+            "only 40% of the contrast",
+        ),
+        (
+            refined(support=replace(SUPPORTED, explained=math.nan)),
+            Outcome.RENDERING_MISMATCH,
+            "of the contrast",
+        ),
+        (refined(support=NONE), Outcome.UNDETERMINED, "fits about as well"),
     ],
 )
-def test_fresh_rays_lead_to_an_outcome(
-    found: RefinementResult, search: SearchResult | None, expected: Outcome, words: str
-) -> None:
-    verdict = rendered_verdict(found, RenderedThresholds(), search)
+def test_fresh_rays_lead_to_an_outcome(found: RefinementResult, expected: Outcome, words: str) -> None:
+    verdict = rendered_verdict(found, RenderedThresholds())
     assert verdict.outcome is expected
     assert re.search(words, verdict.reason)
 
@@ -137,19 +145,17 @@ def test_fresh_rays_lead_to_an_outcome(
     ],
 )
 def test_the_loss_of_a_descent_leads_to_an_outcome(loss: float, finite: bool, expected: Outcome) -> None:
-    verdict = descent_verdict(loss, 0.02, finite, "reached 5 steps")
+    verdict = descent_verdict(loss, 0.02, finite, "reached 5 steps", SUPPORTED, 0.5)
     why = "" if expected is Outcome.DIVERGED else f"; mean loss {loss:.3g}, accepted below 0.02"
     assert verdict == Verdict(expected, f"reached 5 steps{why}")
 
 
-@pytest.mark.parametrize(
-    ("plain", "expected"),
-    [(0.0101, Outcome.CONVERGED), (0.01, Outcome.UNDETERMINED), (0.0, Outcome.UNDETERMINED)],
-)
-def test_a_descent_has_to_explain_more_than_a_single_colour_does(plain: float, expected: Outcome) -> None:
-    verdict = descent_verdict(0.01, 0.02, True, "reached 5 steps", plain)
+@pytest.mark.parametrize(("least", "expected"), [(0.4, Outcome.CONVERGED), (0.6, Outcome.RENDERING_MISMATCH)])
+def test_a_descent_has_to_explain_more_than_a_single_colour_does(least: float, expected: Outcome) -> None:
+    found = replace(SUPPORTED, explained=0.5)
+    verdict = descent_verdict(0.01, 0.02, True, "reached 5 steps", found, least)
     assert verdict.outcome is expected
-    assert ("so little contrast" in verdict.reason) is not verdict.accepted
+    assert ("explains only" in verdict.reason) is not verdict.accepted
 
 
 def test_other_colours_are_rejected() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -38,15 +36,6 @@ def wall(at: float, opacity: float = 1.0) -> Rendering:
 def measured(distance: torch.Tensor) -> Observations:
     zero = torch.zeros(2, 3, 3)
     return Observations(zero, zero, torch.full((2, 3, 3), 0.5), distance, distance > -1)
-
-
-@pytest.mark.parametrize("loss", ["l2", "huber", "geman-mcclure"])
-def test_the_plain_loss_is_that_of_rendering_the_mean_colour(loss: RobustName) -> None:
-    rgb = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(0))
-    seen, rendered = replace(measured(torch.zeros(2, 3)), rgb=rgb), wall(1.0)
-    plain = replace(rendered, rgb=rgb.flatten(0, 1).mean(0).expand_as(rendered.rgb))
-    expected = objective_of(ColourSettings(loss, 0.1), None).loss(plain, seen)
-    assert objective(loss, loss, 1.0).plain_loss(rgb.flatten(0, 1)) == pytest.approx(float(expected))
 
 
 def test_free_space_counts_what_is_in_front_and_nothing_else() -> None:

@@ -171,11 +171,6 @@ class Objective:
         """Return ``rho'(r) / r`` of each residual, the factors of iteratively reweighted least squares."""
         return self._by_term(residuals, lambda term, part: term.robust.weight(part))
 
-    def plain_loss(self, rgb: Float[Tensor, "p 3"]) -> float:
-        """Return the colour terms' loss of a rendering that gives every pixel the mean colour of ``rgb``."""
-        terms = (term for term in self.terms if term.applies is coloured)
-        return sum(term.weight * float(term.robust(rgb - rgb.mean(0)).sum(-1).mean()) for term in terms)
-
     @property
     def scales(self) -> list[float]:
         """The residual of each channel above which it counts as an outlier."""

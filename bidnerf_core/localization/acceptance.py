@@ -7,17 +7,17 @@ into an ``Outcome`` and a sentence.
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import torch
 
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
 from bidnerf_core.localization.settings import RenderedThresholds
 from bidnerf_core.mapping.geometry.calibration import UNSTRETCHED, Calibration
@@ -27,8 +27,6 @@ WELL_BEFORE = 0.04
 """Share of the extent by which a line of sight must meet the surface too early to count as a violation."""
 SIGHT_LINES = 300
 """Largest number of lines of sight that are traced."""
-IMAGE_MARGIN = 0.01
-"""Least relative difference in cost between the best and the next best answer of a search by images."""
 FLAT = 0.02
 """Standard deviation of an image's colours, in [0, 1], below which a gain and a bias make any view fit it."""
 BLANK = Verdict(Outcome.UNDETERMINED, "the image is of a single colour, as if the lens were covered")
@@ -56,6 +54,7 @@ class SurfaceDiagnostics:
     free_space_violations: float
     runner_up_margin: float
     rendered_inliers: float = 1.0  # where nothing was rendered
+    support: Support | None = None  # None: not compared with other poses
 
     def rejection(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict | None:
         """Return the most serious reason to reject the pose, or None."""
@@ -74,7 +73,7 @@ class SurfaceDiagnostics:
         if not self.rendered_inliers >= thresholds.rendered_inliers:
             share = f"{self.rendered_inliers:.0%} of the rendered rays agree with what was measured"
             return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}")
-        return None
+        return None if self.support is None else self.support.rejection()
 
     def verdict(self, thresholds: SurfaceThresholds = SurfaceThresholds()) -> Verdict:
         share = f"{self.colour_inliers:.0%} of the measured points have the surface's place and colour"
@@ -223,38 +222,34 @@ def free_space_violations(cost: SurfaceCost, T: SE3) -> float:
     return float((met < length - slack).float().mean())
 
 
-def rendered_verdict(
-    found: RefinementResult, thresholds: RenderedThresholds, search: SearchResult | None = None
-) -> Verdict:
-    """Judge a pose by fresh rendered rays and, where it came from a search by images, by the runner-up."""
+def rendered_verdict(found: RefinementResult, thresholds: RenderedThresholds) -> Verdict:
+    """Judge a pose by fresh rendered rays: how many agree, and how much better than with other poses or a single colour."""
     if not bool(found.covariance.isfinite().all()):
         return Verdict(Outcome.UNDETERMINED, "what was measured does not determine the pose")
-    if found.contrast < FLAT:
-        return BLANK
     share = f"{found.inliers:.0%} of fresh rays agree with what was measured"
     if not found.inliers >= thresholds.converged_inliers:
         return Verdict(Outcome.RENDERING_MISMATCH, f"{share}, expected {thresholds.converged_inliers:.0%}")
     if not found.step <= thresholds.converged_step:
         most = f"expected {thresholds.converged_step:g} at most"
         return Verdict(Outcome.NOT_SETTLED, f"fresh rays ask for a step of {found.step:.3g}, {most}")
-    if search is not None and search.margin < IMAGE_MARGIN * max(float(search.scores[0]), 1e-6):
-        return AMBIGUOUS
-    return Verdict(Outcome.CONVERGED, share)
+    return found.support.rejection() or Verdict(Outcome.CONVERGED, share)
 
 
 def descent_verdict(
-    mean_loss: float, threshold: float, finite: bool, reason: str, plain_limit: float = math.inf
+    mean_loss: float, threshold: float, finite: bool, reason: str, found: Support, least_explained: float
 ) -> Verdict:
-    """Judge a first-order descent by the mean loss of its last steps; ``reason`` explains why it ended.
+    """Judge a first-order descent by the mean loss of its last steps, and by how well other rays support its answer.
 
-    ``plain_limit`` is a share of the loss of the images' mean colours, and infinite where more than colours was compared: at a
-    wrong pose, images of little contrast have a small loss too, but not a much smaller one than their mean colours.
+    ``reason`` explains why it ended. At a wrong pose, images of little contrast have a small loss too.
     """
     if not finite or not math.isfinite(mean_loss):
         return Verdict(Outcome.DIVERGED, reason)
     reason = f"{reason}; mean loss {mean_loss:.3g}, accepted below {threshold:.3g}"
     if mean_loss >= threshold:
         return Verdict(Outcome.HIGH_LOSS, reason)
-    if mean_loss >= plain_limit:
-        return Verdict(Outcome.UNDETERMINED, f"{reason}, but below {plain_limit:.3g} with so little contrast")
-    return Verdict(Outcome.CONVERGED, reason)
+    rejection = found.rejection(least_explained)
+    return (
+        Verdict(Outcome.CONVERGED, reason)
+        if rejection is None
+        else replace(rejection, reason=f"{reason}, but {rejection.reason}")
+    )

@@ -17,15 +17,16 @@ from torch import Tensor
 from bidnerf_core.devices import moved
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.ambiguous_intrinsics import may_be_miscalibrated
+from bidnerf_core.localization.beyond_chance import Support, support
 from bidnerf_core.localization.by_landmarks import is_sharp
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.costs.images import (
     ColourScales,
     FieldRenderer,
     ImageCost,
+    plain_pixel_costs,
     render_view,
     thumbnail,
-    uniform_cost,
 )
 from bidnerf_core.localization.covariance import LEAST_VARIANCE, position_deviation
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
@@ -75,8 +76,8 @@ def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: i
     best = min(range(len(BLURS)), key=costs.__getitem__)
     if BLURS[best] < NOTICEABLE_BLUR or not costs[best] < CLEARLY_LESS * costs[0]:
         return found
-    uniform = uniform_cost(sharp.thumbnails, HALF_AN_INLIER)
-    if uniform == 0:
+    plain = plain_pixel_costs(sharp.thumbnails, HALF_AN_INLIER).double()
+    if not bool(plain.any()):
         return found  # an image of one colour, which any pose explains
     done = _descents(replace(sharp, blur=BLURS[best]), start, about)
     cost_at_end = float(done[-1].equations.cost[0])
@@ -84,9 +85,12 @@ def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: i
         return found
     T = done[-1].T[0].to("cpu").normalized()
     covariance = about.to(torch.device("cpu")).at_camera(T, _covariance(done[-1], len(problem.views)))
-    distance = float(render_view(sharp.renderer, sharp.thumbnails[-1], done[-1].T).depth.median())
-    precision = position_deviation(covariance) / distance
-    verdict = _verdict(1 - cost_at_end / uniform, precision)
+    seen = render_view(sharp.renderer, sharp.thumbnails[-1], done[-1].T)
+    precision = position_deviation(covariance) / float(seen.depth.median())
+    blurred = sharp.with_blur_of(done[-1].T, BLURS)
+    middle = seen.points[0].median(0).values.to("cpu", torch.float64)
+    apart = support(blurred.pixel_costs, done[-1].T[0], middle, plain)
+    verdict = _verdict(apart, precision)
     if verdict.accepted and not found.converged and problem.matcher is not None:
         there = replace(problem, start=T)
         verdict = mirror_rejection(there, problem.matcher, 0.0, rays, seed) or verdict
@@ -95,8 +99,8 @@ def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: i
         T_world_camera=T,
         outcome=verdict.outcome,
         reason=verdict.reason,
-        confidence=None,
-        diagnostics=None,
+        confidence=apart.confidence,
+        diagnostics=apart,
         covariance=covariance if bool(covariance.isfinite().all()) else None,
         loss=cost_at_end,
         steps=found.steps + ROUNDS * STEPS,
@@ -112,7 +116,9 @@ def _is_eligible(problem: Problem, found: Localization) -> bool:
     unsuited_map = problem.surface is None or not is_sharp(problem)
     if problem.has_depth or hidden or unsuited_map or found.intrinsics is not None:
         return False
-    doubtful = (found.confidence or 0.0) < TRUSTED and found.outcome not in UNSUITABLE
+    # Support by sharp renderings does not tell that a blurred comparison would be better.
+    by_colour = isinstance(found.diagnostics, Support)
+    doubtful = (by_colour or (found.confidence or 0.0) < TRUSTED) and found.outcome not in UNSUITABLE
     return doubtful and not may_be_miscalibrated(problem)
 
 
@@ -140,11 +146,12 @@ def _covariance(done: Descent, views: int) -> Float[Tensor, "6 6"]:
     return torch.linalg.inv_ex(done.equations.hessian[0] / variance).inverse.cpu()
 
 
-def _verdict(explained: float, precision: float) -> Verdict:
-    """Judge a pose by how much of the image it explains, and by its deviation as a share of the distance of what is seen."""
-    share = f"{explained:.0%} of the contrast of the blurred image agrees with renderings blurred to match"
-    if explained < LEAST_EXPLAINED:
-        return Verdict(Outcome.RENDERING_MISMATCH, f"only {share}, expected {LEAST_EXPLAINED:.0%}")
+def _verdict(found: Support, precision: float) -> Verdict:
+    """Judge a pose by its support, and by its deviation as a share of the distance of what is seen."""
+    share = f"{max(found.explained, 0):.0%} of the contrast of the blurred image agrees with renderings blurred to match"
+    rejection = found.rejection(LEAST_EXPLAINED)
+    if rejection is not None:
+        return replace(rejection, reason=f"{rejection.reason}: only {share}, expected {LEAST_EXPLAINED:.0%}")
     if not precision <= PRECISE:
         why = f"the image is blurred, so the position is uncertain by {precision:.1%} of the distance of what is seen"
         return Verdict(Outcome.IMPRECISE, f"{why}, expected at most {PRECISE:.0%}")

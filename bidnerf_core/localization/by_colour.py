@@ -46,7 +46,7 @@ def refine_by_colour(
     stages = stages or usual_stages(config, len(search.T.translation))
     settings = RenderedCostSettings(config.colour, None, config.refinement)
     refined = refine(problem, search.T, stages, settings, generator)
-    return ColourAnswer(search, refined, rendered_verdict(refined, config.thresholds, search))
+    return ColourAnswer(search, refined, rendered_verdict(refined, config.thresholds))
 
 
 def usual_stages(config: ByColourConfig, count: int) -> tuple[RefinementStage, ...]:
@@ -82,6 +82,8 @@ def localization_of(
         poses=SE3.stack(path),
         losses=torch.cat([search.losses, refined.losses]),
         covariance=covariance if bool(covariance.isfinite().all()) else None,
+        confidence=refined.support.confidence,
+        diagnostics=refined.support,
     )
 
 

@@ -10,6 +10,7 @@ from torch import Generator
 
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
+from bidnerf_core.localization.beyond_chance import support
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud
@@ -51,7 +52,9 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
     if config.refine_steps:
         found, inliers = _refined(problem, search, found, config, generator)
     with torch.no_grad():
-        diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers)
+        finest = finest_cost(search.surface, search.cloud)
+        apart = support(finest.point_costs, found.T[0], search.cloud.middle.double().cpu())
+        diagnostics = replace(_diagnostics(search, found), rendered_inliers=inliers, support=apart)
         judgement = judged(diagnostics.verdict(), diagnostics)
         path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
         losses = search.judge(LOSS_POINTS).cost(path)

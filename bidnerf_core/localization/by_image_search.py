@@ -89,7 +89,8 @@ def _refined_robustly(
     robust = replace(config.colour, colour_loss="geman-mcclure")
     settings = RenderedCostSettings(robust, None, config.refinement)
     T = refine(problem, search.T[:1], (many,), settings, generator).T
-    return refine_by_colour(problem, replace(search, T=T[None]), config, generator, (replace(fine, steps=0),))
+    both = replace(search, T=SE3.cat([T[None], search.T[1:]]))
+    return refine_by_colour(problem, both, config, generator, (replace(fine, steps=0),))
 
 
 def _is_hopeless(problem: Problem) -> bool:

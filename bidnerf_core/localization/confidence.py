@@ -13,10 +13,9 @@ from functools import lru_cache
 from importlib.resources import files
 
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.beyond_chance import ACCEPTED
 from bidnerf_core.localization.result import Outcome, Verdict
 
-ACCEPTED = 0.8
-"""Least confidence with which a pose is accepted."""
 ACCEPTED_ESTIMATED = 0.6
 """Least confidence of a pose whose intrinsics were estimated too because landmarks contradict the given ones.
 
@@ -65,13 +64,19 @@ def judged(
 
 
 def confidence(diagnostics: LandmarkDiagnostics | SurfaceDiagnostics) -> float | None:
-    """Return the probability that a pose with these diagnostics is right; None where no model was learned."""
+    """Return the probability that a pose with these diagnostics is right.
+
+    Where no model was learned, it is the probability of the pose among its rivals; None if it was not compared with any.
+    """
     if isinstance(diagnostics, LandmarkDiagnostics):
         name, features = "landmarks", landmark_features(diagnostics)
     else:
         name, features = "surface", surface_features(diagnostics)
     model = models().get(name)
-    return None if model is None else model.probability(features)
+    if model is not None:
+        return model.probability(features)
+    support = diagnostics.support if isinstance(diagnostics, SurfaceDiagnostics) else None
+    return None if support is None else support.confidence
 
 
 @lru_cache(maxsize=1)

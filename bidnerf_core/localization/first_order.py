@@ -9,8 +9,6 @@ would be undefined at magnitude 0.
 
 from __future__ import annotations
 
-import math
-import statistics
 import time
 from dataclasses import dataclass, replace
 
@@ -19,18 +17,22 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.residuals import Objective
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.acceptance import BLANK, descent_verdict, is_blank
-from bidnerf_core.localization.costs.rendered import RayCounts
+from bidnerf_core.localization.acceptance import descent_verdict
+from bidnerf_core.localization.beyond_chance import Support
+from bidnerf_core.localization.costs.rendered import RayCounts, RenderedCost, draw_weighted_rays
 from bidnerf_core.localization.costs.sampled import SampledLoss
 from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.result import Localization, Outcome
+from bidnerf_core.localization.refinement import rendered_support
+from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.settings import (
     AdamSettings,
     ColourSettings,
     DepthSettings,
     DescentSettings,
     ReachSettings,
+    RefinementSettings,
+    RefinementStage,
     objective_of,
 )
 from bidnerf_core.localization.solvers.adam import follow_gradient
@@ -38,6 +40,8 @@ from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.localization.solvers.pivots import pivot
 from bidnerf_core.settings import Settings
 
+SUPPORTING_RAYS = 1024
+"""Number of rays by which an answer is compared with its rivals."""
 PAPERS_REACH = ReachSettings()
 """The paper's objective, with nothing added."""
 WIDE_REACH = ReachSettings(candidates=3, box_weight=1.0)
@@ -62,12 +66,8 @@ def descended(
         loss, pivot(rays.pivot, problem), adam, history, device, generator if loss.is_capturable else None
     )
     T, mean = history.answer(adam.answer)
-    by_depth = objective.uses_depth and problem.has_depth
-    plain = math.inf if by_depth else adam.plain_share * _plain_loss(problem, objective)
-    verdict = descent_verdict(mean, adam.converged_loss, finite, reason, plain)
-    fits = verdict.outcome in (Outcome.CONVERGED, Outcome.UNDETERMINED)
-    if fits and not by_depth and all(is_blank(view.frame) for view in problem.views):
-        verdict = BLANK
+    found = _support(problem, rays, objective, depth_rays, T, seed)
+    verdict = descent_verdict(mean, adam.converged_loss, finite, reason, found, 1 - adam.plain_share)
     return Localization(
         T_world_camera=T,
         outcome=verdict.outcome,
@@ -78,15 +78,20 @@ def descended(
         method=method,
         poses=SE3.stack(history.poses),
         losses=torch.tensor(history.losses, dtype=torch.float64),
+        confidence=found.confidence,
+        diagnostics=found,
     )
 
 
-def _plain_loss(problem: Problem, objective: Objective) -> float:
-    """Return the loss if each image were rendered in its mean colour; infinite without colours."""
-    images = [view.frame for view in problem.views if view.frame.has_colour]
-    if not images:
-        return math.inf
-    return statistics.fmean(objective.plain_loss(frame.rgb.flatten(0, 1)) for frame in images)
+def _support(
+    problem: Problem, rays: DescentSettings, objective: Objective, depth_rays: int, T: SE3, seed: int
+) -> Support:
+    """Return how well rays to which the answer was not fitted distinguish it from its rivals."""
+    problem, about = problem.on_device(), pivot("camera", problem).to(problem.device)
+    counts = RayCounts(SUPPORTING_RAYS, min(depth_rays, SUPPORTING_RAYS))
+    drawn = draw_weighted_rays(problem, objective, counts, "uniform", 1, torch.Generator().manual_seed(seed))
+    stage = RefinementStage(0, SUPPORTING_RAYS, level=rays.level)
+    return rendered_support(RenderedCost(problem, drawn, objective, stage, RefinementSettings(), about), T)
 
 
 @dataclass(frozen=True)

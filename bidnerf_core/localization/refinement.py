@@ -6,7 +6,6 @@ a batch axis: several are refined at once, and each stage continues with the bes
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,17 +15,21 @@ from torch import Generator, Tensor
 
 from bidnerf_core.devices import may_wait, without_waiting
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.beyond_chance import NONE, Support, support
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import sandwich_covariance
 from bidnerf_core.localization.fusion import rendered_term, surface_term
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.search.centring import centred
+from bidnerf_core.localization.search.centring import centred, rendered_middle
 from bidnerf_core.localization.settings import RefinementStage
 from bidnerf_core.localization.solvers.history import History
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
 from bidnerf_core.localization.solvers.pivots import pivot
+
+RIVALS = 3
+"""Largest number of poses found besides the best one with which that is compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +45,7 @@ class RefinementResult:
     step: float  # length of the Gauss-Newton step on these rays (metres, radians)
     poses: SE3  # (steps + 1): the first pose given, then the best one after each step
     losses: Float[Tensor, "s"]  # before each step
-    contrast: float = math.inf  # standard deviation of the measured colours, in [0, 1]; infinite with depth
+    support: Support  # by these rays
 
 
 def refine(
@@ -54,19 +57,22 @@ def refine(
 ) -> RefinementResult:
     """Refine poses (h), of which each stage keeps the best; ``problem.start`` is not used.
 
-    The answer is the better of the last two stages' poses, compared on rays to which neither was fitted.
+    The answer is the better of the last two stages' poses, compared on rays to which neither was fitted. Its rivals are the next
+    best poses of the last stage that had several.
     """
     about = pivot(settings.refinement.pivot, replace(problem, start=start[0])).to(problem.device)
     history = History([start[0].to("cpu")])
     problem, T, ends = problem.on_device(), start.to(problem.device), []
+    rivals: SE3 | None = None
     for stage in stages:
         cost = settings.drawn(problem, stage, about, generator)
         for _ in range(stage.centring):
             T = centred(cost.field, cost.rays.observed, problem.bounds, T)
         T = _ranked(cost, T, history) if stage.steps == 0 else _descended(cost, T[: stage.keep], history)
         ends.append(T[0])
+        rivals = T[1 : 1 + RIVALS] if len(T.translation) > 1 else rivals
     fresh = settings.drawn(problem, stages[-1], about, generator)
-    return _assessed(fresh, SE3.stack(ends[-2:]), history)
+    return _assessed(fresh, SE3.stack(ends[-2:]), rivals, history)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +142,7 @@ def _descended(cost: RenderedCost, T: SE3, history: History) -> SE3:
     return found.T[found.equations.cost.argsort()].normalized()
 
 
-def _assessed(cost: RenderedCost, T: SE3, history: History) -> RefinementResult:
+def _assessed(cost: RenderedCost, T: SE3, rivals: SE3 | None, history: History) -> RefinementResult:
     T, about = T.to("cpu"), cost.pivot.to(torch.device("cpu"))
     residuals = cost.residuals(T)
     equations = residuals.normal_equations()
@@ -151,14 +157,22 @@ def _assessed(cost: RenderedCost, T: SE3, history: History) -> RefinementResult:
         step=float(torch.linalg.vector_norm(equations.solve(torch.zeros_like(equations.cost))[best])),
         poses=SE3.stack(history.poses),
         losses=torch.tensor(history.losses, dtype=torch.float64),
-        contrast=_contrast(cost),
+        support=rendered_support(cost, T[best], rivals),
     )
 
 
-def _contrast(cost: RenderedCost) -> float:
-    """Return the largest standard deviation of a measured colour channel; infinite if depth was measured too."""
-    weights, rgb = cost.rays.weights, cost.rays.observed.rgb
-    if bool((weights[:, 3:] > 0).any()):
-        return math.inf
-    coloured = rgb[(weights[:, :3] > 0).all(-1)]
-    return 0.0 if not len(coloured) else float(coloured.std(0, correction=0).max())
+@torch.no_grad()
+def rendered_support(cost: RenderedCost, T: SE3, rivals: SE3 | None = None) -> Support:
+    """Return how well rendered rays distinguish a pose from its rivals, of which ``rivals`` (h) are some."""
+    problem = cost.problem
+    if not bool(T.matrix().isfinite().all()):
+        return NONE
+    middle = (
+        rendered_middle(cost.field, cost.rays.observed, problem.bounds, T[None].to(problem.device))[0]
+        .cpu()
+        .double()
+    )
+    if not bool(middle.isfinite().all()):  # nothing is rendered
+        centre = torch.tensor(problem.bounds.centre, dtype=torch.float64)
+        middle = T.to("cpu", torch.float64).inverse().apply(centre)
+    return support(cost.ray_costs, T, middle, cost.plain_ray_costs(), rivals)

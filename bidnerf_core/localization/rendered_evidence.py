@@ -7,12 +7,12 @@ distinguish them better.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import take_few_steps
@@ -23,11 +23,6 @@ COMPARED_RAYS = 8192
 """Number of rays on which two explanations are compared; fewer if fewer pixels are not hidden."""
 FITTED = RefinementStage(steps=2, rays=1024)
 """The steps to the pose that suits an explanation best. The comparison draws other rays."""
-LOG_ODDS_PER_DEVIATION = 0.5
-"""Log odds for each standard error of the difference between the two costs.
-
-Independent rays would justify more, but the errors of a field's rays are correlated. Chosen on frames held out for tuning.
-"""
 NOISIEST = 0.15
 """Colour noise of a field on its own training images above which it provides no evidence: it has hardly been trained."""
 
@@ -41,10 +36,8 @@ def log_odds_by_rendering(one: Problem, other: Problem, seed: int, steps: int = 
     if one.colour_noise is not None and one.colour_noise > NOISIEST:
         return 0.0
     stage = replace(FITTED, steps=steps)
-    difference = _ray_costs(other, stage, seed) - _ray_costs(one, stage, seed)
-    error = float(difference.std()) * len(difference) ** 0.5
-    odds = LOG_ODDS_PER_DEVIATION * float(difference.sum()) / max(error, 1e-12)
-    return odds if math.isfinite(odds) else 0.0
+    rival = _ray_costs(other, stage, seed)
+    return float(log_odds(rival[None], _ray_costs(one, stage, seed))[0])
 
 
 def _ray_costs(problem: Problem, stage: RefinementStage, seed: int) -> Float[Tensor, "n"]:

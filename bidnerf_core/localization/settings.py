@@ -128,7 +128,7 @@ class AdamSettings(Settings):
     # pose to answer with: the last, or the one after the 20 steps of least mean loss
     answer: Annotated[AnswerName, EXPERT] = "last"
     converged_loss: NotNegative = 0.02  # mean loss of 20 steps below which the answer counts as converged
-    # where only colours are compared, that mean loss must also be below this share of the loss of the image's mean colour
+    # largest share of the cost of the image's mean colour that an accepted answer leaves, where only colours are compared
     plain_share: Annotated[float, Range(0.0), EXPERT] = 0.5
 
 

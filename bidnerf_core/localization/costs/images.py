@@ -264,6 +264,12 @@ class ImageCost:
         sound = T.translation.isfinite().all(-1) & T.rotation.isfinite().all(-1).all(-1)
         return NormalEquations(torch.where(sound, cost, torch.inf), gradient, hessian)
 
+    def pixel_costs(self, T: SE3) -> Float[Tensor, "h n"]:
+        """Return the cost of each pixel of all images."""
+        seen = (render_view(self.renderer, small, T).blurred(self.blur) for small in self.thumbnails)
+        compared = [self._compared(small, view) for small, view in zip(self.thumbnails, seen, strict=True)]
+        return torch.cat([part.pixels for part in compared], -1).double()
+
     def with_blur_of(self, T: SE3, candidates: Sequence[float]) -> ImageCost:
         """Return the cost with the candidate blur that makes renderings from one pose most similar to the photos."""
         return replace(self, blur=candidates[int(self.costs_of_blurs(T, candidates).argmin())])
@@ -295,29 +301,33 @@ class ImageCost:
         corrected = exposed(seen, measured, self.scales)
         error = corrected.clamp(0, 1) - measured
         near = inlier_weight((error**2).sum(1), scale)
-        cost = (seen.known * (1 - near) + (1 - seen.known) * UNKNOWN_COST).mean(-1)
+        pixels = seen.known * (1 - near) + (1 - seen.known) * UNKNOWN_COST
         weight = seen.known * near**2 / scale**2 / error.shape[-1]
         inside = (corrected - 0.5).abs() < 0.5  # where a camera clips, the colour does not depend on the pose
-        return _Compared(cost, error, weight[:, None] * inside)
+        return _Compared(pixels, error, weight[:, None] * inside)
 
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
     """A rendered image compared with a measured one."""
 
-    cost: Float[Tensor, "h"]
+    pixels: Float[Tensor, "h n"]  # cost of each pixel
     error: Float[Tensor, "h 3 n"]
     weight: Float[Tensor, "h 3 n"]  # of each squared error in a step
 
+    @property
+    def cost(self) -> Float[Tensor, "h"]:
+        return self.pixels.mean(-1)
 
-def uniform_cost(thumbnails: Sequence[Thumbnail], scale: float) -> float:
-    """Return the cost of images of one colour, the median of what was measured: the baseline that a pose must beat."""
+
+def plain_pixel_costs(thumbnails: Sequence[Thumbnail], scale: float) -> Float[Tensor, "n"]:
+    """Return each pixel's cost of images of one colour, the median of what was measured: the baseline that a pose must beat."""
     costs = []
     for small in thumbnails:
         measured = small.rgb.flatten(1)
         squared = ((measured - measured.median(-1, keepdim=True).values) ** 2).sum(0)
-        costs.append((1 - inlier_weight(squared, scale)).mean())
-    return float(torch.stack(costs).mean())
+        costs.append(1 - inlier_weight(squared, scale))
+    return torch.cat(costs)
 
 
 def exposed(

@@ -22,7 +22,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.frames.pixels import DrawerName, draw, drawer
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.linearization import Linearization, linearize
-from bidnerf_core.localization.exposure import Exposure, clipped, robust_exposure
+from bidnerf_core.localization.exposure import EXPOSURE_ROUNDS, Exposure, clipped, robust_exposure
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.settings import (
@@ -189,6 +189,27 @@ class RenderedCost:
             found, self.rays, self.objective, self.settings.exposure, self.stage.surface_sigma
         )
         return replace(residuals, home=home)
+
+    def ray_costs(self, T: SE3) -> Float[Tensor, "h n"]:
+        """Return each ray's part of the cost, without spending time on derivatives."""
+        return self.residuals(T, derivatives=False).ray_costs()
+
+    def plain_ray_costs(self) -> Float[Tensor, "n"] | None:
+        """Return each ray's part of the cost of images of a single colour, the one that suits the rays best; on the CPU.
+
+        None if depth was measured too, or no colour.
+        """
+        weights, rgb = self.rays.weights.double(), self.rays.observed.rgb.double()
+        if bool((weights[:, 3:] > 0).any()) or not bool((weights[:, :3] > 0).any()):
+            return None
+        robust, share = self.objective.terms[0].robust, weights[:, :3]
+        mean = (share * rgb).sum(0) / weights[:, :3].sum(0)
+        for _ in range(EXPOSURE_ROUNDS):
+            share = weights[:, :3] * robust.weight(rgb - mean)
+            mean = (share * rgb).sum(0) / share.sum(0)
+        value = torch.zeros_like(weights)
+        value[:, :3] = torch.where(weights[:, :3] > 0, mean - rgb, 0)
+        return 2 * (weights * self.objective.rho(value)).sum(-1).cpu()
 
     @property
     def field(self) -> RadianceField:

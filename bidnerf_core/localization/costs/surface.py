@@ -172,6 +172,11 @@ class SurfaceCost:
         colour = self.scales.colour_weight
         return moved(self._cost(near, alike) if colour else (1 - near).mean(-1).double(), T.device)
 
+    def point_costs(self, T: SE3) -> Float[Tensor, "h p"]:
+        """Return each point's cost, whose mean is the cost."""
+        near, alike = self.inliers(self.correspondences(T))
+        return moved((1 - near + self.scales.colour_weight * (1 - near * alike)).double(), T.device)
+
     def inliers(self, found: Correspondences) -> tuple[Float[Tensor, "h p"], Float[Tensor, "h p"]]:
         """Return each point's inlier weights: that of its distance and that of its colour."""
         near = inlier_weight(found.squared, self.scales.distance)

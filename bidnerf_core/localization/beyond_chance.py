@@ -1,0 +1,133 @@
+"""Agreement beyond chance: whether what was measured distinguishes a pose from its rivals.
+
+A plain wall agrees with a plain wall from anywhere. How much agrees therefore says little by itself: it counts as far as a
+pose explains the measurements better than its rivals do. These are poses displaced from it by more than an answer may be off,
+the best different pose of a search, and images rendered in their mean colour. One test serves colours, depths and points on
+the surface: each measurement's cost with the rival, less that with the pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.result import Outcome, Verdict
+from bidnerf_core.localization.solvers.pivots import Pivot
+
+ACCEPTED = 0.8
+"""Least confidence with which a pose is accepted."""
+DISPLACEMENT = 0.1
+"""Displacement of rivals: a share of the distance of what is seen, and an angle in radians about it.
+
+It is three times the largest standard deviation of an accepted position by landmarks.
+"""
+LOG_ODDS_PER_DEVIATION = 0.5
+"""Log odds for each standard error of the difference between two costs.
+
+Independent measurements would justify more, but the errors of a field's rays are correlated. Chosen on frames held out for
+tuning.
+"""
+LEAST_EXPLAINED = 0.5
+"""Least share of an image's contrast that an accepted pose explains."""
+
+Costs = Callable[[SE3], Float[Tensor, "h n"]]
+"""Returns each of n measurements' part of the cost, from each of h poses."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """How well measurements distinguish a pose from its rivals."""
+
+    explained: float  # share of the images' contrast: 1 less the ratio of the cost to that of the mean colour
+    plain: float  # log odds against the mean colour; infinite where more than colours was compared
+    displaced: float  # log odds against the best of the displaced poses
+    other: float  # log odds against the best different pose of a search; infinite where there was none
+
+    @property
+    def confidence(self) -> float:
+        """The probability of the pose, if it was as probable as each rival before."""
+        return 1 / (1 + sum(_factor(odds) for odds in (self.plain, self.displaced, self.other)))
+
+    def rejection(self, least_explained: float = LEAST_EXPLAINED) -> Verdict | None:
+        """Return why the measurements do not support the pose, or None."""
+        if self.confidence < ACCEPTED:
+            if self.plain <= min(self.displaced, self.other):
+                return Verdict(Outcome.UNDETERMINED, "an image of a single colour fits about as well")
+            if self.other < self.displaced:
+                return Verdict(Outcome.AMBIGUOUS, "another pose fits about as well")
+            share = f"{DISPLACEMENT:.0%} of the distance of what is seen"
+            return Verdict(Outcome.UNDETERMINED, f"poses displaced by {share} fit about as well")
+        if not self.explained >= least_explained:
+            share = f"{max(self.explained, 0):.0%} of the contrast of the image"
+            return Verdict(Outcome.RENDERING_MISMATCH, f"the pose explains only {share}")
+        return None
+
+
+NONE = Support(0.0, 0.0, 0.0, 0.0)
+"""The support of a pose that is not finite."""
+
+
+def support(
+    costs: Costs,
+    T: SE3,
+    middle: Float[Tensor, "3"],
+    plain: Float[Tensor, "n"] | None = None,
+    others: SE3 | None = None,
+) -> Support:
+    """Compare a pose with its rivals.
+
+    ``middle``: the middle of what is seen (metres, last camera's frame), about which rivals are displaced. ``plain``: each
+    measurement's cost in images rendered in their mean colour; None where more than colours is compared. ``others``: poses (h)
+    found by a search; those within the displacement are no rivals.
+    """
+    here, about = costs(T[None])[0], Pivot.at_point(middle)
+    reach = float(torch.linalg.vector_norm(middle))
+    near = log_odds(costs(_displaced(T, about, reach)), here)
+    far = near[:0]
+    if others is not None:
+        others = others[_apart(T, others, about, reach)]
+        far = log_odds(costs(others), here) if len(others.translation) else far
+    explained, by_plain = 1.0, math.inf
+    if plain is not None:
+        total = float(plain.sum())
+        explained = 1 - float(here.sum()) / total if total > 0 else 0.0
+        by_plain = float(log_odds(plain[None], here)[0])
+    return Support(explained, by_plain, float(near.min()), float(far.min()) if len(far) else math.inf)
+
+
+def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Tensor, "h"]:
+    """Return the log odds against each rival, from each measurement's cost with it and that with the pose; 0 where not finite."""
+    difference = rivals - here
+    error = difference.std(-1) * difference.shape[-1] ** 0.5
+    odds = LOG_ODDS_PER_DEVIATION * difference.sum(-1) / error.clamp(min=1e-12)
+    return torch.where(odds.isfinite(), odds, 0)
+
+
+def _displaced(T: SE3, about: Pivot, reach: float) -> SE3:
+    """Return twelve poses: displaced to both sides along and about each axis."""
+    size = torch.tensor([DISPLACEMENT * reach] * 3 + [DISPLACEMENT] * 3, dtype=torch.float64)
+    steps = torch.cat([torch.diag(size), -torch.diag(size)]).to(T.translation)
+    return about.to(T.translation.device).moved(_repeated(T, len(steps)), steps)
+
+
+def _apart(T: SE3, others: SE3, about: Pivot, reach: float) -> Bool[Tensor, "h"]:
+    """Return which poses are farther from the pose than the displaced ones."""
+    here = about.to(T.translation.device).at(T)
+    there = about.to(T.translation.device).at(others.to(T.translation.device, T.translation.dtype))
+    motion = (_repeated(here.inverse(), len(there.translation)) @ there).log()
+    shift, turn = (torch.linalg.vector_norm(part, dim=-1) for part in motion.split(3, -1))
+    return (shift > DISPLACEMENT * reach) | (turn > DISPLACEMENT)
+
+
+def _repeated(T: SE3, count: int) -> SE3:
+    return SE3(T.rotation.expand(count, 3, 3), T.translation.expand(count, 3))
+
+
+def _factor(odds: float) -> float:
+    return math.exp(-max(-500.0, min(500.0, odds)))
