@@ -13,30 +13,30 @@ from torch import Tensor
 import bidnerf_core.localization.auto as auto_module
 import bidnerf_core.localization.by_landmarks as by_landmarks_module
 from bidnerf_core import Localization, Localizer, Outcome, View
+from bidnerf_core.captures.field_trial import tried
 from bidnerf_core.depth.sensors import find_depth_sensor
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import (
     AutoConfig,
     LandmarkAnswer,
     LandmarkMatcher,
-    RefinementStage,
-    RenderedCost,
-    RenderedCostSettings,
+    LandmarkPose,
+    Problem,
     answer_by_landmarks,
+    propose,
     rig,
 )
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_verdict
 from bidnerf_core.localization.by_depth import share_on_surface
 from bidnerf_core.localization.by_landmarks import (
-    MORE_STEPS,
     SHARPEST,
-    STEPS,
-    THOROUGHLY,
     corrected,
+    fused_answer,
     localization_by_landmarks,
 )
 from bidnerf_core.localization.depth_scale import DepthScale
-from bidnerf_core.localization.fused_pose import FusedPose, Measurements
+from bidnerf_core.localization.fusion import FusedPose, Measurements
 from bidnerf_core.localization.search.landmarks import Confirmation
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing import textured_field
@@ -131,27 +131,6 @@ def test_another_exposure_does_not_mislead_rendering(gain: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("trusted", "effort", "most"),
-    [(0.0, 1, STEPS), (1.1, THOROUGHLY, MORE_STEPS)],
-    ids=["trusted", "doubtful"],
-)
-def test_doubtful_poses_are_refined_on_more_rays(
-    trusted: float, effort: int, most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stages, drawn = list[RefinementStage](), RenderedCostSettings.drawn
-
-    def noted(settings: RenderedCostSettings, *given: Any) -> RenderedCost:
-        stages.append(given[1])
-        return drawn(settings, *given)
-
-    monkeypatch.setattr(RenderedCostSettings, "drawn", noted)
-    monkeypatch.setattr(by_landmarks_module, "TRUSTED", trusted)
-    answer(without_depth(unseen()), rays=100)
-    assert {stage.rays for stage in stages} == {100 * effort}
-    assert 1 < len(stages) <= most  # a draw for each step
-
-
-@pytest.mark.parametrize(
     ("noise", "terms"),
     [(None, ("rendering",)), (SHARPEST, ("rendering",)), (1.01 * SHARPEST, ())],
     ids=["unknown", "sharp", "blurred"],
@@ -208,13 +187,17 @@ def test_depth_of_another_unit_is_left_out(scale: float) -> None:
     assert f"without depth: it is {1 / found.found.depth_scale:.3g} times as long as by landmarks" in reason
 
 
+def _at(found: FusedPose, T: SE3) -> FusedPose:
+    return replace(found, state=replace(found.state, T=T))
+
+
 def test_a_pose_that_leaves_the_landmarks_far_behind_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     fused = by_landmarks_module.fused_pose
     away = torch.tensor([0.5, 0, 0, 0, 0, 0], dtype=torch.float64)
 
-    def carried_off(measurements: Measurements, most_steps: int) -> FusedPose:
-        found = fused(measurements, most_steps)
-        return found if measurements.points is None else replace(found, T=found.T.retract(away))
+    def carried_off(measurements: Measurements, *given: Any) -> FusedPose:
+        found = fused(measurements, *given)
+        return found if measurements.points is None else _at(found, found.T.retract(away))
 
     monkeypatch.setattr(by_landmarks_module, "fused_pose", carried_off)
     found = answer(unseen(), rays=RAYS, map=textured_map(surface=True))
@@ -427,3 +410,58 @@ def test_an_answer_of_the_surface_is_refined_by_landmarks_near_it(monkeypatch: p
     assert_within(found.T_world_camera, 0.02, 0.5)
     assert isinstance(found.diagnostics, LandmarkDiagnostics)
     assert not found.diagnostics.searched
+
+
+def few_by_chance(problem: Problem, off: Tensor) -> LandmarkPose:
+    """Return a pose that is wrong, with which 20 landmarks agree."""
+    found = propose(matcher(), problem.views, seed=0)
+    assert found is not None
+    few = slice(0, 20)
+    return replace(
+        found,
+        T_world_camera=found.T_world_camera.retract(off),
+        covariance=found.covariance * 4,
+        correspondences=found.correspondences[few],
+        residuals=found.residuals[few],
+        normalized_residuals=found.normalized_residuals[few],
+        pixels=found.pixels[few],
+    )
+
+
+def test_few_landmarks_beside_a_sharp_field_do_not_decide() -> None:
+    """A contradiction is settled by rendering both poses, not in favour of landmarks as such."""
+    problem = rig(textured_map(), [without_depth(unseen())], None, matcher=matcher())
+    off = torch.tensor([0.06, -0.03, 0.02, 0.0, 0.0, 0.02], dtype=torch.float64)
+    wrong = few_by_chance(problem, off)
+    found = fused_answer(problem, wrong, landmark_verdict(wrong), RAYS, 0)
+    assert float(pose_error(wrong.T_world_camera, TRUTH).translation) > 0.05
+    assert found.terms == ("rendering",)
+    assert_within(found.T, 0.01, 0.3)
+
+
+class BlurredGround(textured_field.TexturedGround):
+    """A ground whose fine texture was not learned."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        fine = self.waves.norm(dim=0) > 20
+        object.__setattr__(self, "weights", torch.where(fine[:, None], 0, self.weights))
+
+
+@functools.cache
+def blurred_map() -> MapWithLandmarks:
+    """Return a map with good landmarks and a field that is blurred and 3 cm off."""
+    shift = SE3.exp(torch.tensor([0.03, 0, 0, 0, 0, 0], dtype=torch.float64))
+    field = textured_field.MovedField(BlurredGround(), shift)
+    independent = tried(field, textured_field.BOUNDS, textured_field.training_views())
+    return replace(textured_map(), field=field, colour_noise=SHARPEST, independent=independent)
+
+
+def test_many_landmarks_beside_a_blurred_field_decide() -> None:
+    """The trial on the map's own images finds the field off, so that its rays count for little."""
+    alone = answer(without_depth(unseen()))
+    found = answer(without_depth(unseen()), rays=RAYS, map=blurred_map())
+    assert blurred_map().independent.rays < USUAL.rays / 5
+    assert_within(alone.T, 0.01, 0.3)
+    assert_within(found.T, 0.012, 0.35)
+    assert found.verdict.accepted

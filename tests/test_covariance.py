@@ -11,10 +11,10 @@ from torch import Generator
 
 import baked
 from bidnerf_core.depth.sensors import EXACT
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import PointCloud, PointScales, SurfaceCost
 from bidnerf_core.localization.covariance import (
-    INDEPENDENT,
     position_deviation,
     sandwich_covariance,
     surface_covariance,
@@ -103,7 +103,7 @@ def test_the_surface_covariance_of_a_plane_is_that_of_a_few_independent_distance
     bare = torch.zeros(100, dtype=torch.bool)
     cloud = baked.points(seen_patch(noise).points, torch.zeros((100, 3)), coloured=bare)
     found = surface_covariance(PointSearch(surface, cloud).judge(), SE3.identity(), sensor=EXACT)
-    assert float(found[2, 2].sqrt()) == pytest.approx(noise / (2 * INDEPENDENT) ** 0.5, rel=0.15)
+    assert float(found[2, 2].sqrt()) == pytest.approx(noise / (2 * USUAL.points) ** 0.5, rel=0.15)
 
 
 def test_the_sandwich_of_independent_noise_is_the_inverse_of_the_information(generator: Generator) -> None:

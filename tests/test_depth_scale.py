@@ -14,10 +14,9 @@ from bidnerf_core.localization.depth_scale import (
     LANDMARK_SCALE_NOISE,
     PLAUSIBLE,
     DepthScale,
-    PoseAndFactor,
+    PoseAndDepth,
     ScaledPoints,
-    residual_equations,
-    with_factor,
+    of_pose,
 )
 from problems import FieldMap
 
@@ -34,30 +33,29 @@ def scaled_points(scale: DepthScale = SCALE, views: int = 1) -> ScaledPoints:
     return ScaledPoints(SurfaceCost(baked.exact(baked.toy()), cloud, SCALES), scale, seen[-1].T_ref_camera)
 
 
-def away(points: ScaledPoints, generator: Generator, size: float = 0.01) -> PoseAndFactor:
+def away(points: ScaledPoints, generator: Generator, size: float = 0.01) -> PoseAndDepth:
     off = size * torch.randn(6, generator=generator, dtype=torch.float64)
-    return PoseAndFactor(points.start.retract(off), 0.98)
+    return PoseAndDepth(points.start.retract(off), 0.98, 0.01)
 
 
-def moved(points: ScaledPoints, at: PoseAndFactor, unknowns: Tensor) -> PoseAndFactor:
-    T = points.cost.cloud.pivot.moved(at.T, unknowns[:6])
-    return PoseAndFactor(T, at.factor + float(unknowns[6]))
+def moved(points: ScaledPoints, at: PoseAndDepth, unknowns: Tensor) -> PoseAndDepth:
+    return at.moved(points.cost.cloud.pivot, unknowns)
 
 
 @pytest.mark.parametrize("views", [1, 4])
-def test_the_gradient_of_points_is_exact_by_pose_and_factor(views: int, generator: Generator) -> None:
+def test_the_gradient_of_points_is_exact_by_pose_and_errors(views: int, generator: Generator) -> None:
     """The points of another factor turn about another middle; the joint updates turn about the same one."""
     points = scaled_points(views=views)
     at = away(points, generator)
-    cost = points.at(at.factor)
+    cost = points.at(at)
     found = points.about_middle(cost, cost(at.T[None]))
 
     def value(unknowns: Tensor) -> float:
         there = moved(points, at, unknowns)
-        return float(points.at(there.factor).cost(there.T[None])[0])
+        return float(points.at(there).cost(there.T[None])[0])
 
-    for axis in range(7):
-        step = 1e-6 * torch.eye(7, dtype=torch.float64)[axis]
+    for axis in range(8):
+        step = 1e-6 * torch.eye(8, dtype=torch.float64)[axis]
         expected = (value(step) - value(-step)) / 2e-6
         assert 2 * float(found.gradient[0, axis]) == pytest.approx(expected, rel=1e-3, abs=1e-5)
 
@@ -67,7 +65,9 @@ def test_several_cameras_tell_the_factor_and_one_hardly_does() -> None:
     told = []
     for views in (1, 4):
         points = scaled_points(views=views)
-        equations = points.about_middle(points.cost, points.at(1.0)(points.start[None]))
+        equations = points.about_middle(
+            points.cost, points.at(PoseAndDepth(points.start))(points.start[None])
+        )
         own = 1 / torch.linalg.inv(equations.hessian[0])[6, 6]
         told.append(float(own / equations.hessian[0, 6, 6]))
     assert told[0] < 0.2 * told[1]
@@ -80,8 +80,8 @@ def test_what_is_assumed_of_the_factor_has_the_derivative_of_its_cost(
     points = scaled_points(DepthScale(0.02, by_landmarks=1.03), views)
     at = away(points, generator)
     found = points.assumed(at)
-    for axis in range(7):
-        step = 1e-6 * torch.eye(7, dtype=torch.float64)[axis]
+    for axis in range(8):
+        step = 1e-6 * torch.eye(8, dtype=torch.float64)[axis]
         above, below = (float(points.assumed(moved(points, at, sign * step)).cost[0]) for sign in (1, -1))
         assert 2 * float(found.gradient[0, axis]) == pytest.approx((above - below) / 2e-6, rel=1e-5, abs=1e-3)
 
@@ -94,7 +94,7 @@ def test_a_camera_that_moves_away_shows_landmarks_farther_off() -> None:
     farther = points.cost.cloud.pivot.moved(points.start, back)
 
     def cost(factor: float) -> float:
-        return float(points.assumed(PoseAndFactor(farther, factor)).cost[0])
+        return float(points.assumed(PoseAndDepth(farther, factor)).cost[0])
 
     factors = torch.linspace(0.9, 1.3, 401).tolist()
     assert min(factors, key=cost) == pytest.approx(1.1, abs=0.01)
@@ -104,14 +104,14 @@ def test_a_camera_that_moves_away_shows_landmarks_farther_off() -> None:
 def test_at_the_start_the_most_probable_factor_is_the_estimate(by_landmarks: float | None) -> None:
     """The points were corrected by it already, so that the factor is 1 there."""
     points = scaled_points(DepthScale(0.02, by_landmarks))
-    found = points.assumed(PoseAndFactor(points.start))
+    found = points.assumed(PoseAndDepth(points.start))
     assert float(found.gradient[0, 6]) == pytest.approx(0, abs=1e-6)
 
 
 def test_a_sensor_without_errors_fixes_the_factor() -> None:
     points = scaled_points(DepthScale(0.0, by_landmarks=1.03))
     assert points.scale.estimate == 1
-    information = points.assumed(PoseAndFactor(points.start)).hessian[0, 6, 6]
+    information = points.assumed(PoseAndDepth(points.start)).hessian[0, 6, 6]
     assert float(information) > 1e3 / LANDMARK_SCALE_NOISE**2
 
 
@@ -125,19 +125,17 @@ def test_a_scale_is_plausible_as_far_as_sensor_and_landmarks_may_err() -> None:
     assert DepthScale(0.02, 0.2).objection == "it is 5 times as long as by landmarks"
 
 
-def test_a_cost_of_the_pose_says_nothing_of_the_factor(generator: Generator) -> None:
+def test_a_cost_of_the_pose_says_nothing_of_the_errors_of_depth(generator: Generator) -> None:
     rows = torch.randn((1, 20, 6), generator=generator, dtype=torch.float64)
     gradient = torch.randn((1, 6), generator=generator, dtype=torch.float64)
     equations = NormalEquations(torch.ones(1, dtype=torch.float64), gradient, rows.mT @ rows)
-    joint = with_factor(equations)
-    assert not bool(joint.hessian[0, 6].any())
+    joint = of_pose(equations)
+    assert not bool(joint.hessian[0, 6:].any())
     torch.testing.assert_close(joint.hessian[:, :6, :6], equations.hessian)
-    fixed = joint + residual_equations(0.0, torch.eye(7, dtype=torch.float64)[6], 1.0)
-    torch.testing.assert_close(fixed.without_last().hessian, equations.hessian)
 
 
 def test_points_of_another_factor_are_as_far_off_as_it_says() -> None:
     points = scaled_points(views=4)
-    scaled, given = points.at(1.1).cloud, points.cost.cloud
+    scaled, given = points.at(PoseAndDepth(points.start, 1.1)).cloud, points.cost.cloud
     torch.testing.assert_close(scaled.points - given.origins, 1.1 * (given.points - given.origins))
     assert torch.equal(scaled.rgb, given.rgb)

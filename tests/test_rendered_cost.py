@@ -75,7 +75,9 @@ def test_inliers_are_rays_none_of_whose_residuals_is_far_off() -> None:
     value = torch.tensor([[[0.29, 0, 0], [0.31, 0, 0], [0, 0, -0.31], [9.0, 9.0, 9.0]]], dtype=torch.float64)
     weights = torch.ones((4, 3), dtype=torch.float64)
     weights[3] = 0
-    found = Residuals(value, torch.zeros((1, 4, 3, 6)).double(), weights, torch.ones_like(value), objective)
+    found = Residuals(
+        value, torch.zeros((1, 4, 3, 6)).double(), weights, torch.zeros_like(value), 0.0, objective
+    )
     assert found.inliers().tolist() == [0.5]
 
 
@@ -87,7 +89,7 @@ def test_rays_without_depth_are_left_out_of_the_inliers_by_depth() -> None:
     weights = torch.ones(value.shape[1:], dtype=torch.float64)
     fewest = round(100 * LEAST_WITH_DEPTH)
     weights[fewest:, 3] = 0
-    found = Residuals(value, torch.zeros((*value.shape, 6)), weights, torch.ones_like(value), objective)
+    found = Residuals(value, torch.zeros((*value.shape, 6)), weights, torch.zeros_like(value), 0.0, objective)
     assert found.inliers().tolist() == [0.5]
     assert found.inliers_by_depth().tolist() == [1.0]
     weights[fewest - 1, 3] = 0  # one fewer, and all rays count again

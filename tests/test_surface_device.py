@@ -17,6 +17,7 @@ from bidnerf_core.devices import moved, without_waiting
 from bidnerf_core.evaluation.protocols import perturb
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.frames.frame import View
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import (
     ColourSettings,
@@ -28,12 +29,14 @@ from bidnerf_core.localization import (
     RefinementSettings,
     RefinementStage,
     RenderedCostSettings,
+    Scaled,
     Sum,
     descend,
     rig,
 )
 from bidnerf_core.localization.costs import images, surface
-from bidnerf_core.localization.fusion import finest_cost, rendered_term, surface_term
+from bidnerf_core.localization.covariance import weight
+from bidnerf_core.localization.fusion import finest_cost
 from bidnerf_core.localization.search.by_images import IMAGE_STAGES, ImageSearch
 from bidnerf_core.localization.search.by_points import POINT_STAGES, PointSearch
 from bidnerf_core.localization.solvers import levenberg_marquardt
@@ -121,8 +124,9 @@ def align_points_and_render(place: Place) -> list[Tensor]:
     settings = RenderedCostSettings(ColourSettings(), DepthSettings(), RefinementSettings(exposure=True))
     about = points.cloud.pivot
     rays = settings.drawn(problem.on_device(), RefinementStage(2, 64), about.to(place.device), generator)
-    terms = (rendered_term(rays, float(rays.cost(T)[0]), 1), surface_term(points, T[0], 1))
-    return place.descended(Sum(tuple(term.scaled for term in terms)), about, T)
+    by_rays = Scaled(rays, weight(USUAL.rays, float(rays.cost(T)[0])))
+    by_points = Scaled(points, weight(USUAL.points, float(points.residual_variance(T)[0])))
+    return place.descended(Sum((by_rays, by_points)), about, T)
 
 
 GRADIENT = 2

@@ -10,6 +10,7 @@ import torch
 
 from bidnerf_core import SE3, Frame, Localizer, Outcome, Tracker
 from bidnerf_core.depth.sensors import KINECT
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.localization import (
     AutoConfig,
     GaussianPrior,
@@ -27,7 +28,6 @@ from bidnerf_core.localization.tracking.points import FollowedPoints
 from bidnerf_core.localization.tracking.recognition import LEAST_CORNERS, Odometry
 from bidnerf_core.localization.tracking.state import TrackerState
 from bidnerf_core.localization.tracking.surface import (
-    DEPTH_MEASUREMENTS,
     aligned,
     fit_shape,
     fused_with_surface,
@@ -202,7 +202,7 @@ def test_fusing_with_depth_minimizes_the_sum_of_prior_and_surface(steps: int) ->
     cost = SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
     variance = float(cost.residual_variance(start.T_world_camera[None])[0])
     prior = GaussianPrior(start.T_world_camera, start.covariance, cloud.pivot)
-    both = Sum((prior, Scaled(cost, DEPTH_MEASUREMENTS / variance)))
+    both = Sum((prior, Scaled(cost, USUAL.tracked_points / variance)))
     best = descend(both, start.T_world_camera[None], 20, cloud.pivot.moved).T[0]
     off = pose_error(fused.T_world_camera, best)
     assert float(off.translation) < 1e-3

@@ -12,6 +12,7 @@ from torch import Tensor
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
 from bidnerf_core.captures.cameras import PoseConsistency
 from bidnerf_core.captures.shutter_evidence import common_motion
+from bidnerf_core.geometry.independent import KEYPOINTS_PER_INDEPENDENT
 from bidnerf_core.geometry.robust import mad_deviation
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import (
@@ -31,8 +32,6 @@ ROUNDS = 3
 """Largest number of adjustments. After each, the keypoints are matched anew, which finds those that wrong poses hid."""
 SETTLED_PIXELS = 0.25
 """Largest motion of an image in an adjustment (pixels) after which no further one is needed."""
-CORRELATED_KEYPOINTS = 10.0
-"""Number of keypoints that count as one: lenses and rolling shutters cause errors that the keypoints of an image share."""
 LEAST_DEVIATION = 1e-9
 """Least standard deviation of the poses (metres, radians) that is assumed."""
 
@@ -71,7 +70,7 @@ def adjusted_poses(
         prior = PosePrior(given, *deviations, motion)
         start = Adjustment(tracked.T_world_camera, points, tracked.motion)
         pixel_noise = max(LEAST_NOISE, noise(seen.sightings, points))
-        fit = adjusted(seen.sightings, start, prior, pixel_noise, CORRELATED_KEYPOINTS)
+        fit = adjusted(seen.sightings, start, prior, pixel_noise, KEYPOINTS_PER_INDEPENDENT)
         step = _motion(seen, fit.points, tracked.T_world_camera, fit.T_world_camera)
         moved = (given.inverse() @ fit.T_world_camera).log()
         deviations = max(deviations[0], _spread(moved[:, :3])), max(deviations[1], _spread(moved[:, 3:]))
@@ -93,7 +92,7 @@ def adjusted_poses(
 
 
 def _common_motion(tracked: TrackedViews, config: LandmarkConfig) -> MotionPrior:
-    return common_motion(*tracked.triangulated(config), CORRELATED_KEYPOINTS)
+    return common_motion(*tracked.triangulated(config), KEYPOINTS_PER_INDEPENDENT)
 
 
 def _found(

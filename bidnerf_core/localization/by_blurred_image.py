@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.devices import moved
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.ambiguous_intrinsics import may_be_miscalibrated
 from bidnerf_core.localization.beyond_chance import Support, support
@@ -51,8 +52,6 @@ LEAST_EXPLAINED = 0.75
 """Least share of the image's contrast that an accepted pose explains."""
 PRECISE = 0.01
 """Largest standard deviation of an accepted position, as a share of the distance of what is seen."""
-INDEPENDENT_PIXELS = 60
-"""Number of independent measurements in a small image; set by the normalised errors on frames that were held out for tuning."""
 UNSUITABLE = (
     Outcome.AMBIGUOUS, Outcome.DIVERGED, Outcome.MIRRORED, Outcome.MISCALIBRATED, Outcome.TOO_FEW_MATCHES
 )  # fmt: skip
@@ -142,7 +141,7 @@ def _descents(cost: ImageCost, T: SE3, about: Pivot) -> list[Descent]:
 
 def _covariance(done: Descent, views: int) -> Float[Tensor, "6 6"]:
     """Return the covariance of an update at the pivot; not finite where the images do not determine it."""
-    variance = done.equations.cost[0].clamp(min=LEAST_VARIANCE) / (INDEPENDENT_PIXELS * views)
+    variance = done.equations.cost[0].clamp(min=LEAST_VARIANCE) / (USUAL.blurred * views)
     return torch.linalg.inv_ex(done.equations.hessian[0] / variance).inverse.cpu()
 
 

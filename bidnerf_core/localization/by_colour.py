@@ -12,7 +12,7 @@ from torch import Generator
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import rendered_verdict
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
-from bidnerf_core.localization.covariance import INDEPENDENT, position_deviation
+from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult, refine
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -70,7 +70,9 @@ def localization_of(
     path = [T[i] for T in (search.path[:-1], refined.poses) for i in range(len(T.translation))]
     path[0] = problem.start or path[0]
     # The errors of neighbouring rays are correlated, so the rays of a view count as a few independent ones only.
-    covariance = refined.covariance * max(1.0, config.steps.fine_rays / (INDEPENDENT * len(problem.views)))
+    covariance = refined.covariance * max(
+        1.0, config.steps.fine_rays / (problem.independent.rays_alone * len(problem.views))
+    )
     return Localization(
         T_world_camera=refined.T.normalized(),
         outcome=answer.verdict.outcome,

@@ -58,7 +58,9 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
         judgement = judged(diagnostics.verdict(), diagnostics)
         path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
         losses = search.judge(LOSS_POINTS).cost(path)
-        covariance = surface_covariance(search.judge(), found.T[0], len(problem.views), problem.sensor)
+        covariance = surface_covariance(
+            search.judge(), found.T[0], len(problem.views), problem.sensor, problem.independent.points
+        )
     return Localization(
         T_world_camera=found.T[0].normalized(),
         outcome=judgement.verdict.outcome,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from torch import Generator, Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import enumeration
+from bidnerf_core.geometry.independent import independent
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
@@ -20,13 +22,19 @@ from bidnerf_core.localization.acceptance import (
     landmark_diagnostics,
     landmark_verdict,
 )
-from bidnerf_core.localization.confidence import TRUSTED, judged
+from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
-from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
+from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
-from bidnerf_core.localization.fused_pose import Measurements, fused_pose
-from bidnerf_core.localization.fusion import finest_cost
+from bidnerf_core.localization.fusion import (
+    FusedPose,
+    Measurements,
+    drawn_rays,
+    finest_cost,
+    fused_pose,
+    nearby_start,
+)
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
@@ -35,25 +43,24 @@ from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.map_camera import map_camera
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
-from bidnerf_core.localization.settings import (
-    ColourSettings,
-    DepthSettings,
-    RefinementSettings,
-    RefinementStage,
-    rendered_depth_scale,
-)
-from bidnerf_core.localization.solvers.pivots import Pivot, pivot
+from bidnerf_core.localization.solvers.pivots import pivot
 from bidnerf_core.mapping import SurfaceMap
 from bidnerf_core.mapping.geometry.calibration import Calibration
 
 POINTS = 2000
 """Largest number of measured points that are fused."""
-STEPS, MORE_STEPS = 5, 8
-"""Largest number of steps on the sum of all terms, and the same from poses that landmarks leave doubtful."""
+STEPS = 8
+"""Largest number of steps on the sum of all terms."""
+BASIN = 1.0
+"""Deviation of a pose by landmarks, in pixels, beyond which rays may lead from there to a wrong pose."""
+THOROUGHLY = 4
+"""Factor on the number of rays from there."""
+COMPARED_RAYS = 512
+"""Largest number of rays by which they are compared."""
+STARTS = 64
+"""Number of poses, drawn from the landmarks' prior, from which the best one is refined then."""
 CONTRADICTORY = 30.0
 """Squared Mahalanobis distance from the landmarks' pose beyond which the fused measurements contradict the landmarks."""
-THOROUGHLY = 4
-"""Factor by which poses that landmarks leave doubtful get more rays; the weight of each ray grows by the same factor."""
 SHARPEST = 0.04
 """Colour noise of a field on its own training images (root mean square) above which rendering adds nothing to landmarks."""
 MOSTLY_ON_SURFACE = 0.5
@@ -149,25 +156,26 @@ def _log_odds_of(
 def fused_answer(
     problem: Problem, found: LandmarkPose, verdict: Verdict, rays: int, seed: int, searched: bool = True
 ) -> LandmarkAnswer:
-    """Return a pose by landmarks, refined on all terms at once if it is accepted.
+    """Return a pose by landmarks, refined on all terms at once if it is accepted or merely imprecise.
 
-    ``searched`` is false if landmarks only confirm a pose that was found by other means.
+    An imprecise one stays rejected, but is a better place from which to search. ``searched`` is false if landmarks only confirm a pose that was found by other means.
     """
     diagnostics = landmark_diagnostics(found, searched)
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.stated_covariance, diagnostics)
     approximate = problem.focal_is_approximate
-    if not verdict.accepted or found.estimates_calibration:
+    may_be_fused = verdict.accepted or verdict.outcome is Outcome.IMPRECISE
+    if not may_be_fused or found.estimates_calibration:
         if problem.has_depth and found.estimates_calibration:
             answer = replace(answer, left_out="depth, which needs known intrinsics")
         return _judged(answer, approximate)  # rendering would need intrinsics as exact as the landmarks' too
     problem = corrected(problem, found)
-    generator, points = Generator().manual_seed(seed), None
+    points = None
     if problem.surface is not None and problem.has_depth:
-        points = _cost_of_points(problem, problem.surface, generator)
+        points = _cost_of_points(problem, problem.surface, Generator().manual_seed(seed))
         diagnostics = landmark_diagnostics(found, searched, points, found.T_world_camera)
         answer = replace(answer, diagnostics=diagnostics)
     answer = _judged(answer, approximate)
-    return _fused(problem, answer, points, rays if is_sharp(problem) else 0, generator)
+    return _fused(problem, answer, points, rays, seed)
 
 
 def _judged(answer: LandmarkAnswer, approximate: bool) -> LandmarkAnswer:
@@ -201,54 +209,87 @@ def _cost_of_points(problem: Problem, surface: SurfaceMap, generator: Generator)
 
 
 def _fused(
-    problem: Problem, answer: LandmarkAnswer, points: SurfaceCost | None, rays: int, generator: Generator
+    problem: Problem, answer: LandmarkAnswer, points: SurfaceCost | None, rays: int, seed: int
 ) -> LandmarkAnswer:
-    """Return the answer fused with measured points and rendered rays, as far as there are any that agree with the landmarks.
+    """Return the answer fused with measured points and rendered rays.
 
     Where there are points, rays compare colours alone: depth is measured once, and its scale is not exact. Errors in the poses
     of the map's images affect its surface and its field as they do its landmarks, and errors in the motion of a rolling shutter
-    affect rays and points too, so fusion does not reduce them.
+    affect rays and points too, so fusion does not reduce them. Where the sum leaves the landmarks' pose by more than their
+    errors explain, renderings of both poses decide which is right.
     """
     scale = DepthScale.of(answer.found, problem.sensor)
     if points is not None and scale.objection is not None:
         without = replace(answer, left_out=f"depth: {scale.objection}")
-        return _fused(problem.without_depth(), without, None, rays, generator)
-    names = (*(["depth"] if points is not None else []), *(["rendering"] if rays else []))
+        return _fused(problem.without_depth(), without, None, rays, seed)
+    fused_rays = rays if is_sharp(problem) else 0
+    names = (*(["depth"] if points is not None else []), *(["rendering"] if fused_rays else []))
     if not names:
         return answer
-    about = pivot("scene", problem) if points is None else points.cloud.pivot
-    effort = 1 if (answer.confidence or 0.0) >= TRUSTED else THOROUGHLY
-    draw = _drawing(problem, effort * rays, about, points is None, generator) if rays else None
-    scaled = None if points is None else ScaledPoints(points, scale, answer.found.T_world_camera)
-    shared = answer.found.shared_covariance
-    prior = GaussianPrior(answer.T, answer.covariance - shared, about)
-    measurements = Measurements(prior, len(problem.views), scaled, draw, effort**2)
-    fused = fused_pose(measurements, STEPS if effort == 1 else MORE_STEPS)
-    if not float(prior(fused.T[None]).cost[0]) <= CONTRADICTORY:
+    vague = fused_rays > 0 and _apparent_deviation(problem, answer) > BASIN
+    fused_rays *= THOROUGHLY if vague else 1
+    measurements = _measurements(problem, answer, scale, points, fused_rays, seed)
+    start = _vague_start(problem, measurements, fused_rays, points is None, seed) if vague else None
+    fused = fused_pose(measurements, STEPS, start)
+    if not float(measurements.prior(fused.T[None]).cost[0]) <= CONTRADICTORY:
+        other = fused_pose(measurements.without_landmarks(fused.T), STEPS, fused) if rays else None
+        if other is not None and _is_likelier(problem, other.T, answer, seed):
+            return _elsewhere(problem, answer, other, names)
         without = replace(answer, left_out=f"{names[0]}, which contradicts the landmarks")
         rest = rays if points is not None else 0
-        return _fused(problem.without_depth(), without, None, rest, generator)
-    covariance = fused.covariance + shared
-    return replace(answer, T=fused.T, covariance=covariance, terms=names, depth_factor=fused.factor)
+        return _fused(problem.without_depth(), without, None, rest, seed)
+    covariance = fused.covariance + answer.found.shared_covariance
+    return replace(answer, T=fused.T, covariance=covariance, terms=names, depth_factor=fused.state.factor)
 
 
-def _drawing(
-    problem: Problem, rays: int, about: Pivot, by_depth: bool, generator: Generator
-) -> Callable[[SE3, float], RenderedCost]:
-    """Return a function that draws rays from a pose, given the uncertainty of the surfaces (metres).
+def _vague_start(
+    problem: Problem, measurements: Measurements, rays: int, by_depth: bool, seed: int
+) -> FusedPose:
+    """Return where to start from a vague prior: the best of several poses, refined with a loss that reaches farther."""
+    few, many = (
+        drawn_rays(
+            problem, count, measurements.prior.pivot, Generator().manual_seed(seed), by_depth, loss="huber"
+        )
+        for count in (min(rays, COMPARED_RAYS), rays // 2)
+    )
+    near = nearby_start(measurements, few, STARTS, Generator().manual_seed(seed))
+    return fused_pose(replace(measurements, rays=many), STEPS, near)
 
-    Its colour loss is redescending, so what hides the scene counts as outliers.
-    """
-    depth = DepthSettings() if problem.has_depth and by_depth else None
-    colour = ColourSettings(colour_loss="geman-mcclure")
-    settings = RenderedCostSettings(colour, depth, RefinementSettings(exposure=True))
-    stage = RefinementStage(0, rays, depth_scale=rendered_depth_scale(problem.bounds))
 
-    def draw(T: SE3, surface_sigma: float) -> RenderedCost:
-        here = replace(problem, start=T)
-        return settings.drawn(here, replace(stage, surface_sigma=surface_sigma), about, generator)
+def _apparent_deviation(problem: Problem, answer: LandmarkAnswer) -> float:
+    """Return by how many pixels, about, what is seen may be off at a pose by landmarks."""
+    focal = max(view.frame.intrinsics.fx for view in problem.views)
+    return focal * position_deviation(answer.covariance) / answer.found.distance
 
-    return draw
+
+def _measurements(
+    problem: Problem, answer: LandmarkAnswer, scale: DepthScale, points: SurfaceCost | None, rays: int, seed: int
+) -> Measurements:  # fmt: skip
+    about, views = pivot("scene", problem) if points is None else points.cloud.pivot, len(problem.views)
+    generator, most = Generator().manual_seed(seed), problem.independent
+    return Measurements(
+        prior=GaussianPrior(answer.T, answer.covariance - answer.found.shared_covariance, about),
+        points=None if points is None else ScaledPoints(points, scale, answer.found.T_world_camera),
+        rays=drawn_rays(problem, rays, about, generator, points is None) if rays else None,
+        independent_points=views * most.points,
+        independent_rays=independent(rays, views * most.rays),
+    )
+
+
+def _is_likelier(problem: Problem, T: SE3, answer: LandmarkAnswer, seed: int) -> bool:
+    """Return whether a pose is likelier than that of landmarks, by renderings and by the confidence in these landmarks."""
+    sure = min(max(answer.confidence or 0.5, 1e-12), 1 - 1e-12)
+    odds = log_odds_by_rendering(replace(problem, start=T), replace(problem, start=answer.T), seed, steps=0)
+    return odds > math.log(sure / (1 - sure))
+
+
+def _elsewhere(
+    problem: Problem, answer: LandmarkAnswer, other: FusedPose, names: tuple[str, ...]
+) -> LandmarkAnswer:
+    """Return the answer at a pose where landmarks, if any, do not contradict the other measurements."""
+    verdict = Verdict(Outcome.UNCERTAIN, f"{enumeration(names)} contradict the landmarks")
+    covariance = other.covariance + answer.found.shared_covariance
+    return replace(answer, T=other.T, covariance=covariance, verdict=verdict, confidence=None, terms=names)
 
 
 def localization_by_landmarks(problem: Problem, answer: LandmarkAnswer, began: float) -> Localization:

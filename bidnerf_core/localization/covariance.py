@@ -9,18 +9,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
 
-INDEPENDENT = 10
-"""Number of independent measurements in an image. The errors of a map and of a sensor are correlated over large parts of an
-image, so its thousands of pixels count as few. The number was set by the normalised errors on several maps and sensors. It
-is pessimistic for rendered images, and optimistic for those of a hand-held Kinect.
-"""
 LEAST_VARIANCE = 1e-9
 """Lower limit of the variance of residuals, in units of their scale; below it there are only rounding errors."""
 FINEST = 2.0
 """Scale of distances at the end of a search, in cells of the surface's grid."""
+
+
+def weight(measurements: float, variance: float) -> float:
+    """Return the factor of a mean squared residual in a sum of terms, given the number of independent measurements it stands for."""
+    return measurements / max(variance, LEAST_VARIANCE)
 
 
 def sandwich_covariance(
@@ -49,17 +50,22 @@ def sandwich_covariance(
 
 
 def surface_covariance(
-    cost: SurfaceCost, T: SE3, views: int = 1, sensor: DepthSensorModel = UNKNOWN
+    cost: SurfaceCost,
+    T: SE3,
+    views: int = 1,
+    sensor: DepthSensorModel = UNKNOWN,
+    points: float = USUAL.points,
 ) -> Float[Tensor, "6 6"]:
     """Return the covariance of a pose that aligns measured points with the surface; positive definite.
 
-    It is the inverse of the Hessian divided by the variance of the residuals. Directions that the points do not determine,
+    It is the inverse of the Hessian divided by the variance of the residuals; the points of a view count as ``points``
+    independent ones. Directions that the points do not determine,
     such as the way along a bare wall, have the size of the scene or half a turn as standard deviation. The uncertainties
     of the sensor's scale and offset are added, which all its points share.
     """
     finest = PointScales(FINEST * cost.surface.cell)
     cost = SurfaceCost(cost.surface, cost.cloud, finest)
-    variance = cost.residual_variance(T[None])[0].clamp(min=LEAST_VARIANCE) / (INDEPENDENT * views)
+    variance = cost.residual_variance(T[None])[0].clamp(min=LEAST_VARIANCE) / (points * views)
     prior = torch.tensor([cost.surface.extent] * 3 + [math.pi] * 3, dtype=torch.float64)
     information = cost(T[None]).hessian[0] / variance + torch.diag(prior**-2)
     covariance = torch.linalg.inv(information)

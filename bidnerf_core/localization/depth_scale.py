@@ -1,4 +1,4 @@
-"""What is known about the factor that corrects all depths of an image, and measured points that share it."""
+"""What is known about the errors that all depths of an image share, a factor and an offset, and measured points with them."""
 
 from __future__ import annotations
 
@@ -14,29 +14,33 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.normal_equations import NormalEquations
 from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.solvers.pivots import Pivot
 
 LANDMARK_SCALE_NOISE = 0.01
 """Relative standard deviation of the depth scale that a few landmarks give, from the right pose."""
 PRIOR_WIDTH = 2.0
 """Ratio of the standard deviation of the depth scale's prior to that of the sensor model: some sensors are off by far more."""
+UNKNOWNS = 8
+"""Number of unknowns: six of the pose, the factor and the offset."""
 PLAUSIBLE = 5.0
 """Deviation of the depth scale by landmarks, in standard deviations, beyond which the depth has another unit or is wrong."""
 LEAST_SCALE_DEVIATION = 1e-4
-"""Least standard deviation of the factor, so that a sensor without errors can be fused."""
+"""Least standard deviation of the factor, and of the offset in units of the distance, so that exact depth can be fused."""
 
 
 @dataclass(frozen=True)
 class DepthScale:
-    """What a sensor's tolerance and landmarks imply for the factor that corrects measured depth."""
+    """What a sensor's tolerance and landmarks imply for the factor and the offset that correct measured depth."""
 
     deviation: float  # standard deviation of the factor about 1, from the sensor's tolerance
     # Factor from the pose at which landmarks were matched; None if too little was measured.
     by_landmarks: float | None = None
+    offset: float = 0.0  # metres: standard deviation of the offset
 
     @staticmethod
     def of(found: LandmarkPose, sensor: DepthSensorModel) -> DepthScale:
         """Return what is known about the scale of a sensor's depths, given a pose by landmarks."""
-        return DepthScale(PRIOR_WIDTH * sensor.scale, found.depth_scale)
+        return DepthScale(PRIOR_WIDTH * sensor.scale, found.depth_scale, PRIOR_WIDTH * sensor.offset)
 
     @property
     def objection(self) -> str | None:
@@ -56,57 +60,65 @@ class DepthScale:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseAndFactor:
-    """A pose, and the factor by which measured depths are corrected."""
+class PoseAndDepth:
+    """A pose, and the factor and the offset (metres) that correct the distances of measured points."""
 
     T: SE3
     factor: float = 1.0
+    offset: float = 0.0
+
+    def moved(self, about: Pivot, update: Float[Tensor, "8"]) -> PoseAndDepth:
+        """Return the state after an update of the pose about a pivot, the factor and the offset."""
+        T = about.moved(self.T[None], update[None, :6])[0].normalized()
+        return PoseAndDepth(T, self.factor + float(update[6]), self.offset + float(update[7]))
 
 
 @dataclass(frozen=True, eq=False)
 class ScaledPoints:
-    """Measured points on the surface, whose depths share an unknown factor.
+    """Measured points on the surface, whose depths share an unknown factor and an unknown offset.
 
     The factor is relative to ``scale.estimate``, by which the points of ``cost`` were corrected from the pose ``start``.
-    Equations are of seven unknowns: an update of the pose about the middle of those points, and the factor.
+    Equations are of eight unknowns: an update of the pose about the middle of those points, the factor and the offset.
     """
 
     cost: SurfaceCost
     scale: DepthScale
     start: SE3
 
-    def at(self, factor: float) -> SurfaceCost:
-        """Return the cost of the points with their depths multiplied by a factor, about their own middle."""
-        return replace(self.cost, cloud=self.cost.cloud.scaled(factor))
-
-    def cost_at(self, at: PoseAndFactor) -> Float[Tensor, "1"]:
-        """Return the cost at a pose and a factor, without derivatives."""
-        return self.at(at.factor).cost(at.T[None])
+    def at(self, here: PoseAndDepth) -> SurfaceCost:
+        """Return the cost of the points with their depths corrected, about their own middle."""
+        return replace(self.cost, cloud=self.cost.cloud.corrected(here.factor, here.offset))
 
     def about_middle(self, cost: SurfaceCost, equations: NormalEquations) -> NormalEquations:
         """Convert equations about the middle of the points of ``cost`` to ones about the middle of those of ``self.cost``."""
-        updates = torch.eye(7, dtype=torch.float64)
+        updates = torch.eye(UNKNOWNS, dtype=torch.float64)
         updates[:6, :6] = cost.cloud.pivot.adjoint_from(self.cost.cloud.pivot)
         return equations.of_others(updates)
 
-    def assumed(self, at: PoseAndFactor) -> NormalEquations:
-        """Return the equations of what the sensor's tolerance and the landmarks imply for the factor.
+    def assumed(self, at: PoseAndDepth) -> NormalEquations:
+        """Return the equations of what the sensor's tolerance and the landmarks imply for the factor and the offset.
 
         Landmarks give the ratio of their depths to the measured ones. With the pose, it changes in proportion to the distances
         of the points of the scene that were measured.
         """
-        applied = self.scale.estimate
-        by_factor = torch.zeros(7, dtype=torch.float64)
-        by_factor[6] = applied
-        deviation = max(self.scale.deviation, LEAST_SCALE_DEVIATION)
-        whole = residual_equations(applied * at.factor - 1, by_factor, deviation)
+        applied, distance = self.scale.estimate, self._distance
+        by_factor, by_offset = applied * _unit(6), _unit(7)
+        least = LEAST_SCALE_DEVIATION
+        whole = residual_equations(applied * at.factor - 1, by_factor, max(self.scale.deviation, least))
+        whole += residual_equations(at.offset, by_offset, max(self.scale.offset, least * distance))
         if self.scale.by_landmarks is None:
             return whole
         ratio, by_pose = self._relative_distance(at.T)
-        residual = applied * at.factor - self.scale.by_landmarks * ratio
-        jacobian = by_factor
+        residual = applied * (at.factor + at.offset / distance) - self.scale.by_landmarks * ratio
+        jacobian = by_factor + applied / distance * by_offset
         jacobian[:6] = -self.scale.by_landmarks * by_pose
         return whole + residual_equations(residual, jacobian, LANDMARK_SCALE_NOISE)
+
+    @property
+    def _distance(self) -> float:
+        """Median distance of the points, metres."""
+        cloud = self.cost.cloud
+        return float(torch.linalg.vector_norm(cloud.points - cloud.origins, dim=-1).median())
 
     def _relative_distance(self, T: SE3) -> tuple[float, Float[Tensor, "6"]]:
         """Return the mean ratio of the points' distances from a pose to those from ``start``, and its derivative.
@@ -132,6 +144,10 @@ def residual_equations(residual: float, jacobian: Float[Tensor, "k"], deviation:
     )
 
 
-def with_factor(equations: NormalEquations) -> NormalEquations:
-    """Extend the equations of a pose by the factor as a seventh unknown, on which they do not depend."""
-    return equations.of_others(torch.eye(6, 7, dtype=torch.float64))
+def of_pose(equations: NormalEquations) -> NormalEquations:
+    """Extend the equations of a pose by the factor and the offset, on which they do not depend."""
+    return equations.of_others(torch.eye(6, UNKNOWNS, dtype=torch.float64))
+
+
+def _unit(place: int) -> Float[Tensor, "8"]:
+    return torch.eye(UNKNOWNS, dtype=torch.float64)[place]

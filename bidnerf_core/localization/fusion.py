@@ -1,37 +1,46 @@
-"""Fusion of costs in different units: each is weighted by the inverse variance of its residuals."""
+"""The pose that best explains landmarks, measured points on the surface and rendered rays together."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from bidnerf_core.geometry.robust import RobustName
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.costs.prior import GaussianPrior
+from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings, Residuals
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE
-from bidnerf_core.localization.normal_equations import Cost, Scaled
+from bidnerf_core.localization.covariance import FINEST, position_deviation, weight
+from bidnerf_core.localization.depth_scale import (
+    UNKNOWNS,
+    PoseAndDepth,
+    ScaledPoints,
+    of_pose,
+    residual_equations,
+)
+from bidnerf_core.localization.normal_equations import NormalEquations
+from bidnerf_core.localization.problem import Problem
+from bidnerf_core.localization.settings import (
+    ColourSettings,
+    DepthSettings,
+    RefinementSettings,
+    RefinementStage,
+    rendered_depth_scale,
+)
+from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.mapping import SurfaceMap
 
-SURFACE_MEASUREMENTS, RENDERED_MEASUREMENTS = 10.0, 300.0
-"""Numbers of independent measurements that a view's points on the surface, and its rendered rays, count as."""
-SCALED_MEASUREMENTS = 30.0
-"""Number of independent measurements that a view's points count as where their scale is an unknown, not an error they share."""
-
-
-@dataclass(frozen=True, eq=False)
-class FusedTerm:
-    """A cost with the variance of its residuals, so that costs in different units can be added."""
-
-    cost: Cost
-    variance: float
-    measurements: float  # number of independent measurements that it counts as
-
-    @property
-    def weight(self) -> float:
-        """Factor of the cost in a sum."""
-        return self.measurements / self.variance
-
-    @property
-    def scaled(self) -> Cost:
-        return Scaled(self.cost, self.weight)
+LEAST_DECREASE = 0.1
+"""Predicted decrease of the sum, which is a squared Mahalanobis distance, below which a step is the last."""
+VAGUE = 1e3
+"""Factor on the deviations of a prior that is to have no influence."""
+UNSURE = 2.0
+"""Factor on the deviation of the prior, with which rays are weighed first."""
+FIRST_DAMPING = 1e-3
+"""Damping of the first step."""
 
 
 def finest_cost(surface: SurfaceMap, cloud: PointCloud) -> SurfaceCost:
@@ -39,12 +48,165 @@ def finest_cost(surface: SurfaceMap, cloud: PointCloud) -> SurfaceCost:
     return SurfaceCost(surface, cloud, PointScales(FINEST * surface.cell))
 
 
-def surface_term(cost: SurfaceCost, T: SE3, views: int) -> FusedTerm:
-    """Return the term of the points that ``views`` images measured; the variance is that of their residuals from ``T``."""
-    variance = max(float(cost.residual_variance(T[None])[0]), LEAST_VARIANCE)
-    return FusedTerm(cost, variance, SURFACE_MEASUREMENTS * views)
+def drawn_rays(
+    problem: Problem, rays: int, about: Pivot, generator: Generator, by_depth: bool = False, loss: RobustName = "geman-mcclure",
+) -> RenderedCost:  # fmt: skip
+    """Return the cost of rays; its usual colour loss is redescending, so what hides the scene counts as outliers."""
+    depth = DepthSettings() if problem.has_depth and by_depth else None
+    colour = ColourSettings(colour_loss=loss)
+    settings = RenderedCostSettings(colour, depth, RefinementSettings(exposure=True))
+    stage = RefinementStage(0, rays, depth_scale=rendered_depth_scale(problem.bounds))
+    return settings.drawn(problem, stage, about, generator)
 
 
-def rendered_term(cost: Cost, at_start: float, views: int) -> FusedTerm:
-    """Return the term of the rays rendered for ``views`` images, whose cost is ``at_start`` before the descent."""
-    return FusedTerm(cost, max(at_start, LEAST_VARIANCE), RENDERED_MEASUREMENTS * views)
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """What is fused, each with the number of independent measurements that it counts as."""
+
+    prior: GaussianPrior  # on the pose, by landmarks
+    points: ScaledPoints | None = None  # about the prior's pivot
+    rays: RenderedCost | None = None  # about that pivot too
+    independent_points: float = 0.0
+    independent_rays: float = 0.0
+
+    def at(self, state: PoseAndDepth, deviation: float) -> Fit:
+        """Compare with the measurements from a state; what is seen from it is uncertain by ``deviation`` (metres)."""
+        points, rays = None, None
+        if self.points is not None:
+            cost = self.points.at(state)
+            equations, variance = cost.with_variance(state.T[None])
+            equations = self.points.about_middle(cost, equations)
+            points = Term(equations, float(variance[0]), self.independent_points)
+        if self.rays is not None:
+            rays = self.rays.residuals(state.T[None])
+        return Fit(self, state, self._assumed(state), points, rays).weighed(deviation)
+
+    def without_landmarks(self, start: SE3) -> Measurements:
+        """Return the measurements without what landmarks imply, about another pose."""
+        vague = replace(self.prior, mean=start, covariance=VAGUE**2 * self.prior.covariance)
+        points = self.points
+        if points is not None:
+            points = replace(points, scale=replace(points.scale, by_landmarks=None), start=start)
+        return replace(self, prior=vague, points=points)
+
+    def _assumed(self, at: PoseAndDepth) -> NormalEquations:
+        """Return the equations of what is known besides the measurements; without points, the errors of depth are tied to 0."""
+        by_prior = of_pose(self.prior(at.T[None]))
+        if self.points is not None:
+            return by_prior + self.points.assumed(at)
+        unit = torch.eye(UNKNOWNS, dtype=torch.float64)
+        return by_prior + residual_equations(0.0, unit[6], 1.0) + residual_equations(0.0, unit[7], 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """A kind of measurement at one state: the equations of its cost, the variance of its residuals, and how much it counts."""
+
+    equations: NormalEquations
+    variance: float
+    measurements: float  # number of independent ones
+
+    @property
+    def weight(self) -> float:
+        """Factor of the cost in the sum."""
+        return weight(self.measurements, self.variance)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """How well a state explains the measurements."""
+
+    measurements: Measurements
+    state: PoseAndDepth
+    assumed: NormalEquations
+    points: Term | None
+    residuals: Residuals | None  # of the rays
+    rays: Term | None = None
+
+    def weighed(self, deviation: float) -> Fit:
+        """Return the fit with rays as uncertain as what is seen from here, in metres."""
+        if self.residuals is None:
+            return self
+        residuals = replace(self.residuals, surface_sigma=deviation)
+        equations = of_pose(residuals.normal_equations())
+        term = Term(equations, float(residuals.variance()[0]), self.measurements.independent_rays)
+        return replace(self, residuals=residuals, rays=term)
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return tuple(term for term in (self.points, self.rays) if term is not None)
+
+    @property
+    def equations(self) -> NormalEquations:
+        """The sum of all terms."""
+        return sum((term.equations.scaled(term.weight) for term in self.terms), start=self.assumed)
+
+    def cost(self, weighed: Fit) -> float:
+        """Return the sum of all terms with the weights that they have in another fit."""
+        total = float(self.assumed.cost[0])
+        pairs = zip(self.terms, weighed.terms, strict=True)
+        return total + sum(there.weight * float(here.equations.cost[0]) for here, there in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class FusedPose:
+    """A pose estimated from several measurements with its covariance, and the errors of depth estimated with it."""
+
+    state: PoseAndDepth
+    covariance: Float[Tensor, "6 6"]  # metres, radians; of a right update
+
+    @property
+    def T(self) -> SE3:
+        return self.state.T
+
+
+def nearby_start(
+    measurements: Measurements, rays: RenderedCost, count: int, generator: Generator
+) -> FusedPose:
+    """Return the pose that explains prior and rays best among the prior's mean and ``count`` draws from it.
+
+    Rays lead to the right pose only from where edges overlap, which a vague prior may miss.
+    """
+    prior = measurements.prior
+    root = UNSURE * torch.linalg.cholesky(prior.covariance)
+    best = prior.mean
+    for shrink in (1.0, 0.4):
+        updates = torch.randn((count // 2, 6), generator=generator, dtype=torch.float64) @ (shrink * root).mT
+        T = SE3.cat([best[None], best.retract(updates)])
+        by_rays = rays.cost(T)
+        total = prior(T).cost + weight(measurements.independent_rays, float(by_rays.min())) * by_rays
+        best = T[int(total.argmin())]
+    return FusedPose(PoseAndDepth(best), prior.covariance / 4)
+
+
+def fused_pose(measurements: Measurements, most_steps: int, start: FusedPose | None = None) -> FusedPose:
+    """Return the pose that explains all terms best.
+
+    The terms are weighed anew by how well they fit after each step: with weights from a start that is far off, they would
+    count for little until the end. Rays whose rendering changes steeply over the distance by which what is seen may be off
+    count less, since their linearization does not hold that far. A step that does not lower the sum is not taken; the steps
+    end with one that is short beside the pose's deviation, and where equations are not finite. The covariance allows for the
+    last step.
+    """
+    prior, damping = measurements.prior, torch.full((1,), FIRST_DAMPING, dtype=torch.float64)
+    covariance = prior.at_pivot if start is None else start.covariance
+    uncertain = UNSURE * position_deviation(covariance)
+    here = measurements.at(PoseAndDepth(prior.mean) if start is None else start.state, uncertain)
+    for _ in range(most_steps):
+        equations = here.equations
+        if not bool(equations.hessian.isfinite().all() & equations.gradient.isfinite().all()):
+            break
+        step = equations.solve(damping)
+        state, last = here.state.moved(prior.pivot, step[0]), step[:, :6]
+        covariance = torch.linalg.inv(equations.hessian[0])[:6, :6] + last.mT @ last
+        deviation = position_deviation(covariance)
+        if float(step[0] @ equations.hessian[0] @ step[0]) < LEAST_DECREASE and uncertain < 2 * deviation:
+            here = replace(here, state=state)
+            break
+        uncertain = max(deviation, uncertain / 2)
+        there = measurements.at(state, uncertain)
+        lower = there.cost(here) < here.cost(here)
+        here = there if lower else here.weighed(uncertain)
+        damping = damping / 4 if lower else damping * 6
+    covariance = prior.pivot.at_camera(here.state.T, covariance)
+    return FusedPose(here.state, (covariance + covariance.mT) / 2)

@@ -18,9 +18,8 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.beyond_chance import NONE, Support, support
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
 from bidnerf_core.localization.costs.surface import SurfaceCost
-from bidnerf_core.localization.covariance import sandwich_covariance
-from bidnerf_core.localization.fusion import rendered_term, surface_term
-from bidnerf_core.localization.normal_equations import NormalEquations
+from bidnerf_core.localization.covariance import sandwich_covariance, weight
+from bidnerf_core.localization.normal_equations import NormalEquations, Scaled
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.search.centring import centred, rendered_middle
 from bidnerf_core.localization.settings import RefinementStage
@@ -102,8 +101,15 @@ def take_few_steps(
     with without_waiting():
         here = cost.residuals(poses[0][None])
         inliers.append(here.inliers_by_depth()[0])
-        rendered = rendered_term(cost, float(here.cost()[0]), views).weight
-        beside = None if surface is None else surface_term(surface, start, views).scaled
+        rendered = weight(problem.independent.rays * views, float(here.cost()[0]))
+        beside = (
+            None
+            if surface is None
+            else Scaled(
+                surface,
+                weight(problem.independent.points * views, float(surface.residual_variance(start[None])[0])),
+            )
+        )
         aligned = None if beside is None else beside(start[None])
         for left in reversed(range(stage.steps)):
             equations = _sum(here.normal_equations().scaled(rendered), aligned)

@@ -23,6 +23,7 @@ from torch import nn
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField
+from bidnerf_core.geometry.independent import USUAL, Independent
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.io.json import from_plain, read_json, to_plain
@@ -65,7 +66,7 @@ def save_map(
         _check_features(landmarks, folder)
         parts["landmarks"] = lambda: tensors_to_bytes(landmark_tensors(landmarks))
     else:
-        info = replace(info, landmark_source=None, colour_noise=None)
+        info = replace(info, landmark_source=None, colour_noise=None, independent=Independent())
     if capture is not None:
         parts["capture"] = lambda: _json(capture)
     names = {part: _file_name(part, state.step) for part in parts}
@@ -92,9 +93,9 @@ def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
 
 def save_landmarks(
     folder: Path, of: MapInfo, landmarks: LandmarkMap, colour_noise: float | None = None,
-    source: LandmarkSource = "photos",
+    source: LandmarkSource = "photos", independent: Independent = USUAL,
 ) -> MapInfo:  # fmt: skip
-    """Add landmarks to map ``of``, replacing earlier ones, and the error with which the field renders its training images.
+    """Add landmarks to map ``of``, replacing earlier ones, and what its images showed of the errors of field and surface.
 
     ``source`` is the kind of images that the landmarks were built from. Raises ``InputError`` where another training has
     replaced that map meanwhile, and where the detector of the landmarks has no name by which a query could find it.
@@ -103,7 +104,7 @@ def save_landmarks(
     content = tensors_to_bytes(landmark_tensors(landmarks))
     return _save_part(
         folder, of, "landmarks", content, colour_noise=colour_noise, landmark_source=source,
-        landmark_features=landmarks.features,
+        landmark_features=landmarks.features, independent=independent,
     )  # fmt: skip
 
 
@@ -120,13 +121,13 @@ def _check_features(landmarks: LandmarkMap, folder: Path) -> None:
         raise InputError(f"{folder}: landmarks of a detector without a name; expected one that is registered")
 
 
-def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: float | str | None) -> MapInfo:
+def _save_part(folder: Path, of: MapInfo, part: str, content: bytes, **facts: Any) -> MapInfo:
     """Add a file to a map under the name of a part of its description."""
     info = load_info(folder)
     if info.weights != of.weights:
         raise InputError(f"{folder}: was trained anew while its {part} was made; bake it again")
     name = _file_name(part, of.step)
-    info = replace(info, **{part: name}, **facts)  # type: ignore[arg-type]
+    info = replace(info, **(facts | {part: name}))
     description = _json(info)
     try:
         write_file(folder / name, content)

@@ -103,9 +103,16 @@ class Residuals:
     value: Float[Tensor, "h n c"]
     jacobian: Float[Tensor, "h n c 6"]
     weights: Float[Tensor, "n c"]  # of each in the objective; 0 where nothing was measured
-    confidence: Float[Tensor, "h n c"]  # 1, or less where a residual is too steep for the map's accuracy
+    steepness: Float[Tensor, "h n c"]  # norm of its gradient with respect to the ray's origin, per metre
+    surface_sigma: float  # metres: how far off what is seen may be, by the map's errors or the pose's
     objective: Objective
     home: torch.device = torch.device("cpu")  # device of the poses, on which all results are returned
+
+    @cached_property
+    def confidence(self) -> Float[Tensor, "h n c"]:
+        """1, or less where a residual is too steep for the accuracy of what is seen: its variance is (steepness x sigma)^2."""
+        scales = constant(tuple(self.objective.scales), self.value)
+        return (1 + (self.surface_sigma / scales * self.steepness) ** 2).rsqrt()
 
     @property
     def _pull(self) -> Float[Tensor, "h n c"]:
@@ -136,6 +143,18 @@ class Residuals:
     def scores(self) -> Float[Tensor, "h n 6"]:
         """Return each ray's contribution to the gradient."""
         return torch.einsum("hnc,hnci->hni", self._pull * self.value, self.jacobian).to(self.home)
+
+    def variance(self) -> Float[Tensor, "h"]:
+        """Return the variance of a residual as the pose sees it: rays that determine nothing, as on a background, do not count.
+
+        With it, independent rays would give the pose's covariance by the inverse of the Hessian divided by their number.
+        """
+        hessian, scores = self.normal_equations().hessian, self.scores()
+        scores = scores - scores.mean(1, keepdim=True)  # the remaining mean gradient is not noise
+        unit = hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()[..., None]
+        inverse = torch.linalg.pinv(unit * hessian * unit.mT, rtol=1e-10, hermitian=True)
+        spread = (unit * (scores.mT @ scores) * unit.mT * inverse).sum((-2, -1))
+        return scores.shape[1] / 6 * spread
 
     def inliers(self) -> Float[Tensor, "h"]:
         """Return the share of rays none of whose residuals exceeds three times the scale at which outliers begin."""
@@ -251,8 +270,6 @@ def _residuals(
     """Turn a linearization into weighted residuals; with ``exposure``, the rendering first takes on the image's exposure.
 
     The correction clips colours at black and at white, as cameras do; where it does, a residual does not depend on the pose.
-    ``surface_sigma`` (metres) is the uncertainty of the map's surfaces. It adds the variance (slope x sigma)^2 to that of
-    each residual, so steep residuals receive less weight.
     """
     value, jacobian, weights = found.residuals.double(), found.jacobian.double(), rays.weights.double()
     if exposure:
@@ -264,10 +281,8 @@ def _residuals(
         telling = weights[:, :3] * ~clipped(seen, measured)
         by_colour = inside * _without_exposure(rendered, inside * jacobian[..., :3, :], telling, fitted)
         jacobian = torch.cat([by_colour, jacobian[..., 3:, :]], -2)
-    confidence = (
-        1 + (surface_sigma / constant(tuple(objective.scales), value) * found.steepness.double()) ** 2
-    ).rsqrt()
-    return Residuals(torch.where(weights > 0, value, 0), jacobian, weights, confidence, objective)
+    value, steepness = torch.where(weights > 0, value, 0), found.steepness.double()
+    return Residuals(value, jacobian, weights, steepness, surface_sigma, objective)
 
 
 def _without_exposure(

@@ -44,8 +44,9 @@ class PointCloud:
     rgb: Float[Tensor, "p 3"]
     origins: Float[Tensor, "p 3"]  # metres: where each was measured from
     coloured: Bool[Tensor, "p"]  # whether a colour was measured
-    # Metres: derivative of the points with respect to a factor on all depths. If given, that factor is the seventh unknown.
-    growth: Float[Tensor, "p 3"] | None = None
+    # Derivative of the points (metres) with respect to errors that all depths share. If given, these follow the pose's six
+    # unknowns.
+    by_error: Float[Tensor, "p 3 e"] | None = None
 
     @staticmethod
     def measured(
@@ -72,15 +73,20 @@ class PointCloud:
 
     def first(self, count: int) -> PointCloud:
         """Return the first ``count`` points: a random sample, since their order is random."""
-        growth = None if self.growth is None else self.growth[:count]
+        by_error = None if self.by_error is None else self.by_error[:count]
         return PointCloud(
-            self.points[:count], self.rgb[:count], self.origins[:count], self.coloured[:count], growth
+            self.points[:count], self.rgb[:count], self.origins[:count], self.coloured[:count], by_error
         )
 
-    def scaled(self, factor: float) -> PointCloud:
-        """Return the points, not scaled so far, with depths multiplied by a factor, which becomes an unknown."""
-        growth = self.points - self.origins
-        return replace(self, points=self.origins + factor * growth, growth=growth)
+    def corrected(self, factor: float, offset: float) -> PointCloud:
+        """Return the points, not corrected so far, with distances multiplied by a factor and lengthened by an offset (metres).
+
+        Factor and offset become unknowns, in this order.
+        """
+        lines = self.points - self.origins
+        sight = torch.nn.functional.normalize(lines, dim=-1)
+        points = self.origins + factor * lines + offset * sight
+        return replace(self, points=points, by_error=torch.stack([lines, sight], -1))
 
     @cached_property
     def all_coloured(self) -> bool:
@@ -93,11 +99,11 @@ class PointCloud:
 
     @cached_property
     def basis(self) -> Float[Tensor, "p 3 k"]:
-        """Jacobian of the points, in the camera's axes, with respect to an update about their middle and the factor, if any."""
+        """Jacobian of the points, in the camera's axes, with respect to an update about their middle and the shared errors, if any."""
         turned = -skew(self.points - self.middle)
         eye = torch.eye(3, dtype=turned.dtype, device=turned.device)
         by_pose = torch.cat([eye.expand_as(turned), turned], dim=-1)
-        return by_pose if self.growth is None else torch.cat([by_pose, self.growth[..., None]], dim=-1)
+        return by_pose if self.by_error is None else torch.cat([by_pose, self.by_error], dim=-1)
 
     @cached_property
     def squares(self) -> Float[Tensor, "p kk"]:
@@ -144,6 +150,11 @@ class SurfaceCost:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cloud", self.cloud.to(self.surface.device))
+
+    @property
+    def pivot(self) -> Pivot:
+        """The middle of the points, about which updates rotate; on the CPU."""
+        return self.cloud.pivot
 
     def __call__(self, T: SE3) -> NormalEquations:
         return moved(self._equations(self.correspondences(T)), T.device)
@@ -276,8 +287,8 @@ def _distance_terms(
     flat = weight - spread
     normal = found.normal @ found.rotation  # in the camera's axes
     turned = torch.linalg.cross((cloud.points - cloud.middle).expand_as(normal), normal)
-    by_factor = () if cloud.growth is None else ((cloud.growth * normal).sum(-1, keepdim=True),)
-    rows = torch.cat([normal, turned, *by_factor], -1)
+    by_error = () if cloud.by_error is None else ((normal[..., None, :] @ cloud.by_error)[..., 0, :],)
+    rows = torch.cat([normal, turned, *by_error], -1)
     hessian = (rows * flat[..., None]).mT @ rows + (spread @ cloud.squares).unflatten(-1, rows.shape[-1:] * 2)
     pull = (weight * found.across)[..., None] * found.normal + spread[..., None] * found.along
     return _gradient(pull, found, cloud) / count, (hessian / count).double()

@@ -15,6 +15,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.depth.sensors import UNKNOWN, DepthNoise
 from bidnerf_core.frames.frame import Frame
+from bidnerf_core.geometry.independent import CORNERS_PER_INDEPENDENT
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
@@ -260,8 +261,6 @@ SIGNIFICANT_NFA = -6.0
 """Largest logarithm of the number of such agreements expected by chance."""
 REPLENISHED = 0.5
 """Share of ``count`` below which new corners are detected."""
-CORRELATION = 4.0
-"""Number of corners that count as one, since the errors of neighbouring depths are correlated."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +278,7 @@ class Odometry:
         ``start`` is the predicted pose, at which the fit begins.
         """
         threshold = pixel_threshold(frame.intrinsics)
-        found = fit_pose(points.observed(frame), start, threshold / 2, threshold, CORRELATION)
+        found = fit_pose(points.observed(frame), start, threshold / 2, threshold, CORNERS_PER_INDEPENDENT)
         if found is None:
             return None
         evidence = flow_evidence(found, frame.intrinsics)

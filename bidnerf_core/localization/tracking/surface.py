@@ -18,14 +18,14 @@ from torch import Generator, Tensor
 from bidnerf_core.depth.sensors import EXACT
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.frames.pixels import observe
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.rotations import retracted
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, PointScales, SurfaceCost
-from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE, surface_covariance
-from bidnerf_core.localization.fusion import surface_term
-from bidnerf_core.localization.normal_equations import Sum
+from bidnerf_core.localization.covariance import FINEST, LEAST_VARIANCE, surface_covariance, weight
+from bidnerf_core.localization.normal_equations import Scaled, Sum
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.by_points import JUDGED
 from bidnerf_core.localization.solvers.levenberg_marquardt import descend
@@ -34,10 +34,6 @@ from bidnerf_core.mapping import SurfaceMap
 
 SURFACE_BIAS = 0.5
 """Share of the variance of a pose by depth that consecutive frames share."""
-DEPTH_MEASUREMENTS = 3.0
-"""Number of independent measurements that a frame's points count as when fused with landmarks: fewer than ``INDEPENDENT``,
-which is optimistic for hand-held sensors.
-"""
 DRAWN = 4
 """Number of pixels that are drawn for each measured point that is wanted."""
 ALIGNMENT_STEPS = 8
@@ -75,7 +71,7 @@ def measured_cloud(
 def fused_with_surface(
     pose: PoseEstimate, surface: SurfaceMap, cloud: PointCloud, steps: int
 ) -> PoseEstimate:
-    """Fuse a pose with measured points on the surface, which count as ``DEPTH_MEASUREMENTS``.
+    """Fuse a pose with measured points on the surface, which count as ``USUAL.tracked_points``.
 
     A share ``SURFACE_BIAS`` of the variance that the points contribute is bias, as in ``aligned``.
     """
@@ -120,9 +116,9 @@ def aligned(
     prior, T = GaussianPrior(predicted, covariance, about), predicted
     for distance in (spread, finest) if spread > 1.5 * finest else (finest,):
         cost = SurfaceCost(surface, cloud, PointScales(distance))
-        term = surface_term(cost, T, 1)
+        term = Scaled(cost, weight(USUAL.points, float(cost.residual_variance(T[None])[0])))
         T = (
-            descend(Sum((prior, term.scaled)), T[None], ALIGNMENT_STEPS, about.moved, stop=ALIGNED_STEP)
+            descend(Sum((prior, term)), T[None], ALIGNMENT_STEPS, about.moved, stop=ALIGNED_STEP)
             .T[0]
             .normalized()
         )
@@ -201,7 +197,7 @@ def _descended(
     for _ in range(steps):
         here, variance = cost.with_variance(T[None])
         # The residuals at a prediction that is off do not reflect the noise, so it is estimated anew in each step.
-        weight = DEPTH_MEASUREMENTS / max(float(variance[0]), LEAST_VARIANCE)
+        weight = USUAL.tracked_points / max(float(variance[0]), LEAST_VARIANCE)
         kept = torch.eye(6).double() if whole else _determined(here.hessian[0], cost.cloud)
         hessian = weight * at_pivot.T @ kept.T @ here.hessian[0] @ kept @ at_pivot
         gradient = weight * at_pivot.T @ kept.T @ here.gradient[0]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.devices import moved, working_device
+from bidnerf_core.geometry.independent import KEYPOINTS_PER_INDEPENDENT
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
 from bidnerf_core.mapping.landmarks.landmark_cells import LandmarkCells
@@ -48,7 +49,7 @@ class LandmarkMap:
     pose_covariance: Float[Tensor, "6 6"]  # float64
     # The number of keypoints that count as one measurement in an image with ``usual_matches`` of them, because their errors are
     # correlated; see ``correlation_of``.
-    correlation: float = 10.0
+    correlation: float = KEYPOINTS_PER_INDEPENDENT
     usual_matches: float = 0.0  # median of the images of the map; 0 where it is not known
     # Standard deviations of the corrections of intrinsics that images of the map seem to need, although their intrinsics are
     # right: logarithm of the focal length, principal point (u, v) as a share of it, radial distortion. Float64.

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Generator, Tensor
 
-from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import (
     ColourSettings,
     GaussianPrior,
@@ -23,15 +21,9 @@ from bidnerf_core.localization import (
     SurfaceCost,
     rig,
 )
-from bidnerf_core.localization.covariance import INDEPENDENT, LEAST_VARIANCE, position_deviation
-from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
-from bidnerf_core.localization.fused_pose import (
-    FusedPose,
-    Measurements,
-    WeightedTerms,
-    fused_pose,
-)
-from bidnerf_core.localization.fusion import finest_cost
+from bidnerf_core.localization.covariance import position_deviation
+from bidnerf_core.localization.depth_scale import DepthScale, PoseAndDepth, ScaledPoints
+from bidnerf_core.localization.fusion import Fit, FusedPose, Measurements, finest_cost, fused_pose
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import textured_map, unseen
 
@@ -52,32 +44,25 @@ def measured(scale: float = 1.0) -> SurfaceCost:
     return finest_cost(surface, PointCloud.measured(views, None, 1500, Generator().manual_seed(0)))
 
 
-def drawing(about: Pivot, draws: list[float]) -> Callable[[SE3, float], RenderedCost]:
-    """Return what draws rays; the uncertainties of the surfaces for which it does are noted."""
+def drawn(about: Pivot, seed: int = 0) -> RenderedCost:
+    """Return the cost of rays of an image without depth."""
     problem = rig(textured_map(), (replace(unseen(), frame=replace(unseen().frame, depth=None)),), None)
     settings = RenderedCostSettings(ColourSettings(), None, RefinementSettings())
-    generator = Generator().manual_seed(0)
-
-    def draw(T: SE3, surface_sigma: float) -> RenderedCost:
-        draws.append(surface_sigma)
-        stage = RefinementStage(0, 512, surface_sigma=surface_sigma)
-        return settings.drawn(replace(problem, start=T), stage, about, generator)
-
-    return draw
+    return settings.drawn(problem, RefinementStage(0, 512), about, Generator().manual_seed(seed))
 
 
 def prior(about: Pivot, covariance: Tensor = WIDE) -> GaussianPrior:
     return GaussianPrior(TRUTH.retract(OFF), covariance, about)
 
 
-def rays(draws: list[float]) -> Measurements:
+def rays(independent: float = 100) -> Measurements:
     about = measured().cloud.pivot
-    return Measurements(prior(about), 1, None, drawing(about, draws))
+    return Measurements(prior(about), None, drawn(about), independent_rays=independent)
 
 
-def scaled(cost: SurfaceCost, scale: DepthScale) -> Measurements:
+def scaled(cost: SurfaceCost, scale: DepthScale, independent: float = 30) -> Measurements:
     start = prior(cost.cloud.pivot)
-    return Measurements(start, 1, ScaledPoints(cost, scale, start.mean))
+    return Measurements(start, ScaledPoints(cost, scale, start.mean), independent_points=independent)
 
 
 def squared_error(found: FusedPose) -> float:
@@ -92,7 +77,7 @@ def translation_error(found: FusedPose) -> float:
 
 def test_a_prior_alone_is_its_own_answer() -> None:
     start = prior(measured().cloud.pivot)
-    found = fused_pose(Measurements(start, 1), 5)
+    found = fused_pose(Measurements(start), 5)
     assert torch.allclose(found.T.matrix(), start.mean.matrix(), atol=1e-9)
     torch.testing.assert_close(found.covariance, WIDE, rtol=1e-6, atol=1e-12)
 
@@ -111,66 +96,69 @@ def test_a_wrong_scale_is_found_where_the_sensor_may_have_one(scale: float) -> N
     doubted = fused_pose(scaled(cost, DepthScale(0.05)), 8)
     assert translation_error(doubted) < 0.5 * translation_error(believed)
     assert squared_error(doubted) < CHI2_99 < squared_error(believed)
-    assert doubted.factor == pytest.approx(1 / scale, abs=0.015)
-    assert believed.factor == pytest.approx(1, abs=1e-3)
+    assert doubted.state.factor == pytest.approx(1 / scale, abs=0.015)
+    assert believed.state.factor == pytest.approx(1, abs=1e-3)
 
 
 def test_landmarks_hold_the_scale_that_they_gave() -> None:
     """Landmarks say 1.05, wrongly, of points that were corrected by it."""
     scale = DepthScale(0.05, by_landmarks=1.05)
     cost = measured(scale.estimate)
-    alone, held = (fused_pose(scaled(cost, given), 8).factor for given in (DepthScale(0.05), scale))
+    alone, held = (fused_pose(scaled(cost, given), 8).state.factor for given in (DepthScale(0.05), scale))
     assert alone + 0.005 < held < 1
 
 
-def test_rays_bring_the_pose_to_the_truth_and_allow_for_what_is_still_uncertain() -> None:
-    draws = list[float]()
-    measurements = rays(draws)
-    found = fused_pose(measurements, 8)
+def test_rays_bring_the_pose_to_the_truth() -> None:
+    found = fused_pose(rays(), 8)
     assert translation_error(found) < 0.005
     assert squared_error(found) < CHI2_99
-    assert draws[0] == pytest.approx(position_deviation(measurements.prior.at_pivot))
-    assert draws[0] > 1.5 * draws[-1] > 0
+
+
+def test_steep_rays_count_less_while_what_is_seen_is_uncertain() -> None:
+    measurements = rays()
+    vague, certain = (measurements.at(PoseAndDepth(TRUTH), sigma).rays for sigma in (0.1, 0.0))
+    assert vague is not None
+    assert certain is not None
+    assert float(vague.equations.hessian[0].trace()) < 0.5 * float(certain.equations.hessian[0].trace())
 
 
 def test_points_and_rays_together_are_as_certain_as_either_or_more() -> None:
     cost = measured()
-    about = cost.cloud.pivot
     points = scaled(cost, DepthScale(0.02))
-    both = fused_pose(replace(points, draw=drawing(about, [])), 8)
+    both = fused_pose(replace(points, rays=drawn(cost.cloud.pivot), independent_rays=100), 8)
     assert squared_error(both) < CHI2_99
-    for one in (points, rays([])):
+    for one in (points, rays()):
         alone = fused_pose(one, 8)
         assert position_deviation(both.covariance) < 1.01 * position_deviation(alone.covariance)
 
 
-def test_steps_are_taken_until_the_pose_settles() -> None:
-    few, many = list[float](), list[float]()
-    fused_pose(rays(few), 2)
-    fused_pose(rays(many), 200)
-    assert len(few) == 2
-    assert 2 < len(many) < 200
+def test_a_term_counts_in_the_answer_as_in_its_covariance() -> None:
+    """The prior is off, and the truth fits the rays: the more rays are independent, the nearer the answer and the surer."""
+    errors, deviations = [], []
+    for count in (0.01, 1.0, 100.0):
+        found = fused_pose(rays(count), 8)
+        errors.append(translation_error(found))
+        deviations.append(position_deviation(found.covariance))
+    assert errors == sorted(errors, reverse=True)
+    assert deviations == sorted(deviations, reverse=True)
+    assert squared_error(fused_pose(rays(100.0), 8)) < CHI2_99
 
 
-def test_the_covariance_counts_rays_as_few_and_allows_for_the_last_step() -> None:
-    """At the truth of a prior that is certain of it there is nearly no step, and the information adds up."""
-    measurements = rays([])
-    about, certain = measurements.prior.pivot, 1e-4 * WIDE
-    measurements = replace(measurements, prior=GaussianPrior(TRUTH, certain, about))
-    found = fused_pose(measurements, 1)
-    draw = drawing(about, [])
-    cost = draw(TRUTH, position_deviation(measurements.prior.at_pivot))
-    equations, at_prior = cost(TRUTH[None]), measurements.prior(TRUTH[None]).hessian[0]
-    by_rays = equations.hessian[0] * (INDEPENDENT / max(float(equations.cost[0]), LEAST_VARIANCE))
-    least = about.at_camera(TRUTH, torch.linalg.inv(at_prior + by_rays))
-    added = found.covariance - least
-    assert float(torch.linalg.eigvalsh(added)[0]) > -1e-6 * float(least.trace())
-    assert float(torch.linalg.eigvalsh(added)[-2]) < 1e-3 * float(least.trace())  # a single step, of rank one
+def test_steps_are_taken_until_the_pose_settles(monkeypatch: pytest.MonkeyPatch) -> None:
+    count, at = [0], Measurements.at
+
+    def counted(self: Measurements, state: PoseAndDepth, deviation: float) -> Fit:
+        count[0] += 1
+        return at(self, state, deviation)
+
+    monkeypatch.setattr(Measurements, "at", counted)
+    fused_pose(rays(), 200)
+    assert 2 < count[0] < 20
 
 
 def test_a_step_that_does_not_lower_the_sum_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    measurements = rays([])
-    monkeypatch.setattr(WeightedTerms, "cost", lambda self, at: math.inf)
+    measurements = rays()
+    monkeypatch.setattr(Fit, "cost", lambda self, weighed: math.inf)
     found = fused_pose(measurements, 3)
     assert torch.equal(found.T.matrix(), measurements.prior.mean.matrix())
 
