@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, replace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
 
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, Outcome, propose
-from bidnerf_core.localization.acceptance import (
-    LandmarkThresholds,
-    doubtful_intrinsics,
-    landmark_verdict,
+from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
+from bidnerf_core.localization.landmarks.hypotheses import Whose
+from bidnerf_core.localization.landmarks.map_camera import (
+    SAME_CAMERA,
+    MapCamera,
+    correction_between,
+    map_cameras,
 )
+from bidnerf_core.localization.landmarks.propose import updated
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.map_camera import SAME_CAMERA, correction_between, map_camera
-from bidnerf_core.localization.search.miscalibration import (
-    CameraEvidence,
-    probability_beside_approximate,
-    probability_of_map_camera,
-)
 from bidnerf_core.localization.search.unguided import unguided_matches
-from bidnerf_core.mapping import Calibration, LandmarkMap, ReprojectionFit, build_landmarks
+from bidnerf_core.mapping import Calibration, LandmarkMap, build_landmarks
 from bidnerf_core.mapping.geometry.calibration import GIVEN, NOMINAL
-from bidnerf_core.mapping.geometry.resection import Minimum
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
 TRUE = looking_in(0.43, 0.45, 3.6)
@@ -56,6 +53,13 @@ def localized(landmarks: LandmarkMap, stated: Intrinsics, true: Intrinsics = PIN
     return found
 
 
+def map_camera(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera | None:
+    """The one camera of a map whose images have one shape."""
+    found = map_cameras(given, cameras)
+    assert len(found) <= 1
+    return found[0] if found else None
+
+
 def error(found: LandmarkPose) -> float:
     return float((found.T_world_camera.inverse() @ TRUE).log().norm())
 
@@ -67,6 +71,7 @@ def error(found: LandmarkPose) -> float:
         Calibration(log_focal=-0.03),
         Calibration(0.02, 0.01, -0.02, 0.0),
         Calibration(0.01, 0.0, 0.0, 0.04),
+        Calibration(-0.02, 0.01, 0.0, 0.0, 0.1),
     ],
 )
 @pytest.mark.parametrize("given", [PINHOLE, replace(PINHOLE, distortion=(-0.02, 0.0, 0.0, 0.0))])
@@ -108,7 +113,7 @@ def test_one_unusual_image_of_a_camera_that_focuses_does_not_explain_a_wrong_foc
     found = map_camera(with_focal(1.02), (*cameras, with_focal(1.018)))
     assert found is not None
     assert bool(found.differs[0])
-    assert found.calibration.focal_factor == pytest.approx(1 / 1.02, abs=1e-3)
+    assert float(found.correction[0].exp()) == pytest.approx(1 / 1.02, abs=1e-3)
 
 
 def test_lenses_that_no_correction_describes_are_not_compared() -> None:
@@ -123,8 +128,12 @@ def test_a_resized_image_has_the_maps_camera() -> None:
     assert found.correction.abs().max() < 1e-9
 
 
-def test_images_of_another_shape_are_not_compared() -> None:
-    assert map_camera(replace(PINHOLE, height=400), (PINHOLE,)) is None
+def test_images_of_another_shape_are_compared_with_resized_ones() -> None:
+    taller = replace(PINHOLE, height=400, cy=200.0)
+    found = map_camera(taller, (PINHOLE,))
+    assert found is not None
+    assert found.intrinsics == PINHOLE.resized(400, 400)
+    assert float(found.correction[4]) == pytest.approx(math.log(3 / 4))
     assert map_camera(PINHOLE, ()) is None
 
 
@@ -134,7 +143,7 @@ def test_a_camera_that_refocuses_differs_only_beyond_its_own_spread() -> None:
     assert inside is not None
     assert outside is not None
     assert not bool(inside.differs.any())
-    assert outside.differs.tolist() == [True, False, False, False]
+    assert outside.differs.tolist() == [True, False, False, False, False]
     assert float(outside.deviations[0]) == pytest.approx(0.0075, rel=0.2)
 
 
@@ -143,45 +152,6 @@ def test_the_farther_the_cameras_are_apart_the_less_likely_they_are_one() -> Non
     odds = [camera.log_odds for camera in found if camera is not None]
     assert odds == sorted(odds, reverse=True)
     assert odds[-1] == -math.inf
-
-
-def fit(apparent: float, deviation: float) -> ReprojectionFit:
-    """A fit with free intrinsics that asks for a longer focal length."""
-    zeros = torch.zeros((6, 6), dtype=torch.float64)
-    return ReprojectionFit(
-        SE3.identity(),
-        Calibration(apparent),
-        motion=zeros[0],
-        noise=0.3,
-        covariance=torch.eye(6, dtype=torch.float64),
-        calibration_deviations=torch.full((4,), deviation, dtype=torch.float64),
-        minimum=cast(Minimum, None),
-    )
-
-
-def test_the_image_decides_where_it_can(landmarks: LandmarkMap) -> None:
-    camera = map_camera(with_focal(1 / 1.02), (PINHOLE,))
-    assert camera is not None
-    exact = [probability_of_map_camera(fit(a, 0.002), landmarks, camera) for a in (0.0, 0.01, 0.02)]
-    assert exact == sorted(exact)
-    assert exact[0] < 0.001
-    assert exact[-1] > 0.99
-    vague = [probability_of_map_camera(fit(a, 0.5), landmarks, camera) for a in (0.0, 0.02)]
-    prior = 1 / (1 + math.exp(-camera.log_odds))
-    assert vague == pytest.approx([prior, prior], abs=0.02)
-
-
-def test_an_approximate_focal_length_may_be_that_of_the_map_or_any_other(landmarks: LandmarkMap) -> None:
-    camera = map_camera(with_focal(1 / 1.1), (PINHOLE,))
-    assert camera is not None
-    there, elsewhere = (
-        probability_beside_approximate(fit(math.log(a), 0.004), landmarks, camera) for a in (1.1, 1.14)
-    )
-    assert there > 0.99
-    assert elsewhere < 0.01
-    far = map_camera(with_focal(2.0), (PINHOLE,))
-    assert far is not None
-    assert probability_beside_approximate(fit(-0.69, 0.004), landmarks, far) == 0
 
 
 @pytest.mark.parametrize("factor", [0.95, 0.98, 1.02, 1.05])
@@ -221,16 +191,22 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
     verdict = landmark_verdict(found)
     assert verdict.outcome is Outcome.MISCALIBRATED
     assert "do not tell whether" in verdict.reason
-    shift = found.alternative_shift
+    assert found.guided is not None
+    other = found.guided.posterior.riskiest
+    assert other is not None
+    shift = found.guided.posterior.shift(other)
     assert float(shift[:3].norm()) > 0.02
-    certain = replace(
-        found, miscalibration=replace(found.miscalibration, alternative_probability=torch.tensor(0.0))
-    )
-    added = found.unresolved_calibration - certain.unresolved_calibration
-    expected = found.miscalibration.alternative_probability * torch.outer(shift, shift)
-    torch.testing.assert_close(added, expected)
-    indifferent = LandmarkThresholds(alternative_motion=1.0)
+    assert found.expected_shift > LandmarkThresholds().expected_shift
+    # The covariance contains the pose with the other intrinsics.
+    assert float(shift @ torch.linalg.solve(found.full_covariance, shift)) < 16.8
+    indifferent = LandmarkThresholds(expected_shift=1.0)
     assert landmark_verdict(found, indifferent).outcome is not Outcome.MISCALIBRATED
+
+
+def with_log_odds(found: LandmarkPose, whose: Whose, odds: float) -> LandmarkPose:
+    assert found.guided is not None
+    families = {e.hypothesis.family for e in found.guided.posterior.explanations}
+    return updated(found, {family: odds for family in families if family[0] is whose})
 
 
 @pytest.mark.parametrize("odds", [-20.0, 20.0])
@@ -242,8 +218,9 @@ def test_what_else_is_known_of_the_camera_decides_where_the_image_does_not(
     vague, points = replace(landmarks, calibration_scatter=scatter), Points(noise=NOISE)
     view = points.view(TRUE)
     stated = replace(view, frame=replace(view.frame, intrinsics=with_focal(1.05)))
-    found = propose(LandmarkMatcher(vague), [stated], points, evidence=CameraEvidence(map_camera=odds))
+    found = propose(LandmarkMatcher(vague), [stated], points)
     assert found is not None
+    found = with_log_odds(found, Whose.MAP, odds)
     assert found.takes_map_camera is (odds > 0)
     assert landmark_verdict(found).accepted
 
@@ -252,24 +229,11 @@ def test_evidence_against_the_intrinsics_taken_has_them_estimated(landmarks: Lan
     points = Points(noise=NOISE)
     view, strange = points.view(TRUE), replace(landmarks, cameras=())
     stated = replace(view, frame=replace(view.frame, intrinsics=with_focal(1.02)))
-    kept, estimated = (
-        propose(LandmarkMatcher(strange), [stated], points, evidence=CameraEvidence(mistaken=odds))
-        for odds in (-50.0, 50.0)
-    )
-    assert kept is not None
-    assert estimated is not None
+    found = propose(LandmarkMatcher(strange), [stated], points)
+    assert found is not None
+    kept, estimated = (with_log_odds(found, Whose.ESTIMATED, odds) for odds in (-50.0, 50.0))
     assert not kept.estimates_calibration
     assert estimated.focal_factor == pytest.approx(1 / 1.02, rel=0.005)
-
-
-def test_the_farther_off_a_pose_may_be_the_less_probable_that_has_to_be(landmarks: LandmarkMap) -> None:
-    found = localized(landmarks, with_focal(1.05), with_focal(1.05))  # of another camera, and told apart
-    motion = float(found.alternative_shift[:3].norm()) / found.distance
-    assert 0.02 < motion < 0.1
-    thresholds = LandmarkThresholds(alternative=0.5, alternative_motion=0.2 * motion)
-    for probability, doubtful in ((0.19, False), (0.21, True)):
-        judged = replace(found.miscalibration, alternative_probability=torch.tensor(probability))
-        assert doubtful_intrinsics(replace(found, miscalibration=judged), thresholds) is doubtful
 
 
 def test_a_misplaced_principal_point_is_corrected_too(landmarks: LandmarkMap) -> None:
@@ -307,7 +271,7 @@ def test_an_approximate_focal_length_is_found_among_mostly_wrong_matches(
         landmark[wrong] = landmark[wrong].roll(1)
         return replace(matches, landmark=landmark)
 
-    monkeypatch.setattr("bidnerf_core.localization.search.landmarks.unguided_matches", mostly_wrong)
+    monkeypatch.setattr("bidnerf_core.localization.landmarks.propose.unguided_matches", mostly_wrong)
     points = Points(noise=NOISE)
     stated = View(Frame("f", points.view(TRUE).frame.rgb, with_focal(1.1)), SE3.identity())
     matcher = LandmarkMatcher(landmarks if known else replace(landmarks, cameras=()))
@@ -322,11 +286,9 @@ def test_intrinsics_that_are_also_the_maps_are_mistaken_less_often(landmarks: La
     """An image of the map's camera that seems to need a correction is trusted more than one of an unknown camera."""
     apparent = with_focal(1.01)
     known, unknown = (
-        localized(part, PINHOLE, apparent).miscalibration.worst
-        for part in (landmarks, replace(landmarks, cameras=()))
+        localized(part, PINHOLE, apparent).doubt.wrong for part in (landmarks, replace(landmarks, cameras=()))
     )
-    assert known[0] == unknown[0] == 0  # the focal length
-    odds = [p / (1 - p) for _, p in (known, unknown)]
+    odds = [p / (1 - p) for p in (known, unknown)]
     assert odds[0] == pytest.approx((1 - SAME_CAMERA) * odds[1], rel=0.1)
 
 

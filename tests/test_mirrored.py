@@ -9,11 +9,7 @@ import torch
 
 from bidnerf_core import Localizer, Outcome, View
 from bidnerf_core.localization import LandmarkMatcher, confirm, propose
-from bidnerf_core.localization.search.mirrored import (
-    MirrorEvidence,
-    mirror_evidence,
-    mirror_image,
-)
+from bidnerf_core.localization.search.mirrored import MirrorEvidence, mirror_evidence, mirror_image
 from bidnerf_core.testing.textured_field import textured_map, unseen
 
 

@@ -27,10 +27,12 @@ from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.fields.rendering import render, render_image
 from bidnerf_core.frames.pixels import all_pixels, observe
 from bidnerf_core.localization import LandmarkMatcher, propose
-from bidnerf_core.localization.search.evident_motion import (
+from bidnerf_core.localization.landmarks.hypotheses import (
     SHARE_AS_MAP,
     SHARE_MOVING,
-    evident_motion,
+    Motion,
+    camera_hypotheses,
+    posterior,
     share_moving,
 )
 from bidnerf_core.mapping import (
@@ -41,7 +43,6 @@ from bidnerf_core.mapping import (
     resect,
     tracked_views,
 )
-from bidnerf_core.mapping.geometry.calibration import FIXED
 from bidnerf_core.mapping.landmarks.building import observed_at_rest, pose_updates
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, unseen
 from bidnerf_core.training import RayBank
@@ -267,13 +268,16 @@ def test_weaker_motions_are_believed_where_the_map_moved() -> None:
     """Images whose motion is about as probable as none are judged by either prior probability."""
     points, views, true = capture(motions(0.35))
     seen, positions = tracked_views(views, points).at(true).triangulated(LandmarkConfig())
-    taken = {SHARE_MOVING: 0, 0.8: 0}
+    taken, sure = {SHARE_MOVING: 0, 0.8: 0}, torch.full((4,), 1e-4, dtype=torch.float64)
     for number in range(VIEWS):
         own = (seen.image == number).nonzero()[:, 0]
         data = observed_at_rest(seen.sightings[own], positions, true[number])
         fit = resect(data, true[number], NOISE)
         for share in taken:
-            taken[share] += evident_motion(data, fit, 1.0, FIXED, share).prior != STILL
+            judged = posterior(
+                data, fit.T_world_rig, NOISE, camera_hypotheses([]), 1.0, GIVEN, sure, share
+            ).with_stated
+            taken[share] += judged.best.motion is Motion.MOVING
     assert taken[SHARE_MOVING] < taken[0.8]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from copy import copy
 from dataclasses import replace
 
@@ -15,11 +14,7 @@ from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, propose
 from bidnerf_core.localization.acceptance import landmark_verdict
-from bidnerf_core.localization.search.correspondences import query_images
-from bidnerf_core.localization.search.landmark_query import LandmarkQuery
-from bidnerf_core.localization.search.resized_image import RESIZED, log_odds
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
-from bidnerf_core.mapping.geometry.calibration import FIXED
 from bidnerf_core.results.errors import pose_error
 from landmark_scene import PINHOLE, Points, looking_in, ring
 
@@ -85,15 +80,6 @@ def moving_points(pose: SE3, camera: Intrinsics, motion: torch.Tensor) -> Points
     return points
 
 
-def odds(landmarks: LandmarkMap, view: View, resized: Intrinsics, stated: Intrinsics) -> float:
-    """Return the log odds of a ``resized`` image of the map's camera against the ``stated`` camera, from poses with either."""
-    unaware = replace(landmarks, cameras=())
-    other, found = (found_with(unaware, view, camera) for camera in (resized, stated))
-    view = replace(view, frame=replace(view.frame, intrinsics=stated))
-    query = LandmarkQuery(query_images([view], POINTS), landmarks, FIXED)
-    return log_odds(query, replace(other, intrinsics=resized), found)
-
-
 @pytest.mark.parametrize("moved", [False, True])
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("across", [0.95, 1.05])
@@ -101,19 +87,15 @@ def test_evidence_favours_the_true_camera(
     landmarks: LandmarkMap, across: float, pose: SE3, moved: bool
 ) -> None:
     """An image is resized, or of another camera for which the other hypothesis is the map's; the true camera may have moved."""
-    one, other = PINHOLE, replace(PINHOLE, fx=PINHOLE.fx / across)
+    stated = replace(PINHOLE, fx=PINHOLE.fx / across)
     motion = torch.tensor([0.0, 0.01, 0.0, 0.0, 0.0, 0.012], dtype=torch.float64) * float(moved)
-    for true, sign in ((one, 1), (other, -1)):
-        view = moving_points(pose, true, motion).view(pose, true)
-        assert sign * odds(landmarks, view, one, other) > 2
-
-
-def test_the_prior_decides_where_keypoints_do_not(landmarks: LandmarkMap) -> None:
-    """The prior of resized images alone is left if keypoints hardly count."""
-    view = POINTS.view(POSES[0], PINHOLE)
-    vague = replace(landmarks, correlation=1e9)
-    stated = replace(PINHOLE, fx=PINHOLE.fx / 1.03)
-    assert odds(vague, view, PINHOLE, stated) == pytest.approx(math.log(RESIZED / (1 - RESIZED)), abs=0.05)
+    for true in (PINHOLE, stated):
+        found = found_with(landmarks, moving_points(pose, true, motion).view(pose, true), stated)
+        assert found.takes_map_camera is (true is PINHOLE)
+        assert found.guided is not None
+        taken = found.guided.posterior.best.hypothesis.family
+        weighted = zip(found.guided.posterior.explanations, found.guided.posterior.probabilities, strict=True)
+        assert sum(p for each, p in weighted if each.hypothesis.family == taken) > 0.88
 
 
 def test_the_doubt_between_two_cameras_is_part_of_the_covariance(landmarks: LandmarkMap) -> None:
@@ -121,11 +103,10 @@ def test_the_doubt_between_two_cameras_is_part_of_the_covariance(landmarks: Land
     pose = POSES[0]
     view, stated = POINTS.view(pose, PINHOLE), replace(PINHOLE, fx=PINHOLE.fx / 1.05)
     vague = replace(landmarks, correlation=1000.0)
-    unaware, found = found_with(replace(vague, cameras=()), view, stated), found_with(vague, view, stated)
+    found = found_with(vague, view, stated)
     assert not found.takes_map_camera
     off = (found.T_world_camera.inverse() @ pose).log()
-    added = found.covariance - unaware.covariance
-    assert float(torch.linalg.eigvalsh(added)[-1]) > 0.01 * float(off @ off)
+    assert float(torch.linalg.eigvalsh(found.doubt.covariance)[-1]) > 0.01 * float(off @ off)
 
 
 def test_a_map_that_does_not_know_its_cameras_takes_the_given_one(landmarks: LandmarkMap) -> None:

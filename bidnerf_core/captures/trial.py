@@ -161,8 +161,9 @@ def _calibration_scatter(answers: Sequence[_Answer], landmarks: LandmarkMap) -> 
 
     The part explained by the uncertainty of each fit is removed.
     """
-    apparent = torch.stack([answer.found.miscalibration.apparent for answer in answers])
-    noise = torch.stack([answer.found.miscalibration.noise for answer in answers])
+    posteriors = [answer.found.guided.posterior for answer in answers if answer.found.guided is not None]
+    apparent = torch.stack([posterior.apparent[:4] for posterior in posteriors])
+    noise = torch.stack([posterior.deviations[:4] for posterior in posteriors])
     explained = _factors(answers, landmarks)[:, None] * noise.square()
     low, high = torch.full((4,), 1e-5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
     for _ in range(30):

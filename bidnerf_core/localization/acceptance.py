@@ -16,11 +16,11 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.beyond_chance import Support
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
+from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
+from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import RenderedThresholds
-from bidnerf_core.mapping.geometry.calibration import UNSTRETCHED, Calibration
 from bidnerf_core.mapping.surface.casting import trace
 
 WELL_BEFORE = 0.04
@@ -121,14 +121,13 @@ def landmark_diagnostics(
     found: LandmarkPose, searched: bool = True, judge: SurfaceCost | None = None, T: SE3 | None = None
 ) -> LandmarkDiagnostics:
     """Return the diagnostics of a pose by landmarks; ``judge`` holds measured points, if any, which ``T`` places."""
-    wrong = 0.0 if found.estimates_calibration else found.miscalibration.worst[1]
     near = both = None
     if judge is not None and T is not None:
         near_points, alike = judge.inliers(judge.correspondences(T[None]))
         near, both = float(near_points.mean()), float((near_points * alike).mean())
     return LandmarkDiagnostics(
         found.inliers, found.matches, found.agreeing, found.log10_nfa, found.chance, found.visible,
-        found.keypoints, found.spread, found.noise_ratio, wrong, found.position_deviation / found.distance,
+        found.keypoints, found.spread, found.noise_ratio, found.doubt.wrong, found.position_deviation / found.distance,
         found.estimates_calibration, searched, near, both, found.has_motion,
     )  # fmt: skip
 
@@ -142,12 +141,9 @@ class LandmarkThresholds:
     inliers: int = 15
     above_chance: float = 3.0  # times as many as at a wrong pose, at least
     spread: float = 0.06  # share of the image's cells that hold one, at least
-    miscalibration: float = 0.1  # probability that the given intrinsics are wrong, at most
-    # probability that the intrinsics that were not taken, the given ones or the map's, are right, at most, ...
-    alternative: float = 0.2
-    # ... if they would move the camera by more than this share of the landmarks' distance. Also the limit of the expected
-    # motion, probability times motion: the farther off a pose may be, the less probable that must be.
-    alternative_motion: float = 0.005
+    # expected shift of the position by other intrinsics, probability times shift, as a share of the landmarks' distance, at most:
+    # the farther off a pose may be, the less probable that must be
+    expected_shift: float = 0.0025
     precision: float = 0.03  # standard deviation of the position, as a share of that distance, at most
 
 
@@ -163,24 +159,15 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
         return Verdict(Outcome.UNDETERMINED, f"{share}, all in {found.spread:.0%} of the image")
     if not bool(found.covariance.isfinite().all()):
         return Verdict(Outcome.UNDETERMINED, f"{share}, but do not determine the pose")
-    wrong = found.miscalibration
-    if not found.estimates_calibration and wrong.worst[1] > thresholds.miscalibration:
-        suggested = torch.tensor(astuple(found.calibration), dtype=torch.float64) + wrong.apparent
-        suspect = Calibration(*suggested.tolist()).parts[wrong.worst[0]]
-        though = f" with the map's intrinsics ({found.camera_sentence})" if found.takes_map_camera else ""
-        return Verdict(Outcome.MISCALIBRATED, f"{share}{though}, but they suggest {suspect} than given")
-    if not found.estimates_calibration and doubtful_intrinsics(found, thresholds):
-        other = found.calibration if found.takes_map_camera else Calibration(*wrong.alternative.tolist())
-        choice = "the given intrinsics or those of the map's images"
-        return Verdict(
-            Outcome.MISCALIBRATED, f"{share}, but do not tell whether {choice} are right: {other.sentence}"
-        )
+    if found.expected_shift > thresholds.expected_shift:
+        return Verdict(Outcome.MISCALIBRATED, f"{share}{_doubted(found)}")
     if found.better_camera is not None:
-        camera = found.better_camera.sentence
-        return Verdict(Outcome.MISCALIBRATED, f"{share}, but far more would with {camera}")
-    if found.stretch != UNSTRETCHED and not found.takes_map_camera:
-        return Verdict(Outcome.MISCALIBRATED, f"{share}, but only with {found.camera_sentence}")
-    deviation = position_deviation(found.stated_covariance)
+        return Verdict(
+            Outcome.MISCALIBRATED, f"{share}, but far more would with {found.better_camera.sentence}"
+        )
+    if found.calibration.is_stretched and not found.takes_map_camera:
+        return Verdict(Outcome.MISCALIBRATED, f"{share}, but only with {found.calibration.sentence}")
+    deviation = position_deviation(found.stated_covariance + found.doubt.covariance)
     if not deviation <= thresholds.precision * found.distance:
         cause = ", as the intrinsics had to be estimated" if found.estimates_calibration else ""
         return Verdict(
@@ -191,18 +178,24 @@ def landmark_verdict(found: LandmarkPose, thresholds: LandmarkThresholds = Landm
     if found.takes_map_camera or found.estimates_calibration:
         whose = "the map's" if found.takes_map_camera else "estimated"
         with_others = f", with {whose} intrinsics" + (
-            f": {found.camera_sentence}" if found.changes_camera else ""
+            f": {found.calibration.sentence}" if found.changes_camera else ""
         )
     moving = ", with the motion of a rolling shutter" if found.has_motion else ""
     return Verdict(Outcome.CONVERGED, f"{share} within {found.noise:.1f} px{moving}{with_others}")
 
 
-def doubtful_intrinsics(found: LandmarkPose, thresholds: LandmarkThresholds) -> bool:
-    """Return whether the intrinsics that were not taken, given or the map's, may be right and would move the pose far."""
-    motion = float(torch.linalg.vector_norm(found.alternative_shift[:3])) / found.distance
-    probability = float(found.miscalibration.alternative_probability)
-    most = thresholds.alternative_motion
-    return motion > most and (probability > thresholds.alternative or probability * motion > most)
+def _doubted(found: LandmarkPose) -> str:
+    """Return what speaks for other intrinsics than those with which a pose was found."""
+    taken = " with the map's intrinsics" if found.takes_map_camera else ""
+    taken = " with estimated intrinsics" if found.estimates_calibration else taken
+    with_taken = f"{taken} ({found.calibration.sentence})" if taken else ""
+    if not found.doubt.other_is_known:
+        return f"{with_taken}, but they suggest {found.doubt.other.sentence}"
+    if found.estimates_calibration:
+        return f"{with_taken}, but do not tell whether the given ones are right"
+    other = found.calibration if found.takes_map_camera else found.doubt.other
+    choice = "the given intrinsics or those of the map's images"
+    return f", but do not tell whether {choice} are right: {other.sentence}"
 
 
 def is_blank(frame: Frame) -> bool:

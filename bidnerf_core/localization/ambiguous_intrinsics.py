@@ -13,9 +13,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, SurfaceDiagnostics
+from bidnerf_core.localization.landmarks.map_camera import OTHER_CAMERA, MapCamera, map_cameras
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome
-from bidnerf_core.localization.search.map_camera import OTHER_CAMERA, MapCamera, map_camera
 
 
 def may_be_miscalibrated(problem: Problem) -> bool:
@@ -23,8 +23,8 @@ def may_be_miscalibrated(problem: Problem) -> bool:
     if problem.focal_is_approximate:
         return True
     cameras = () if problem.matcher is None else problem.matcher.landmarks.cameras
-    known = [map_camera(view.frame.intrinsics, cameras) for view in problem.views]
-    return any(_differs_a_little(camera) for camera in known if camera is not None)
+    known = [camera for view in problem.views for camera in map_cameras(view.frame.intrinsics, cameras)]
+    return any(_differs_a_little(camera) for camera in known)
 
 
 def _differs_a_little(camera: MapCamera) -> bool:

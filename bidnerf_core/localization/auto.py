@@ -37,12 +37,12 @@ from bidnerf_core.localization.by_landmarks import (
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.first_order import BidConfig, bid
+from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.propose import confirm
 from bidnerf_core.localization.methods import Method
 from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
@@ -250,7 +250,7 @@ def _unless_twin(
 
 def _is_misled(near: LandmarkPose, problem: Problem) -> bool:
     """Return whether landmarks contradict the intrinsics of a pose by colour, which fits wrong ones at a wrong pose."""
-    doubted = near.miscalibration.worst[1] > MISLEADING or near.better_camera is not None
+    doubted = near.doubt.wrong > MISLEADING or near.better_camera is not None
     return doubted and not near.estimates_calibration and _measured_points(problem) < LEAST_POINTS
 
 

@@ -11,41 +11,26 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import enumeration
 from bidnerf_core.geometry.independent import independent
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.acceptance import (
-    LandmarkDiagnostics,
-    LandmarkThresholds,
-    doubtful_intrinsics,
-    landmark_diagnostics,
-    landmark_verdict,
-)
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics, LandmarkThresholds, landmark_diagnostics, landmark_verdict
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
-from bidnerf_core.localization.fusion import (
-    FusedPose,
-    Measurements,
-    drawn_rays,
-    finest_cost,
-    fused_pose,
-    nearby_start,
-)
+from bidnerf_core.localization.fusion import FusedPose, Measurements, drawn_rays, finest_cost, fused_pose, nearby_start
+from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.propose import propose, updated
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
-from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmarks import propose
-from bidnerf_core.localization.search.map_camera import map_camera
+from bidnerf_core.localization.result import Localization, Verdict
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
 from bidnerf_core.localization.solvers.pivots import pivot
+from bidnerf_core.localization.settings import ColourSettings, DepthSettings, RefinementSettings, RefinementStage, rendered_depth_scale
+from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.mapping import SurfaceMap
-from bidnerf_core.mapping.geometry.calibration import Calibration
 
 POINTS = 2000
 """Largest number of measured points that are fused."""
@@ -87,7 +72,7 @@ class LandmarkAnswer:
 
         These errors mislead landmarks and rendered colours alike, and the scale of measured depth is no better known.
         """
-        return self.covariance + self.found.unresolved_calibration
+        return self.covariance + self.found.doubt.covariance
 
 
 def answer_by_landmarks(
@@ -100,57 +85,26 @@ def answer_by_landmarks(
     """
     found = propose(matcher, problem.views, seed=seed, seek_twin=True)
     if found is not None and rays:
-        found = _with_camera_judged(problem, matcher, found, seed)
+        found = _with_camera_rendered(problem, found, seed)
     return None if found is None else fused_answer(problem, found, landmark_verdict(found), rays, seed)
 
 
-def _with_camera_judged(
-    problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, seed: int
-) -> LandmarkPose:
-    """Return a pose, found again with evidence from renderings if landmarks leave open which intrinsics are right."""
-    if landmark_verdict(found).outcome is not Outcome.MISCALIBRATED or found.has_other_camera:
+def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> LandmarkPose:
+    """Return a pose with evidence from renderings if landmarks leave open which intrinsics are right."""
+    if found.guided is None or found.expected_shift <= LandmarkThresholds().expected_shift:
         return found
-    evidence, limits = NO_EVIDENCE, LandmarkThresholds()
-    if doubtful_intrinsics(found, limits):
-        other, correction = _other_camera(problem, matcher, found), found.miscalibration.alternative
-        odds = _log_odds_of(problem, found, correction, lambda _: other, seed)
-        evidence = CameraEvidence(map_camera=-odds if found.takes_map_camera else odds)
-        found = propose(matcher, problem.views, seed=seed, seek_twin=True, evidence=evidence) or found
-    if not found.estimates_calibration and found.miscalibration.worst[1] > limits.miscalibration:
-        correction = found.miscalibration.apparent
-        change = Calibration(*correction.tolist())
-        evidence = replace(evidence, mistaken=_log_odds_of(problem, found, correction, change.applied, seed))
-        found = propose(matcher, problem.views, seed=seed, seek_twin=True, evidence=evidence) or found
-    return found
-
-
-def _other_camera(problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose) -> Intrinsics:
-    """Return the intrinsics that were not taken: the given ones, the fitted ones where those are approximate, or the map's."""
-    frame, other = problem.views[-1].frame, Calibration(*found.miscalibration.alternative.tolist())
-    if found.intrinsics is not None:
-        return other.applied(found.intrinsics) if frame.focal_is_approximate else frame.intrinsics
-    camera = map_camera(frame.intrinsics, matcher.landmarks.cameras, near=other)
-    return frame.intrinsics if camera is None else camera.intrinsics
-
-
-def _log_odds_of(
-    problem: Problem,
-    found: LandmarkPose,
-    correction: Float[Tensor, "4"],
-    corrected_camera: Callable[[Intrinsics], Intrinsics],
-    seed: int,
-) -> float:
-    """Return the log odds, by renderings, of corrected intrinsics against the intrinsics that were taken.
-
-    ``correction`` determines how the pose moves along with the intrinsics.
-    """
-    taken = corrected(problem, found)
+    posterior = found.guided.posterior
+    other = posterior.riskiest
+    if other is None:
+        return found
+    here = corrected(problem, found)
     views = tuple(
-        replace(view, frame=replace(view.frame, intrinsics=corrected_camera(view.frame.intrinsics)))
-        for view in taken.views
+        replace(view, frame=replace(view.frame, intrinsics=other.intrinsics(given.frame.intrinsics)))
+        for view, given in zip(here.views, problem.views, strict=True)
     )
-    other = replace(taken, views=views, start=found.with_correction(correction))
-    return log_odds_by_rendering(other, taken, seed)
+    there = replace(here, views=views, start=found.T_world_camera.retract(posterior.shift(other)))
+    odds = log_odds_by_rendering(there, here, seed)
+    return updated(found, {other.hypothesis.family: odds})
 
 
 def fused_answer(

@@ -7,10 +7,10 @@ from dataclasses import replace
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.by_landmarks import corrected
+from bidnerf_core.localization.landmarks.propose import propose
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.landmarks import propose
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.mirrored import SUSPICIOUS, mirror_evidence, mirror_image
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import torch
-
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import landmark_verdict
 from bidnerf_core.localization.by_landmarks import LandmarkAnswer, corrected, fused_answer
+from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose, Twin
+from bidnerf_core.localization.landmarks.propose import confirm
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Twin, Unguided
-from bidnerf_core.localization.search.landmarks import confirm
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 
 TWIN_LOG_ODDS = 10.0
@@ -71,22 +69,18 @@ def twin_rejection(
 def _at_twin(
     problem: Problem, matcher: LandmarkMatcher, found: LandmarkPose, twin: Twin
 ) -> LandmarkPose | None:
-    """Return the pose at the twin, without the matches by descriptors that agree with the pose itself."""
-    there = confirm(matcher, _views_seen_by(problem, found), twin.T_world_rig).pose
+    """Return the pose at the twin."""
+    seen = _views_seen_by(problem, found)
+    there = confirm(matcher, seen, twin.T_world_rig, rival=found.T_world_camera).pose
     if there is None:
         return None
-    if there.unguided is not None:
-        data, limit = there.unguided.matches, there.unguided.limit
-        off = data.without_motion(found.T_world_camera, found.motion).residuals(found.T_world_camera)
-        elsewhere = torch.linalg.vector_norm(off, dim=-1) <= limit
-        there = replace(there, unguided=Unguided(data[~elsewhere], limit))
     if found.intrinsics_of(problem.views[-1].frame.intrinsics) is None:
         return there
     if there.changes_camera:  # of two corrections, one after the other, nothing keeps account
         return None
     return replace(
         there, calibration=found.calibration, calibration_deviations=found.calibration_deviations,
-        intrinsics=found.intrinsics, stretch=found.stretch, has_other_camera=found.has_other_camera,
+        intrinsics=found.intrinsics,
     )  # fmt: skip
 
 

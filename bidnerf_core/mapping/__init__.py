@@ -4,7 +4,7 @@
 """
 
 from bidnerf_core.mapping.geometry.bundle_adjustment import Adjustment, PosePrior, adjusted
-from bidnerf_core.mapping.geometry.calibration import Calibration, CalibrationPrior, Stretch
+from bidnerf_core.mapping.geometry.calibration import Calibration, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
 from bidnerf_core.mapping.landmarks.building import (
@@ -44,7 +44,6 @@ __all__ = [
     "PosedKeypoints",
     "ReprojectionFit",
     "Sift",
-    "Stretch",
     "SurfaceMap",
     "SurfelIndex",
     "Surfels",

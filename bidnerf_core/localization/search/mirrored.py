@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from bidnerf_core.camera.orientation import Orientation
 from bidnerf_core.frames.frame import Frame, View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.landmark_evidence import log10_agreement
+from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.correspondences import query_images
-from bidnerf_core.localization.search.landmark_evidence import log10_agreement
-from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.localization.search.unguided import unguided_matches

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from bidnerf_core.localization.landmarks.guided_refinement import LEAST_GUIDED_MATCHES, RADII, confirmed
+from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose, Twin
+from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.guided_refinement import LEAST_GUIDED_MATCHES, RADII, confirmed
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Twin
-from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.localization.search.unguided import LOOKED_UP
@@ -39,10 +39,10 @@ def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose)
     first = sample_consensus(query.observed(others), others.view, query.threshold, seed=0)
     if first is None or _keypoints(others[first.inliers]) < least:
         return None
-    there = confirmed(query, first.T_world_rig)
+    there = confirmed(query, others, first.T_world_rig)
     if there is None or _is_shared(there.correspondences, here):
         return None
-    share = (len(there.correspondences) - there.chance) / max(len(here) - found.chance, 1)
+    share = (len(there.correspondences) - there.visible_and_by_chance()[1]) / max(len(here) - found.chance, 1)
     return Twin(there.fit.T_world_rig, share) if share >= RIVAL else None
 
 

@@ -19,11 +19,9 @@ from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.evident_motion import share_moving
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmark_query import pixel_threshold
-from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.landmark_query import pixel_threshold
 from bidnerf_core.localization.settings import ByColourConfig, TrackerConfig
 from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
@@ -51,8 +49,6 @@ SIGMAS = 3.0
 """Radius of that search, in standard deviations of the prediction."""
 ENOUGH_LANDMARKS = 40
 """Least number of agreeing followed landmarks at which no new ones are sought, and the pose needs no confirmation."""
-INTRINSICS_CHECKED_EVERY = 30
-"""The number of frames after which recognised landmarks check the given intrinsics again."""
 SINGLE = LandmarkThresholds(precision=math.inf)
 """Thresholds for landmarks in one image. The precision is judged after fusing them with depth and the prediction."""
 VAGUE = 0.35
@@ -108,13 +104,13 @@ class ByLandmarks:
             points.observed(frame), predicted.T_world_camera, state.noise, threshold, correlation, state.moves
         )
         if found is not None:
-            found = with_motion(found, correlation, share_moving(self.detector.landmarks))
+            found = with_motion(found, self.detector.landmarks)
             state = replace(state, moves=found.moves)
         judged = measured = None
         state = replace(state, age=state.age + 1)
         if found is not None:
             evidence = flow_evidence(found, frame.intrinsics)
-            pose, verdict = self._judged(frame, points, found, evidence, state.miscalibration)
+            pose, verdict = self._judged(frame, points, found, evidence, state.doubt)
             judged = pose, not_by_chance(verdict, found.fit.noise, threshold)
             measured = self._fused(frame, state, points[found.inliers], *judged, predicted)
         if judged is None or measured is None or self._wants_more(state, judged[0], measured):
@@ -133,10 +129,10 @@ class ByLandmarks:
         points: FollowedPoints,
         found: PointFit,
         evidence: Evidence,
-        miscalibration: Miscalibration,
+        doubt: CameraDoubt,
     ) -> tuple[LandmarkPose, Verdict]:
         pose = landmark_pose(
-            points, found, evidence, self.detector.landmarks, miscalibration, frame.intrinsics
+            points, found, evidence, self.detector.landmarks, doubt, frame.intrinsics
         )
         return pose, landmark_verdict(pose, SINGLE)
 
@@ -161,14 +157,10 @@ class ByLandmarks:
             radius = max(least, search_radius(predicted, camera))
             if radius > most:
                 return None
-        due = state.calibrated is None or state.frames - state.calibrated >= INTRINSICS_CHECKED_EVERY
-        seen = self.detector(
-            frame, T, radius, state.usual_distance, state.noise, state.moves,
-            None if due else state.miscalibration,
-        )  # fmt: skip
+        seen = self.detector(frame, T, radius, state.usual_distance, state.noise, state.moves)
         if seen is None:
             return None
-        pose, verdict = self._judged(frame, seen.points, seen.found, seen.evidence, seen.miscalibration)
+        pose, verdict = self._judged(frame, seen.points, seen.found, seen.evidence, seen.doubt)
         if not verdict.accepted:
             return pose, verdict, seen.points, seen.found, state
         some = well_spread(seen.points.pixels[seen.found.inliers], camera, self.config.points)
@@ -179,8 +171,7 @@ class ByLandmarks:
             sought=len(some),
             age=0,
             usual_distance=seen.usual_distance,
-            miscalibration=seen.miscalibration,
-            calibrated=state.frames if due else state.calibrated,
+            doubt=seen.doubt,
         )
         return pose, verdict, seen.points, replace(seen.found, inliers=kept), state
 

@@ -14,8 +14,9 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_times, transposed_exposure_times
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.search.evident_motion import SHARE_MOVING, EvidentMotion, evident_motion
+from bidnerf_core.localization.landmarks.hypotheses import Motion, Posterior, camera_hypotheses, posterior, share_moving
 from bidnerf_core.localization.search.ransac import sample_consensus
+from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
 from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
@@ -93,7 +94,7 @@ class PointFit:
     fit: ReprojectionFit
     data: ObservedPoints
     inliers: Bool[Tensor, "m"]
-    evident: EvidentMotion = EvidentMotion()  # of the camera while its rows were exposed
+    judged: Posterior | None = None  # what explains the image, with the given intrinsics as the best
 
     @property
     def T_world_camera(self) -> SE3:
@@ -108,6 +109,11 @@ class PointFit:
     def still_data(self) -> ObservedPoints:
         """The points as a camera at rest at the pose would have observed them."""
         return self.data.without_motion(self.fit.T_world_rig, self.fit.motion)
+
+    @property
+    def doubt_of_motion(self) -> Float[Tensor, "6 6"]:
+        """What the doubt about a motion between rows adds to the covariance of the pose."""
+        return torch.zeros_like(self.fit.covariance) if self.judged is None else self.judged.doubt_of_motion
 
     @property
     def share(self) -> float:
@@ -149,18 +155,20 @@ def fit_pose(
     return other if other.within(threshold) > found.within(threshold) else found
 
 
-def with_motion(found: PointFit, correlation: float, share: float = SHARE_MOVING) -> PointFit:
-    """Return a fit with the camera's motion while its rows were exposed, if one is evident, and with the doubt about it.
-
-    ``share`` is the prior probability of a motion.
-    """
-    evident = evident_motion(found.data[found.inliers], found.fit, correlation, share=share)
-    if (evident.prior != STILL) == found.moves:
-        return replace(found, evident=evident)
-    fit = resect(
-        found.data, found.T_world_camera, found.fit.noise, correlation=correlation, motion=evident.prior
-    )
-    return PointFit(fit, found.data, _inliers(found.data, fit), evident)
+def with_motion(found: PointFit, landmarks: LandmarkMap) -> PointFit:
+    """Return a fit with the more probable of a motion while the rows were exposed and none, and with what is left of doubt."""
+    inliers = found.data[found.inliers]
+    correlation = landmarks.correlation_of(len(inliers))
+    judged = posterior(
+        inliers, found.T_world_camera, found.fit.noise, camera_hypotheses([]), correlation, GIVEN,
+        landmarks.calibration_scatter, share_moving(landmarks),
+    ).with_stated  # fmt: skip
+    moved = judged.best.motion is Motion.MOVING
+    if moved == found.moves:
+        return replace(found, judged=judged)
+    motion = MotionPrior.usual(judged.distance) if moved else STILL
+    fit = resect(found.data, found.T_world_camera, found.fit.noise, correlation=correlation, motion=motion)
+    return PointFit(fit, found.data, _inliers(found.data, fit), judged)
 
 
 def _inliers(data: ObservedPoints, fit: ReprojectionFit) -> Bool[Tensor, "m"]:

@@ -19,20 +19,18 @@ from bidnerf_core.geometry.independent import CORNERS_PER_INDEPENDENT
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
-from bidnerf_core.localization.search.evident_motion import share_moving
 from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches, projected_landmarks
-from bidnerf_core.localization.search.guided_refinement import RADII, matches_by_chance, usual_distance
-from bidnerf_core.localization.search.landmark_evidence import (
+from bidnerf_core.localization.landmarks.guided_refinement import RADII, matches_by_chance, usual_distance
+from bidnerf_core.localization.landmarks.landmark_evidence import (
     cell_numbers,
     depth_scale,
     median_distance,
     probability_within,
     share_of_cells,
 )
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmark_query import LandmarkQuery, pixel_threshold
+from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery, pixel_threshold
 from bidnerf_core.localization.search.matching import EXHAUSTIVE, LandmarkMatcher
-from bidnerf_core.localization.search.miscalibration import Miscalibration, TakenIntrinsics
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
@@ -73,7 +71,7 @@ class Recognized:
     found: PointFit
     evidence: Evidence
     usual_distance: float  # largest squared descriptor distance at which a match was allowed
-    miscalibration: Miscalibration
+    doubt: CameraDoubt  # about the intrinsics
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +89,11 @@ class LandmarkDetector:
         most_distance: float,
         noise: float,
         moves: bool = False,
-        known: Miscalibration | None = None,
     ) -> Recognized | None:
         """Match keypoints with landmarks that project within ``radius`` pixels of them, and fit the pose to the matches.
 
         ``most_distance`` is the largest squared distance between the descriptors of a match, ``noise`` a first guess at that
-        of keypoints (pixels), ``moves`` a guess as for ``fit_pose``, ``known`` the result of an earlier check of the
-        intrinsics; without it, they are checked now. Returns None if too few keypoints match.
+        of keypoints (pixels), ``moves`` a guess as for ``fit_pose``. Returns None if too few keypoints match.
         """
         number = self._near(frame.intrinsics, T_world_camera)
         image = query_image(frame, SE3.identity(), self.features)
@@ -116,12 +112,12 @@ class LandmarkDetector:
             return None
         points, found, _ = seen
         correlation = self.landmarks.correlation_of(int(found.inliers.sum()))
-        found = with_motion(found, correlation, share_moving(self.landmarks))
+        found = with_motion(found, self.landmarks)
         evidence = _guided_evidence(query, found, tight, most_distance)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))
         points = replace(points, landmark=number[points.landmark])
-        wrong = self._miscalibration(found) if known is None else known
-        return Recognized(points, found, evidence, most_distance, wrong)
+        doubt = CameraDoubt() if found.judged is None else CameraDoubt.of(found.judged)
+        return Recognized(points, found, evidence, most_distance, doubt)
 
     def _seen(
         self,
@@ -160,14 +156,6 @@ class LandmarkDetector:
             return index
         return index[landmarks.views[index].argsort(descending=True, stable=True)[:NEARBY].sort().values]
 
-    def _miscalibration(self, found: PointFit) -> Miscalibration:
-        """Judge the given intrinsics by those that fit the landmarks best."""
-        free = resect(
-            found.data[found.inliers], found.T_world_camera, found.fit.noise, NOMINAL, GIVEN,
-            self.landmarks.correlation_of(int(found.inliers.sum())), found.evident.prior,
-        )  # fmt: skip
-        return Miscalibration.of(free, self.landmarks, TakenIntrinsics())
-
 
 def _guided_evidence(query: LandmarkQuery, found: PointFit, radius: float, most: float) -> Evidence:
     """Compare the number of matches with that around shifted projections, where all of them are due to chance."""
@@ -195,14 +183,14 @@ def landmark_pose(
     found: PointFit,
     evidence: Evidence,
     landmarks: LandmarkMap,
-    miscalibration: Miscalibration,
+    doubt: CameraDoubt,
     camera: Intrinsics,
 ) -> LandmarkPose:
     """Return a pose by landmarks in the form that ``landmark_verdict`` judges."""
     fit, data, every = found.fit, found.still_data, torch.arange(len(points))
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
-        covariance=fit.covariance + found.evident.doubt + landmarks.pose_covariance,
+        covariance=fit.covariance + found.doubt_of_motion + landmarks.pose_covariance,
         map_covariance=landmarks.pose_covariance,
         noise=fit.noise,
         correspondences=LandmarkMatches(
@@ -222,11 +210,9 @@ def landmark_pose(
         distance=median_distance(data, fit.T_world_rig),
         calibration=GIVEN,
         calibration_deviations=fit.calibration_deviations,
-        slope=fit.slope,
         motion=fit.motion,
-        motion_covariance=fit.covariance_by_motion + found.evident.doubt,
-        miscalibration=miscalibration,
-        calibration_scatter=landmarks.calibration_scatter,
+        motion_covariance=fit.covariance_by_motion + found.doubt_of_motion,
+        doubt=doubt,
         intrinsics=None,
         depth_scale=depth_scale(data, fit.T_world_rig),
     )

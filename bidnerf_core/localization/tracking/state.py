@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -21,10 +21,11 @@ from bidnerf_core.io.files import write_file
 from bidnerf_core.io.json import from_plain, parse_json, to_plain
 from bidnerf_core.io.tensors import read_tensors_and_metadata
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
-from bidnerf_core.localization.search.miscalibration import Miscalibration
+from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt
 from bidnerf_core.localization.tracking.flow import Grey
 from bidnerf_core.localization.tracking.motion import Clock, Motion
 from bidnerf_core.localization.tracking.points import FollowedPoints
+from bidnerf_core.mapping.geometry.calibration import Calibration
 from bidnerf_core.mapping.tensors import Kinds, check_kinds, check_range
 
 
@@ -89,14 +90,12 @@ def after_search(
 
 R = TypeVar("R")
 
-STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 6
+STATE_FORMAT, STATE_VERSION = "bidnerf tracker", 7
 KINDS: Kinds = {
     "points.pixels": ((-1, 2), torch.float32), "points.positions": ((-1, 3), torch.float64),
     "points.deviations": ((-1, 2), torch.float64), "points.directions": ((-1, 3), torch.float64),
-    "points.landmark": ((-1,), torch.int64), "miscalibration.alternative_probability": ((), torch.float64),
-} | {
-    f"miscalibration.{name}": ((4,), torch.float64)
-    for name in ("apparent", "noise", "probability", "unresolved", "alternative")
+    "points.landmark": ((-1,), torch.int64), "doubt.covariance": ((6, 6), torch.float64),
+    "doubt.other": ((5,), torch.float64), "doubt.numbers": ((3,), torch.float64),
 }  # fmt: skip
 MOTION_KINDS: Kinds = {
     "motion.rotation": ((3, 3), torch.float64), "motion.translation": ((3,), torch.float64),
@@ -120,8 +119,7 @@ class TrackerState:
     sought: int = 0  # number of points when they were last sought
     age: int = 0  # frames since then
     usual_distance: float = float("inf")  # largest squared distance between the descriptors of a match
-    miscalibration: Miscalibration = field(default_factory=Miscalibration.unknown)
-    calibrated: int | None = None  # the frame (of ``frames``) in which the intrinsics were last checked
+    doubt: CameraDoubt = field(default_factory=CameraDoubt)  # about the intrinsics
     camera: CorrectedCamera | None = None  # found by searches; None while the given intrinsics are taken
     noise: float = 1.0  # pixels: of the points in the last image
     moves: bool = False  # whether the camera moved while the rows of the last image were exposed
@@ -144,7 +142,6 @@ class StoredNumbers:
     waited: float
     sought: int
     age: int
-    calibrated: int | None
     noise: float
     moves: bool
     usual_distance: float | None  # None for infinity, which JSON does not have
@@ -172,7 +169,7 @@ class StoredNumbers:
 
 def save_state(path: Path, state: TrackerState, key: str) -> None:
     """Write a state as safetensors, atomically; ``key`` identifies the map."""
-    tensors = _tensors_of("points", state.points) | _tensors_of("miscalibration", state.miscalibration)
+    tensors = _tensors_of("points", state.points) | _doubt_tensors(state.doubt)
     if state.image is not None:
         tensors["image"] = torch.from_numpy(state.image)
     if state.motion is not None:
@@ -222,7 +219,7 @@ def _state(numbers: StoredNumbers, tensors: dict[str, Tensor]) -> TrackerState:
         del values["usual_distance"]
     return TrackerState(
         **values, points=_record(FollowedPoints, "points", tensors),
-        miscalibration=_record(Miscalibration, "miscalibration", tensors),
+        doubt=_doubt(tensors),
         image=tensors["image"].numpy() if "image" in tensors else None,
     )  # fmt: skip
 
@@ -245,6 +242,19 @@ def _check_tensors(tensors: dict[str, Tensor], moving: bool) -> None:
         raise ValueError("the pose of the motion is not rigid")
     if any(bool((tensors[f"motion.{name}"].diagonal() < 0).any()) for name in ("noise", "bias")):
         raise ValueError("a variance of the motion is negative")
+
+
+def _doubt_tensors(doubt: CameraDoubt) -> dict[str, Tensor]:
+    numbers = [doubt.wrong, doubt.expected_shift, float(doubt.other_is_known)]
+    found = {"numbers": numbers, "other": astuple(doubt.other)}
+    tensors = {f"doubt.{name}": torch.tensor(value, dtype=torch.float64) for name, value in found.items()}
+    return tensors | {"doubt.covariance": doubt.covariance}
+
+
+def _doubt(tensors: dict[str, Tensor]) -> CameraDoubt:
+    wrong, shift, known = tensors["doubt.numbers"].tolist()
+    other = Calibration(*tensors["doubt.other"].tolist())
+    return CameraDoubt(wrong, shift, tensors["doubt.covariance"], other, bool(known))
 
 
 def _tensors_of(name: str, record: Any) -> dict[str, Tensor]:

@@ -13,6 +13,8 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.errors import enumeration
 
 PRINCIPAL_POINT = "a principal point "
+STRETCH_TOLERANCE = 0.02
+"""Largest stretch, as a logarithm, that errors of lenses and landmarks bring about; with a larger one, an image was resized."""
 
 
 @dataclass(frozen=True)
@@ -23,20 +25,29 @@ class Calibration:
     shift_u: float = 0.0  # of the principal point, as a share of the given focal length
     shift_v: float = 0.0
     radial: float = 0.0  # first coefficient of radial distortion, added to the given distortion
+    log_stretch: float = (
+        0.0  # logarithm of the ratio of fx to fy over that of the given ones: resized to another shape
+    )
 
     @property
     def focal_factor(self) -> float:
-        """Ratio of the true to the given focal length."""
+        """Ratio of the true to the given focal length; of a stretched image, the geometric mean across and down."""
         return math.exp(self.log_focal)
+
+    @property
+    def across_and_down(self) -> Float[Tensor, "2"]:
+        """Ratios of the true to the given focal lengths, across and down the image."""
+        logarithms = (self.log_focal + 0.5 * self.log_stretch, self.log_focal - 0.5 * self.log_stretch)
+        return torch.tensor(logarithms, dtype=torch.float64).exp()
 
     def applied(self, given: Intrinsics) -> Intrinsics:
         """Return the corrected intrinsics; the given ones if there is nothing to correct."""
         if self == GIVEN:
             return given
         k1, *others = given.distortion or (0.0, 0.0, 0.0, 0.0)
-        factor = self.focal_factor
+        across, down = self.across_and_down.tolist()
         return replace(
-            given, fx=given.fx * factor, fy=given.fy * factor, cx=given.cx + self.shift_u * given.fx,
+            given, fx=given.fx * across, fy=given.fy * down, cx=given.cx + self.shift_u * given.fx,
             cy=given.cy + self.shift_v * given.fy, distortion=(k1 + self.radial, *others),
         )  # fmt: skip
 
@@ -44,15 +55,31 @@ class Calibration:
         """Return where points on the plane z = 1 appear: pixels from the given principal point, at the given focal length."""
         bent = flat * (1 + self.radial * flat.square().sum(-1, keepdim=True))
         shift = torch.tensor([self.shift_u, self.shift_v], dtype=flat.dtype)
-        return (bent * self.focal_factor + shift) * focal
+        return (bent * self.across_and_down.to(flat.dtype) + shift) * focal
 
     def undistorted(self, image: Float[Tensor, "m 2"], focal: Float[Tensor, "m"]) -> Float[Tensor, "m 2"]:
         """Return corrected observations on the plane z = 1, for observations made with the given intrinsics."""
-        seen = (image - torch.tensor([self.shift_u, self.shift_v], dtype=image.dtype)) / self.focal_factor
+        shift = torch.tensor([self.shift_u, self.shift_v], dtype=image.dtype)
+        seen = (image - shift) / self.across_and_down.to(image.dtype)
         flat = seen
         for _ in range(8):  # fixed-point iteration as in OpenCV's undistortPoints
             flat = seen / (1 + self.radial * flat.square().sum(-1, keepdim=True))
         return flat
+
+    @property
+    def is_stretched(self) -> bool:
+        """Whether the image was resized to another aspect ratio, which its intrinsics do not reflect."""
+        return abs(self.log_stretch) > STRETCH_TOLERANCE
+
+    @property
+    def _focal_beside_stretch(self) -> float:
+        """What a stretch leaves of the change of the focal length (logarithm).
+
+        An image that was resized in one direction keeps its focal length in the other, so the least change is the most probable.
+        """
+        if not self.is_stretched:
+            return self.log_focal
+        return min((self.log_focal + share * self.log_stretch for share in (0, -0.5, 0.5)), key=abs)
 
     @property
     def sentence(self) -> str:
@@ -66,60 +93,39 @@ class Calibration:
     @property
     def considerable(self) -> list[str]:
         """The parts of the correction that are larger than errors of a good calibration, in words."""
-        sizes = torch.tensor(astuple(self), dtype=torch.float64).abs() / CALIBRATED.deviations
-        large = (sizes > 2).tolist()
+        values = [self._focal_beside_stretch, *astuple(self)[1:]]
+        sizes = torch.tensor(values, dtype=torch.float64).abs() / CALIBRATED.deviations
+        large = [*(sizes[:4] > 2).tolist(), self.is_stretched]
         found = [text for text, is_large in zip(self.parts, large, strict=True) if is_large]
         if large[1] and large[2]:  # one principal point
             down = found.pop(found.index(self.parts[2]))
             found[found.index(self.parts[1])] += f" and {down.removeprefix(PRINCIPAL_POINT)}"
-        return found
+        return found[-1:] + found[:-1] if large[4] else found
 
     @property
-    def parts(self) -> tuple[str, str, str, str]:
+    def parts(self) -> tuple[str, str, str, str, str]:
         """Each part of the correction in words, in the order of the fields."""
-        longer, right, down, higher = (
+        longer, right, down, higher, wider = (
             word if value >= 0 else opposite
             for value, word, opposite in (
-                (self.log_focal, "longer", "shorter"),
+                (self._focal_beside_stretch, "longer", "shorter"),
                 (self.shift_u, "right", "left"),
                 (self.shift_v, "down", "up"),
                 (self.radial, "higher", "lower"),
+                (self.log_stretch, "wider", "narrower"),
             )
         )
         return (
-            f"a focal length {abs(self.focal_factor - 1):.1%} {longer}",
+            f"a focal length {abs(math.exp(self._focal_beside_stretch) - 1):.1%} {longer}",
             f"{PRINCIPAL_POINT}{abs(self.shift_u):.1%} of the focal length further {right}",
             f"{PRINCIPAL_POINT}{abs(self.shift_v):.1%} of the focal length further {down}",
             f"a radial distortion {abs(self.radial):.3f} {higher}",
+            f"an image {abs(math.exp(self.log_stretch) - 1):.0%} {wider}",
         )
 
 
 GIVEN = Calibration()
 """Intrinsics as they are given."""
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Factors of the given focal lengths: the image was resized to another shape, which its intrinsics do not reflect."""
-
-    across: float = 1.0
-    down: float = 1.0
-
-    def applied(self, given: Intrinsics) -> Intrinsics:
-        """Return the intrinsics of the stretched image."""
-        return replace(given, fx=given.fx * self.across, fy=given.fy * self.down)
-
-    def sentence(self, calibration: Calibration) -> str:
-        """Return in words how a camera differs from the given one if its ``calibration`` is corrected too."""
-        factor = self.across / self.down
-        if factor == 1:
-            return calibration.sentence
-        how = f"{abs(factor - 1):.0%} {'wider' if factor > 1 else 'narrower'}"
-        return f"{enumeration([f'an image {how}', *calibration.considerable])} than given"
-
-
-UNSTRETCHED = Stretch()
-"""No stretch: the shape is the one that the intrinsics state."""
 
 
 @dataclass(frozen=True)
@@ -129,28 +135,30 @@ class CalibrationPrior:
     log_focal: float = 0.0
     shift: float = 0.0
     radial: float = 0.0
+    stretch: float = 0.0
 
     @property
-    def deviations(self) -> Float[Tensor, "4"]:
+    def deviations(self) -> Float[Tensor, "5"]:
         """The standard deviations in the order of the fields of ``Calibration``."""
-        return torch.tensor([self.log_focal, self.shift, self.shift, self.radial], dtype=torch.float64)
+        parts = [self.log_focal, self.shift, self.shift, self.radial, self.stretch]
+        return torch.tensor(parts, dtype=torch.float64)
 
 
 FIXED = CalibrationPrior()
 """Intrinsics that are not estimated."""
-CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002)
+CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002, stretch=0.001)
 """Intrinsics from a good calibration."""
-USUAL, USUALLY = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01), 0.35
-"""Standard deviations of intrinsics as many devices state them, and the share of cameras with such intrinsics: they belong to
-another unit of the model, or to another focus and temperature.
-"""
-DOUBTED = CalibrationPrior(log_focal=0.005, shift=0.005, radial=0.005)
-"""Intrinsics that are right as far as is known, of a camera whose other intrinsics are wrong."""
-MISTAKEN, MISTAKES = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05), 0.05
-"""Standard deviations of intrinsics that are wrong, and the share of cameras with such intrinsics."""
-CROPPED, CROPS = CalibrationPrior(log_focal=DOUBTED.log_focal, shift=0.1, radial=DOUBTED.radial), 0.02
-"""Standard deviations of intrinsics that take the middle of a cropped image for its principal point, and their share."""
+USUALLY, MISTAKES, CROPS = 0.35, 0.05, 0.02
+"""Shares of cameras whose stated intrinsics are as inexact as usual, wrong, and those of a larger image; others are calibrated."""
+USUAL = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01, stretch=0.001)
+"""Intrinsics as many devices state them: of another unit of the model, or at another focus and temperature."""
+MISTAKEN = CalibrationPrior(log_focal=0.05, shift=0.02, radial=0.05, stretch=0.001)
+"""Intrinsics that are wrong."""
+CROPPED = replace(USUAL, shift=0.1)
+"""Intrinsics that take the middle of a cropped image for its principal point."""
 NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
 """Intrinsics from EXIF or a field of view, without distortion."""
-ANY = CalibrationPrior(log_focal=NOMINAL.log_focal, shift=CROPPED.shift, radial=NOMINAL.radial)
+ANY = replace(NOMINAL, shift=CROPPED.shift)
 """Intrinsics of which nothing is known except that the lens has the usual distortion; the image may be a crop."""
+STRETCHED = replace(ANY, stretch=ANY.log_focal)
+"""The same for an image that may have been resized to another aspect ratio."""

@@ -101,7 +101,7 @@ class State:
     rotation: Array  # (3, 3) R_world_rig
     position: Array  # (3,) metres
     camera: (
-        Array  # (10,) calibration in the order of ``Calibration``, and motion from the first row to the last
+        Array  # (11,) calibration in the order of ``Calibration``, and motion from the first row to the last
     )
 
     @staticmethod
@@ -111,11 +111,11 @@ class State:
 
     @property
     def calibration(self) -> Calibration:
-        return Calibration(*self.camera[:4].tolist())
+        return Calibration(*self.camera[:5].tolist())
 
     @property
     def motion(self) -> Float[Tensor, "6"]:
-        return torch.from_numpy(self.camera[4:].copy())
+        return torch.from_numpy(self.camera[5:].copy())
 
     def retracted(self, step: Array, free: Array) -> State:
         """Return the state after a step of the pose and of the ``free`` ones among the parameters of the camera."""
@@ -160,27 +160,31 @@ class ReprojectionErrors:
     def linearized(self, state: State, free: Array) -> LinearizedErrors:
         """Return the errors at a state, and their Jacobian with respect to the pose and the camera's ``free`` parameters."""
         rig = (self._points - state.position) @ state.rotation
-        motion = state.camera[4:]
+        motion = state.camera[5:]
         if motion.any():
             rig = moved_array(rig, self._exposure_times, motion)
         turned = np.einsum("mij,mj->mi", self._rotation, rig) if self._turned else rig
         seen, focal = projected(turned + self._translation), self._focal[:, None]
         log_focal, shift, radial = state.camera[0], state.camera[1:3], state.camera[3]
+        half = 0.5 * state.camera[4]  # of the logarithm of the stretch
+        stretch = np.exp([half, -half])
         bend = radial * (seen.flat**2).sum(1, keepdims=True)
-        bent = seen.flat * (1 + bend) * focal * math.exp(log_focal)
+        bent = seen.flat * (1 + bend) * focal * math.exp(log_focal) * stretch
         by_point = seen.by_point(self._focal * math.exp(log_focal))
         if radial:
             across = 2 * radial * seen.flat[:, :, None] * seen.flat[:, None]
             by_point = (np.eye(2) * (1 + bend)[..., None] + across) @ by_point
+        by_point = by_point * stretch[:, None]
         by_rig = by_point @ self._rotation if self._turned else by_point
         by_pose = by_update(by_rig, rig)
         off = bent + focal * shift - self._observed
         if not len(free):
             return LinearizedErrors(state, seen.front, off, by_pose)
         by_shift = np.eye(2)[..., None] * self._focal
-        distorted = seen.flat * (seen.flat**2).sum(1, keepdims=True) * focal * math.exp(log_focal)
+        distorted = seen.flat * (seen.flat**2).sum(1, keepdims=True) * focal * math.exp(log_focal) * stretch
         by_motion = np.moveaxis(by_pose * self._exposure_times[:, None, None], -1, 0)
-        by_camera = [bent, by_shift[0].T, by_shift[1].T, distorted, *by_motion]
+        by_stretch = bent * np.array([0.5, -0.5])
+        by_camera = [bent, by_shift[0].T, by_shift[1].T, distorted, by_stretch, *by_motion]
         jacobian = np.concatenate([by_pose, np.stack([by_camera[i] for i in free], axis=-1)], axis=-1)
         return LinearizedErrors(state, seen.front, off, jacobian)
 

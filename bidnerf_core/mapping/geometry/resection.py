@@ -47,7 +47,7 @@ class ReprojectionFit:
     noise: float  # pixels: robust standard deviation of a residual along each axis
     # Of the right update (translation, rotation), with the uncertainty of the calibration and of the motion.
     covariance: Float[Tensor, "6 6"]
-    calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
+    calibration_deviations: Float[Tensor, "5"]  # standard deviations, in the order of ``Calibration``
     minimum: Minimum
 
     @cached_property
@@ -63,7 +63,7 @@ class ReprojectionFit:
         return torch.from_numpy(self.minimum.system.inverse_curvature[first:, first:].copy())
 
     @cached_property
-    def slope(self) -> Float[Tensor, "6 4"]:
+    def slope(self) -> Float[Tensor, "6 5"]:
         """The derivative of the pose (right update) with respect to the calibration, with the best motion if it is unknown."""
         return self.minimum.slope(self.noise)
 
@@ -89,21 +89,21 @@ class Minimum:
     system: RobustEquations
     state: State
     correlation: float
-    deviations: Array  # (10,) of the priors of the calibration and the motion
+    deviations: Array  # (11,) of the priors of the calibration and the motion
 
     @property
     def first_of_motion(self) -> int:
         """The number of the first unknown that belongs to the motion."""
-        return 6 + int(np.count_nonzero(self.deviations[:4]))
+        return 6 + int(np.count_nonzero(self.deviations[:5]))
 
-    def slope(self, noise: float) -> Float[Tensor, "6 4"]:
-        moving = 4 + self.deviations[4:].nonzero()[0]
-        free = np.concatenate([np.arange(4), moving])
+    def slope(self, noise: float) -> Float[Tensor, "6 5"]:
+        moving = 5 + self.deviations[5:].nonzero()[0]
+        free = np.concatenate([np.arange(5), moving])
         system = self.errors.system(self.errors.linearized(self.state, free), noise)
         system = system.weighted(1 / self.correlation)
         hessian = system.with_prior(self.state.camera[moving], self.deviations[moving]).hessian
-        follows = np.concatenate([np.arange(6), np.arange(10, len(hessian))])
-        by_calibration = hessian[follows[:, None], np.arange(6, 10)]
+        follows = np.concatenate([np.arange(6), np.arange(11, len(hessian))])
+        by_calibration = hessian[follows[:, None], np.arange(6, 11)]
         return torch.from_numpy(
             -damped_solution(hessian[follows[:, None], follows], 1e-9, by_calibration)[:6]
         )
@@ -127,13 +127,37 @@ def resect(
     """
     errors = ReprojectionErrors(data, start)
     deviations = torch.cat([prior.deviations, motion.deviations]).numpy()
+    here, system, noise = minimized(errors, State.of(start, calibration), deviations, noise, correlation)
+    free = torch.from_numpy(deviations.nonzero()[0])
+    state, covariance = here.state, torch.from_numpy(system.covariance)
+    of_calibration = covariance.new_zeros(11)
+    of_calibration[free] = covariance.diagonal()[6:].clamp(min=0).sqrt()
+    return ReprojectionFit(
+        state.pose(), state.calibration, state.motion, noise, covariance[:6, :6].clone(), of_calibration[:5].clone(),
+        Minimum(errors, system, state, correlation, deviations),
+    )  # fmt: skip
+
+
+def minimized(
+    errors: ReprojectionErrors,
+    start: State,
+    deviations: Array,
+    noise: float,
+    correlation: float = 1.0,
+    known_noise: bool = False,
+) -> tuple[LinearizedErrors, RobustEquations, float]:
+    """Minimize the robust cost with a prior about zero on the parameters of the camera.
+
+    Returns the errors at the minimum, the equations there with the prior, and the noise (pixels). ``deviations`` (11,): those of
+    the prior; parameters with 0 stay where ``start`` has them. Unless the noise is known, it is estimated too, as in ``resect``.
+    """
     free = deviations.nonzero()[0]
 
     def equations(here: LinearizedErrors, noise: float) -> RobustEquations:
         system = errors.system(here, noise).weighted(1 / correlation)
         return system.with_prior(here.state.camera[free], deviations[free])
 
-    here = errors.linearized(State.of(start, calibration), free)
+    here = errors.linearized(start, free)
     system, damping = equations(here, noise), 1e-6
     for _ in range(RESECTION_STEPS):
         step = -damped_solution(system.hessian, damping, system.gradient)
@@ -146,20 +170,13 @@ def resect(
                 break
             continue
         here, system, damping = moved, tried, damping / 10
-        better = max(LEAST_NOISE, noise * tried.spread)
-        settled = abs(better / noise - 1) < NOISE_TOLERANCE
-        if not settled:
+        better = noise if known_noise else max(LEAST_NOISE, noise * tried.spread)
+        if abs(better / noise - 1) >= NOISE_TOLERANCE:
             noise = better
             system = equations(here, noise)
         elif size < SMALL_STEP:
             break
-    state, covariance = here.state, torch.from_numpy(system.covariance)
-    of_calibration = covariance.new_zeros(10)
-    of_calibration[torch.from_numpy(free)] = covariance.diagonal()[6:].clamp(min=0).sqrt()
-    return ReprojectionFit(
-        state.pose(), state.calibration, state.motion, noise, covariance[:6, :6].clone(), of_calibration[:4].clone(),
-        Minimum(errors, system, state, correlation, deviations),
-    )  # fmt: skip
+    return here, system, noise
 
 
 def log_likelihood_ratio(
@@ -174,27 +191,6 @@ def log_likelihood_ratio(
     errors = ReprojectionErrors(data, better.T_world_rig)
     costs = [_cost(errors, each, better.noise) for each in (other, fit)]
     return (costs[0] - costs[1]) / correlation
-
-
-def log_motion_evidence(
-    data: ObservedPoints,
-    moving: ReprojectionFit,
-    still: ReprojectionFit,
-    motion: MotionPrior,
-    correlation: float,
-) -> float:
-    """Return the logarithm of the Bayes factor of a motion against none."""
-    return log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
-
-
-def log_likelihood(
-    data: ObservedPoints, fit: ReprojectionFit, noise: float, correlation: float = 1.0
-) -> float:
-    """Return the logarithm of the likelihood of the observations with a fit, up to a constant.
-
-    It compares fits whose cameras differ, and with them the ``data``. ``noise`` (pixels) is that of the better fit.
-    """
-    return -_cost(ReprojectionErrors(data, fit.T_world_rig), fit, noise) / correlation
 
 
 def _cost(errors: ReprojectionErrors, fit: ReprojectionFit, noise: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,17 +10,19 @@ import torch
 from bidnerf_core.errors import InputError
 from bidnerf_core.frames.frame import View
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.far_cameras import better_camera, with_far_camera
+from bidnerf_core.localization.landmarks.guided_refinement import (
+    agreeing_with,
+    confirmed,
+    refined_pose,
+    visible_and_matching,
+)
+from bidnerf_core.localization.landmarks.landmark_evidence import described, log10_agreement
+from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_images
-from bidnerf_core.localization.search.guided_refinement import confirmed, refined_pose, visible_and_matching
-from bidnerf_core.localization.search.landmark_evidence import described, log10_agreement
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose
-from bidnerf_core.localization.search.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.matching import LandmarkMatcher
-from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
-from bidnerf_core.localization.search.other_camera import with_other_camera
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
-from bidnerf_core.localization.search.resized_image import with_resized_map_camera
-from bidnerf_core.localization.search.stopwatch import Stopwatch
 from bidnerf_core.localization.search.twins import twin_of
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
@@ -46,36 +48,38 @@ def propose(
     features: Features | None = None,
     seed: int = 0,
     prior: CalibrationPrior | None = None,
-    evidence: CameraEvidence = NO_EVIDENCE,
     seek_twin: bool = False,
     moving: bool = True,
 ) -> LandmarkPose | None:
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
     ``prior``: how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal length
-    is approximate. ``features`` finds the keypoints, by default the detector of the map. One correction is estimated for all views; those of different cameras are taken as given. ``evidence``: what
-    else is known about the camera. ``seek_twin``: whether to look for another place that the images may show. ``moving``:
+    is approximate. ``features`` finds the keypoints, by default the detector of the map. One correction is estimated for all views; those of different cameras are taken as given.
+    ``seek_twin``: whether to look for another place that the images may show. ``moving``:
     whether to estimate how the camera moved while the rows of its image were exposed, where that is evident.
     Raises ``InputError`` if there is no view.
     """
     if not views:
         raise InputError("nothing to localize: expected at least one view")
     prior = _calibration_prior(views) if prior is None else prior
-    clock = Stopwatch()
-    query = LandmarkQuery(
-        query_images(views, features or matcher.features), matcher.landmarks, prior, evidence, moving
-    )
-    clock.lap("descriptors")
-    matches, first = _first_pose(query, matcher, seed, clock)
+    query = LandmarkQuery(query_images(views, features or matcher.features), matcher.landmarks, prior, moving)
+    matches, first = _first_pose(query, matcher, seed)
     if first is None:
         return None
-    answer = refined_pose(query, matches[first.inliers], first)
-    clock.lap("refinement")
-    found = described(query, matches, answer, clock.seconds)
-    clock.lap("assessment")
-    found = with_other_camera(query, matches, found, clock)
-    found = with_resized_map_camera(query, matches, found, clock)
-    return _with_twin(query, matcher, found, clock) if seek_twin else found
+    answer = refined_pose(query, matches, first)
+    found = with_far_camera(query, matches, described(answer))
+    return _with_twin(query, matcher, found) if seek_twin else found
+
+
+def updated(found: LandmarkPose, log_odds: Mapping[tuple[str, ...], float]) -> LandmarkPose:
+    """Return a pose with the log odds of intrinsics by further evidence, see ``Posterior.updated``.
+
+    It is refined anew where other intrinsics have become the most probable; nothing is searched again.
+    """
+    if found.guided is None:
+        raise ValueError("landmarks that were followed have no posterior to add evidence to")
+    again = described(found.guided.updated(log_odds))
+    return replace(again, better_camera=found.better_camera, twin=found.twin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,39 +103,40 @@ def confirm(
     T_world_camera: SE3,
     features: Features | None = None,
     seek_twin: bool = False,
+    rival: SE3 | None = None,
 ) -> Confirmation:
     """Match the landmarks near their projections at a pose of the last of ``views``, and refine it.
 
-    ``seek_twin`` is as in ``propose``.
+    ``seek_twin`` is as in ``propose``. ``rival``: another pose; what matches there does not show that the camera is another.
     """
-    clock = Stopwatch()
     query = LandmarkQuery(
         query_images(views, features or matcher.features), matcher.landmarks, _calibration_prior(views)
     )
-    clock.lap("descriptors")
     visible, matches, chance = visible_and_matching(query, T_world_camera)
-    answer = confirmed(query, T_world_camera)
-    clock.lap("refinement")
+    # Matches that were not sought near the pose are the evidence for it, and reveal another camera.
+    by_descriptors = unguided_matches(query.images, matcher, STRONGEST)
+    if rival is not None:
+        by_descriptors = by_descriptors[~agreeing_with(query, by_descriptors, rival)]
+    answer = confirmed(query, by_descriptors, T_world_camera)
     if answer is None:
         return Confirmation(None, visible, matches, chance)
-    # Matches that were not sought near the pose are the evidence for it, and reveal another camera.
-    pose = described(query, unguided_matches(query.images, matcher, STRONGEST), answer, clock.seconds)
+    pose = described(answer)
+    better = better_camera(query, by_descriptors, pose)
     agreeing = int((torch.linalg.vector_norm(pose.residuals, dim=-1) <= query.threshold).sum())
-    pose = replace(pose, matches=len(pose.correspondences), agreeing=agreeing)
-    clock.lap("assessment")
-    pose = _with_twin(query, matcher, pose, clock) if seek_twin else pose
+    pose = replace(
+        pose, matches=len(pose.correspondences), agreeing=agreeing,
+        better_camera=None if better is None else better.calibration,
+    )  # fmt: skip
+    pose = _with_twin(query, matcher, pose) if seek_twin else pose
     return Confirmation(pose, visible, matches, chance)
 
 
-def _with_twin(
-    query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose, clock: Stopwatch
-) -> LandmarkPose:
+def _with_twin(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> LandmarkPose:
     """Return a pose with its twin, if there is one, sought with the intrinsics that were taken or estimated."""
     cameras = [found.intrinsics_of(image.intrinsics) or image.intrinsics for image in query.images]
-    seen = replace(query.seen_by(cameras), prior=FIXED, evidence=NO_EVIDENCE)
+    seen = replace(query.seen_by(cameras), prior=FIXED)
     twin = twin_of(seen, matcher, found)
-    clock.lap("twin")
-    return found.with_twin(twin)
+    return replace(found, twin=twin)
 
 
 def _calibration_prior(views: Sequence[View]) -> CalibrationPrior:
@@ -140,15 +145,13 @@ def _calibration_prior(views: Sequence[View]) -> CalibrationPrior:
 
 
 def _first_pose(
-    query: LandmarkQuery, matcher: LandmarkMatcher, seed: int, clock: Stopwatch
+    query: LandmarkQuery, matcher: LandmarkMatcher, seed: int
 ) -> tuple[LandmarkMatches, Hypothesis | None]:
     """Match the strongest keypoints, then all if those do not give a convincing pose."""
     most = max(len(image.keypoints) for image in query.images)
     for count in (min(STRONGEST, most), most):
         matches = unguided_matches(query.images, matcher, count)
-        clock.lap("matching")
         found = _consensus(query, matches, seed)
-        clock.lap("ransac")
         agreeing = 0 if found is None else int(found.inliers.sum())
         if count == most or log10_agreement(query, matches, agreeing) < CONVINCING:
             break
@@ -159,23 +162,25 @@ def _consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Hyp
     data = query.observed(matches)
     found = sample_consensus(data, matches.view, query.threshold, seed)
     if query.prior.log_focal > APPROXIMATE:
-        others = (focal_consensus(data, query.threshold, seed), _map_camera_consensus(query, matches, seed))
-        hypotheses = [h for h in (found, *others) if h is not None]
+        free = focal_consensus(data, query.threshold, seed)
+        hypotheses = [h for h in (found, free, *_map_camera_consensus(query, matches, seed)) if h is not None]
         found = max(hypotheses, key=lambda h: int(h.inliers.sum()), default=None)
     if found is None or int(found.inliers.sum()) < LEAST_INLIERS:
         return None
     return found
 
 
-def _map_camera_consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> Hypothesis | None:
-    """Return the hypothesis that most matches agree with if the map's camera took the images; None where that is improbable.
+def _map_camera_consensus(query: LandmarkQuery, matches: LandmarkMatches, seed: int) -> list[Hypothesis]:
+    """Return the hypotheses that most matches agree with if one of the map's cameras took the images, as far as that is probable.
 
     With a known focal length, three correct matches make a hypothesis instead of four, and far more are tried in the same time.
     """
-    camera = query.map_camera
-    if camera is None or not camera.is_near(query.prior):
-        return None
-    data = query.seen_by([camera.intrinsics] * len(query.images)).observed(matches)
-    found = sample_consensus(data, matches.view, query.threshold, seed)
-    focal = Calibration(log_focal=camera.calibration.log_focal)
-    return None if found is None else replace(found, calibration=focal)
+    found = []
+    for hypothesis in query.hypotheses:
+        if hypothesis.camera is None:
+            continue
+        data = query.seen_by([hypothesis.camera] * len(query.images)).observed(matches)
+        sampled = sample_consensus(data, matches.view, query.threshold, seed)
+        if sampled is not None:
+            found.append(replace(sampled, calibration=Calibration(log_focal=float(hypothesis.mean[0]))))
+    return found

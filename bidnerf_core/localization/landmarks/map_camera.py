@@ -17,18 +17,20 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics, cameras_at_size, centre_crop_cameras, stretched_cameras
 from bidnerf_core.mapping.geometry.calibration import (
     CALIBRATED,
-    GIVEN,
+    CROPPED,
+    CROPS,
     MISTAKEN,
     MISTAKES,
+    STRETCH_TOLERANCE,
+    STRETCHED,
     USUAL,
     USUALLY,
-    Calibration,
     CalibrationPrior,
 )
 
-MOST_CAMERAS = 9
+MAX_CAMERAS = 9
 """Largest number of a map's cameras, evenly chosen by focal length, that are compared with the query's."""
-MOST_RESIDUAL = 0.002
+MAX_RESIDUAL = 0.002
 """Root mean square difference, as a share of the image's width, above which a correction does not describe another camera."""
 UNUSUAL = 0.03
 """Share of the map's images up to which an agreeing camera is taken for an extreme of one that focuses, not for another one."""
@@ -39,11 +41,11 @@ DISTINGUISHABLE_DEVIATIONS = 2.0
 SAME_CAMERA = 0.9
 """Share of queries with nearly the map's intrinsics that are from the map's camera."""
 SAME_LOG_ODDS = math.log(SAME_CAMERA / (1 - SAME_CAMERA))
-OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1)
+OTHER_CAMERA = CalibrationPrior(log_focal=0.08, shift=0.03, radial=0.1, stretch=STRETCH_TOLERANCE / 1.5)
 """Standard deviations of the differences between the intrinsics of different cameras with images of the same shape."""
-ALIKE, ALIKE_SHAPES = CalibrationPrior(log_focal=0.04, shift=0.04), 0.02
-"""Largest differences between intrinsics that were estimated from an image and those of the map's camera, if it took the image."""
-MOST_DEVIATIONS = 1.5
+RESIZED = 0.05
+"""Share of resized images among those whose pixels have another aspect ratio than the map's images at their size would have."""
+MAX_DEVIATIONS = 1.5
 """Intrinsics that differ by more than this multiple of ``OTHER_CAMERA``, or of ``NOMINAL`` where the focal length is
 approximate, are certainly those of another camera.
 """
@@ -53,73 +55,72 @@ approximate, are certainly those of another camera.
 class MapCamera:
     """The intrinsics of a map's images, relative to those that a query states."""
 
-    correction: Float[Tensor, "4"]  # of the stated intrinsics, in the order of ``Calibration``
-    deviations: Float[Tensor, "4"]  # of single images of the map, errors of a good calibration included
+    correction: Float[Tensor, "5"]  # of the stated intrinsics, in the order of ``Calibration``
+    deviations: Float[Tensor, "5"]  # of single images of the map, errors of a good calibration included
     intrinsics: Intrinsics  # at the resolution of the query
 
     @property
-    def differs(self) -> Bool[Tensor, "4"]:
+    def differs(self) -> Bool[Tensor, "5"]:
         """Which parameters of the intrinsics differ."""
         return self.correction.abs() > DISTINGUISHABLE_DEVIATIONS * self.deviations
-
-    @property
-    def calibration(self) -> Calibration:
-        """The correction of the stated intrinsics."""
-        return Calibration(*self.correction.tolist())
 
     @property
     def log_odds(self) -> float:
         """Prior log odds that the map's intrinsics are right rather than the stated ones.
 
-        Either the query is from the map's camera and misstates it, or it is from another camera with similar intrinsics.
+        Either the query is from the map's camera and misstates it, or it is from another camera with similar intrinsics. Where the
+        shapes of the pixels differ, the image was resized, or it is from another camera.
         """
-        if not self.is_near(OTHER_CAMERA):
+        if self.is_near(OTHER_CAMERA):
+            shares = ((USUAL, USUALLY), (MISTAKEN, MISTAKES), (CROPPED, CROPS))
+            misstated = torch.stack([self._log_density(prior) + math.log(share) for prior, share in shares])
+            return float(misstated.logsumexp(0) - self._log_density(OTHER_CAMERA)) + SAME_LOG_ODDS
+        if not self.is_near(STRETCHED):
             return -math.inf
-        misstated = torch.logaddexp(
-            self._log_density(USUAL) + math.log(USUALLY), self._log_density(MISTAKEN) + math.log(MISTAKES)
-        )
-        return float(misstated - self._log_density(OTHER_CAMERA)) + SAME_LOG_ODDS
+        return math.log(RESIZED / (1 - RESIZED)) if self.is_stretched else -math.inf
+
+    @property
+    def is_stretched(self) -> bool:
+        """Whether the shapes of the pixels differ by more than those of different cameras do."""
+        return abs(float(self.correction[4])) > STRETCH_TOLERANCE
 
     def is_near(self, prior: CalibrationPrior) -> bool:
-        """Return whether the intrinsics differ by no more than ``MOST_DEVIATIONS`` standard deviations of ``prior``."""
-        return bool((self.correction.abs() <= MOST_DEVIATIONS * prior.deviations).all())
+        """Return whether the intrinsics differ by no more than ``MAX_DEVIATIONS`` standard deviations of ``prior``."""
+        return bool((self.correction.abs() <= MAX_DEVIATIONS * prior.deviations).all())
 
     def _log_density(self, prior: CalibrationPrior) -> Float[Tensor, ""]:
-        """Return the logarithm of the density of the parameters that differ, up to a constant."""
-        deviations = prior.deviations
-        return (-0.5 * (self.correction / deviations).square() - deviations.log())[self.differs].sum()
+        """Return the logarithm of the density of the parameters that differ, but for the stretch, up to a constant."""
+        deviations, differs = prior.deviations[:4], self.differs[:4]
+        return (-0.5 * (self.correction[:4] / deviations).square() - deviations.log())[differs].sum()
 
 
-def map_camera(
-    given: Intrinsics, cameras: tuple[Intrinsics, ...], crops: bool = False, near: Calibration = GIVEN
-) -> MapCamera | None:
-    """Return the camera of a map's images of the same shape as those with the ``given`` intrinsics; None if there are none.
+def map_cameras(given: Intrinsics, cameras: tuple[Intrinsics, ...], crops: bool = False) -> list[MapCamera]:
+    """Return the cameras that may have taken an image with the ``given`` intrinsics if its camera is one of the map's.
 
-    It is the one that the given intrinsics agree with or, if that took hardly any of the images, that with the median focal
-    length. None as well if its lens is so different that ``Calibration`` cannot describe the difference.
+    Of the map's cameras with images of one shape, the one that the given intrinsics agree with is taken or, if that took hardly
+    any of the images, that with the median focal length. Cameras whose lens is so different that ``Calibration`` cannot
+    describe the difference are left out.
 
-    A camera that took landscape images alone is turned for a portrait one, to the side that puts its principal point nearest to
-    that of the correction ``near``. With ``crops``, an image of a shape that the map does not have is compared with centre
-    crops of the map's images.
+    A camera that took landscape images alone is turned to either side for a portrait one. An image of a shape that the map does
+    not have is compared with the map's images resized to it and, with ``crops``, with their centre crops.
     """
     groups = cameras_at_size(cameras, given.width, given.height)
-    if crops and not groups:
-        groups = centre_crop_cameras(cameras, given.width, given.height)
+    if not groups:
+        groups = stretched_cameras(cameras, given.width, given.height)
+        groups += centre_crop_cameras(cameras, given.width, given.height) if crops else ()
     known = [_camera_among(given, group) for group in groups]
-    shift = torch.tensor([near.shift_u, near.shift_v], dtype=torch.float64)
-    found = [camera for camera in known if camera is not None]
-    return min(found, key=lambda camera: float((camera.correction[1:3] - shift).norm()), default=None)
+    return [camera for camera in known if camera is not None]
 
 
 @lru_cache(maxsize=64)
 def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCamera | None:
-    """Return the one of ``cameras``, all of images of one size, that ``map_camera`` describes."""
+    """Return the one of ``cameras``, all of images of one size, that ``map_cameras`` describes."""
     alike = list(cameras)
     agreeing = [camera for camera in alike if _agree(given, camera)]
     if len(agreeing) > UNUSUAL * len(alike):
         alike = agreeing[:1]
     alike.sort(key=lambda camera: camera.fx)
-    count = min(len(alike), MOST_CAMERAS)
+    count = min(len(alike), MAX_CAMERAS)
     chosen = [alike[i] for i in torch.linspace(0, len(alike) - 1, count).round().int().tolist()]
     found = [(correction_between(given, camera), camera) for camera in chosen]
     described = [(correction, camera) for correction, camera in found if correction is not None]
@@ -128,25 +129,6 @@ def _camera_among(given: Intrinsics, cameras: tuple[Intrinsics, ...]) -> MapCame
     correction, camera = described[(len(described) - 1) // 2]
     spread = torch.stack([(other - correction).square() for other, _ in described]).mean(0)
     return MapCamera(correction, (CALIBRATED.deviations.square() + spread).sqrt(), camera)
-
-
-def camera_like(
-    fitted: Intrinsics, cameras: tuple[Intrinsics, ...], log_focal_deviation: float = 0.0
-) -> Intrinsics | None:
-    """Return the camera of a map's images that resembles ``fitted`` intrinsics once resized to their image; None if none does.
-
-    ``log_focal_deviation``: standard deviation of the logarithm of their focal length, which was estimated from a single image.
-    """
-
-    def differences(camera: Intrinsics) -> tuple[float, float, float]:
-        across, down = math.log(camera.fx / fitted.fx), math.log(camera.fy / fitted.fy)
-        shift = max(abs(camera.cx - fitted.cx) / fitted.fx, abs(camera.cy - fitted.cy) / fitted.fy)
-        return abs(across + down) / 2, abs(across - down), shift
-
-    limits = (max(ALIKE.log_focal, 2 * log_focal_deviation), ALIKE_SHAPES, ALIKE.shift)
-    resized = [c for group in stretched_cameras(cameras, fitted.width, fitted.height) for c in group]
-    alike = [c for c in resized if all(x <= y for x, y in zip(differences(c), limits, strict=True))]
-    return min(alike, key=differences, default=None)
 
 
 def _agree(a: Intrinsics, b: Intrinsics) -> bool:
@@ -161,7 +143,7 @@ def _agree(a: Intrinsics, b: Intrinsics) -> bool:
     return all(abs(difference) <= DISTINGUISHABLE_DEVIATIONS * deviation for difference, deviation in parts)
 
 
-def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "4"] | None:
+def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "5"] | None:
     """Return the correction of ``given`` intrinsics, in the order of ``Calibration``, that comes closest to ``true`` ones.
 
     It minimizes the squared differences in pixels. None if these remain considerable.
@@ -175,12 +157,17 @@ def correction_between(given: Intrinsics, true: Intrinsics) -> Float[Tensor, "4"
     # between such points to pixels.
     slope = torch.stack([given.unproject(pixels + step)[:, :2] - stated for step in steps], dim=-1)
     bend = real * real.square().sum(-1, keepdim=True)
-    # stated = factor real + shift + factor radial bend, as in ``Calibration.pixels``
-    rows = torch.stack([real, *(step.expand_as(real) for step in steps), bend], dim=-1)
+    # stated = factors real + shift + factors radial bend, as in ``Calibration.pixels``
+    ratio = real.new_tensor([given.fy * true.fx / (given.fx * true.fy), 1.0])
+    bend = bend * (ratio / ratio.prod().sqrt())
+    rows = torch.stack(
+        [*(real * step for step in steps), *(step.expand_as(real) for step in steps), bend], dim=-1
+    )
     rows, target = torch.linalg.solve(slope, rows), torch.linalg.solve(slope, stated[..., None])
-    solved = torch.linalg.lstsq(rows.reshape(-1, 4), target.reshape(-1, 1)).solution
+    solved = torch.linalg.lstsq(rows.reshape(-1, 5), target.reshape(-1, 1)).solution
     left = (rows @ solved - target)[..., 0].norm(dim=-1)
-    factor, shift_u, shift_v, bent = solved[:, 0]
-    if not bool(left.square().mean().sqrt() <= MOST_RESIDUAL * given.width) or float(factor) <= 0:
+    across, down, shift_u, shift_v, bent = solved[:, 0]
+    if not bool(left.square().mean().sqrt() <= MAX_RESIDUAL * given.width) or min(across, down) <= 0:
         return None
-    return torch.stack([factor.log(), shift_u, shift_v, bent / factor])
+    factor = (across * down).sqrt()
+    return torch.stack([factor.log(), shift_u, shift_v, bent / factor, (across / down).log()])

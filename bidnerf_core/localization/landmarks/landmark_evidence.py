@@ -10,11 +10,13 @@ from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.guided_refinement import GuidedPose
+from bidnerf_core.localization.landmarks.hypotheses import Whose
+from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.guided_refinement import GuidedPose
-from bidnerf_core.localization.search.landmark_pose import LandmarkPose, Unguided
-from bidnerf_core.localization.search.landmark_query import LandmarkQuery
+from bidnerf_core.mapping.geometry.calibration import Calibration
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 LEAST_DEPTHS = 6
@@ -23,23 +25,24 @@ CELLS = 8
 """Rows and columns into which an image is divided to see how far the correspondences spread."""
 
 
-def described(
-    query: LandmarkQuery, matches: LandmarkMatches, answer: GuidedPose, seconds: dict[str, float]
-) -> LandmarkPose:
-    """Return a refined pose with the evidence for it; ``matches`` are those by descriptors alone."""
-    fit = answer.fit
-    given = query.observed(matches)
-    query, camera = answer.query, answer.taken.camera
+def described(answer: GuidedPose) -> LandmarkPose:
+    """Return a refined pose with the evidence for it."""
+    query, matches, fit, best = answer.query, answer.matches, answer.fit, answer.best
+    landmarks = query.landmarks
+    seen = answer.seen
     data, by_descriptors = (
-        query.observed(found).without_motion(fit.T_world_rig, fit.motion).corrected(fit.calibration)
+        seen.observed(found).without_motion(fit.T_world_rig, fit.motion).corrected(fit.calibration)
         for found in (answer.correspondences, matches)
     )
     off = by_descriptors.residuals(fit.T_world_rig)
     agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= query.threshold).sum())
+    visible, chance = answer.visible_and_by_chance()
+    doubt_of_motion = answer.posterior.doubt_of_motion
+    is_of_map = best.hypothesis.whose is Whose.MAP
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
-        covariance=fit.covariance + answer.motion_doubt + query.landmarks.pose_covariance,
-        map_covariance=query.landmarks.pose_covariance,
+        covariance=fit.covariance + doubt_of_motion + landmarks.pose_covariance,
+        map_covariance=landmarks.pose_covariance,
         noise=fit.noise,
         correspondences=answer.correspondences,
         residuals=data.residuals(fit.T_world_rig),
@@ -48,23 +51,20 @@ def described(
         matches=len(matches),
         agreeing=agreeing,
         log10_nfa=log10_agreement(query, matches, agreeing),
-        chance=answer.chance,
-        visible=answer.visible,
+        chance=chance,
+        visible=visible,
         keypoints=sum(len(image.keypoints) for image in query.images),
-        noise_ratio=fit.noise / query.landmarks.noise,
+        noise_ratio=fit.noise / landmarks.noise,
         spread=_spread(query, answer.correspondences),
         distance=median_distance(data, fit.T_world_rig),
-        calibration=fit.calibration if camera is None else answer.taken.calibration,
-        intrinsics=None if camera is None else camera.intrinsics,
+        calibration=Calibration(*best.hypothesis.mean.tolist()) if is_of_map else fit.calibration,
+        intrinsics=best.hypothesis.camera,
         calibration_deviations=fit.calibration_deviations,
-        slope=fit.slope,
         motion=fit.motion,
-        motion_covariance=fit.covariance_by_motion + answer.motion_doubt,
-        miscalibration=answer.miscalibration,
-        calibration_scatter=query.landmarks.calibration_scatter,
+        motion_covariance=fit.covariance_by_motion + doubt_of_motion,
+        doubt=CameraDoubt.of(answer.posterior),
         depth_scale=depth_scale(data, fit.T_world_rig),
-        unguided=Unguided(given, query.threshold),
-        seconds=seconds,
+        guided=answer,
     )
 
 

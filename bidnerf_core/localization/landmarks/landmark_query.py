@@ -11,10 +11,10 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.localization.landmarks.hypotheses import Hypothesis, Whose, camera_hypotheses
+from bidnerf_core.localization.landmarks.map_camera import MapCamera, map_cameras
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, QueryImage, observed_points
-from bidnerf_core.localization.search.map_camera import MapCamera, map_camera
-from bidnerf_core.localization.search.miscalibration import NO_EVIDENCE, CameraEvidence
-from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration, CalibrationPrior
+from bidnerf_core.mapping.geometry.calibration import FIXED, CalibrationPrior
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.landmarks.features import paired_squared_distances
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
@@ -30,7 +30,6 @@ class LandmarkQuery:
     images: list[QueryImage]
     landmarks: LandmarkMap
     prior: CalibrationPrior
-    evidence: CameraEvidence = NO_EVIDENCE
     moving: bool = True  # whether the camera of a single image may have moved while its rows were exposed
 
     @property
@@ -44,16 +43,20 @@ class LandmarkQuery:
         return pixel_threshold(self.images[-1].intrinsics)
 
     @property
-    def map_camera(self) -> MapCamera | None:
+    def map_cameras(self) -> list[MapCamera]:
         """The intrinsics of the map's images, if all images of the query state the same."""
-        return self.map_camera_near(GIVEN)
-
-    def map_camera_near(self, estimated: Calibration) -> MapCamera | None:
-        """Return ``map_camera``; if it is turned, an estimated correction decides to which side."""
         given = {image.intrinsics for image in self.images}
         if len(given) > 1:
-            return None
-        return map_camera(given.pop(), self.landmarks.cameras, crops=self.prior.log_focal > 0, near=estimated)
+            return []
+        return map_cameras(given.pop(), self.landmarks.cameras, crops=self.prior != FIXED)
+
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """The hypotheses about the camera. Images of different cameras have the stated intrinsics, as far as these are exact."""
+        every = camera_hypotheses(self.map_cameras, self.prior)
+        if len({image.intrinsics for image in self.images}) == 1:
+            return every
+        return [each for each in every if each.whose is Whose.GIVEN]
 
     def seen_by(self, cameras: Sequence[Intrinsics]) -> LandmarkQuery:
         """Return the query with other intrinsics for each of its images."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -13,11 +11,10 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.covariance import position_deviation
-from bidnerf_core.localization.search.camera_fit import UNSUSPECTED, CameraFit, better_camera
+from bidnerf_core.localization.landmarks.guided_refinement import GuidedPose
+from bidnerf_core.localization.landmarks.hypotheses import Posterior, Whose
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.localization.search.miscalibration import Miscalibration
-from bidnerf_core.mapping.geometry.calibration import GIVEN, UNSTRETCHED, Calibration, Stretch
-from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.calibration import GIVEN, Calibration
 
 ESTIMATED_INFLATION = 3.0
 """Factor on the covariance of poses whose intrinsics were estimated too.
@@ -28,19 +25,36 @@ of 153 such poses lie inside their 95 % bound in the record ``faults_camera``.
 
 
 @dataclass(frozen=True, eq=False)
-class Unguided:
-    """Matches by descriptors alone, before there was a pose."""
-
-    matches: ObservedPoints  # with the given intrinsics
-    limit: float  # pixels: largest residual of one that agrees with a pose
-
-
-@dataclass(frozen=True, eq=False)
 class Twin:
     """Another pose with which about as many landmarks agree."""
 
     T_world_rig: SE3
     share: float  # ratio of its correspondences to those of the pose itself, those by chance left out of both
+
+
+@dataclass(frozen=True, eq=False)
+class CameraDoubt:
+    """What the probabilities of other intrinsics mean for a pose."""
+
+    wrong: float = 0.0  # probability that neither the stated intrinsics nor the map's are right, if one of these was taken
+    expected_shift: float = (
+        0.0  # metres: sum over other intrinsics of their probability times the shift that they bring
+    )
+    covariance: Float[Tensor, "6 6"] = field(default_factory=lambda: torch.zeros((6, 6), dtype=torch.float64))
+    other: Calibration = (
+        GIVEN  # of the intrinsics that contribute most to the expected shift, relative to the stated ones
+    )
+    other_is_known: bool = True  # whether these are the stated ones or the map's
+
+    @staticmethod
+    def of(found: Posterior) -> CameraDoubt:
+        """Return the doubt about the best explanation of a posterior."""
+        taken, other = found.best.hypothesis.whose, found.riskiest
+        return CameraDoubt(
+            0.0 if taken is Whose.ESTIMATED else found.wrong, found.expected_shift, found.doubt_of_camera,
+            GIVEN if other is None else other.calibration,
+            other is None or other.hypothesis.whose is not Whose.ESTIMATED,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,59 +84,35 @@ class LandmarkPose:
     calibration: (
         Calibration  # of the camera: estimated, or that of the map's images if their intrinsics were taken
     )
-    calibration_deviations: Float[Tensor, "4"]  # standard deviations, in the order of ``Calibration``
-    slope: Float[Tensor, "6 4"]  # derivative of the pose (right update) with respect to each of them
+    calibration_deviations: Float[Tensor, "5"]  # standard deviations, in the order of ``Calibration``
     # Of the camera while its rows were exposed, see ``rolling_shutter``; 0 if none is evident.
     motion: Float[Tensor, "6"]
     motion_covariance: Float[Tensor, "6 6"]  # the part of the pose's covariance due to the motion
-    miscalibration: Miscalibration
-    calibration_scatter: Float[Tensor, "4"]  # standard deviations of such estimates in this map
+    doubt: CameraDoubt
     intrinsics: Intrinsics | None  # of the map's images, if these were taken in place of the given ones
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
-    unguided: Unguided | None = None  # what reveals another camera; None for landmarks that were followed
-    has_other_camera: bool = False  # whether far more matches agree with this camera than with the given one
+    # With which far more matches agree, but which no pose could be refined with.
+    better_camera: Calibration | None = None
     twin: Twin | None = None  # if sought and found: another pose with which about as many landmarks agree
-    stretch: Stretch = UNSTRETCHED  # of the given intrinsics; ``calibration`` corrects the stretched ones
-    seconds: dict[str, float] = field(default_factory=dict)  # by stage
-
-    @cached_property
-    def better_camera(self) -> CameraFit | None:
-        """The camera with which far more matches agree; None if there is none, or if it was taken."""
-        if self.has_other_camera or self.unguided is None:
-            return None
-        least = 1.0 if self.estimates_calibration else UNSUSPECTED
-        matches = self.unguided.matches.without_motion(self.T_world_camera, self.motion)
-        return better_camera(matches, self.T_world_camera, self.calibration, self.unguided.limit, least)
-
-    def with_twin(self, twin: Twin | None) -> LandmarkPose:
-        """Return the pose with its twin. What was fitted for ``better_camera`` does not depend on the twin, and is kept."""
-        found = replace(self, twin=twin)
-        if "better_camera" in vars(self):  # a fifth of the time of a query
-            vars(found)["better_camera"] = self.better_camera
-        return found
+    guided: GuidedPose | None = (
+        None  # what evidence about the camera is added to; None for followed landmarks
+    )
 
     @property
     def focal_factor(self) -> float:
         """Ratio of the estimated to the given focal length; of a stretched image, the geometric mean across and down."""
-        return self.calibration.focal_factor * math.sqrt(self.stretch.across * self.stretch.down)
+        return self.calibration.focal_factor
 
     def intrinsics_of(self, given: Intrinsics) -> Intrinsics | None:
         """Return the intrinsics that were taken or estimated for images with the ``given`` ones; None if these were kept."""
         if self.intrinsics is not None:
             return self.intrinsics
-        if self.calibration == GIVEN and self.stretch == UNSTRETCHED:
-            return None
-        return self.calibration.applied(self.stretch.applied(given))
-
-    @property
-    def camera_sentence(self) -> str:
-        """How the camera differs from the given one, in words."""
-        return self.stretch.sentence(self.calibration)
+        return None if self.calibration == GIVEN else self.calibration.applied(given)
 
     @property
     def changes_camera(self) -> bool:
         """Whether the camera differs from the given one by more than errors of a good calibration."""
-        return bool(self.calibration.considerable) or self.stretch != UNSTRETCHED
+        return bool(self.calibration.considerable)
 
     @property
     def estimates_calibration(self) -> bool:
@@ -142,36 +132,17 @@ class LandmarkPose:
     @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:
         """The covariance, including that due to errors of the intrinsics, whether these were taken or estimated."""
-        deviations = (
-            self.calibration_scatter if self.estimates_calibration else self.miscalibration.deviations
-        )
-        by_calibration = self.slope * deviations
-        return self.covariance + by_calibration @ by_calibration.mT
+        return self.covariance + self.doubt.covariance
 
     @property
     def stated_covariance(self) -> Float[Tensor, "6 6"]:
-        """``full_covariance``, enlarged where the intrinsics were estimated too."""
-        return (ESTIMATED_INFLATION if self.estimates_calibration else 1.0) * self.full_covariance
-
-    def with_correction(self, correction: Float[Tensor, "4"]) -> SE3:
-        """Return the pose after a correction of the intrinsics, in the order of ``Calibration``, which moves it."""
-        return self.T_world_camera.retract(self.slope @ correction)
+        """``covariance``, enlarged where the intrinsics were estimated too."""
+        return (ESTIMATED_INFLATION if self.estimates_calibration else 1.0) * self.covariance
 
     @property
-    def alternative_shift(self) -> Float[Tensor, "6"]:
-        """The right update by which the intrinsics that were not taken, given or the map's, would move the pose."""
-        return self.slope @ self.miscalibration.alternative
-
-    @property
-    def unresolved_calibration(self) -> Float[Tensor, "6 6"]:
-        """What usual errors of the intrinsics, as far as this image does not rule them out, add to ``full_covariance``."""
-        if self.estimates_calibration:
-            return torch.zeros_like(self.covariance)
-        judged = self.miscalibration
-        added = (judged.unresolved.square() - judged.deviations.square()).clamp(min=0)
-        shift = self.alternative_shift
-        by_alternative = judged.alternative_probability * torch.outer(shift, shift)
-        return self.slope * added @ self.slope.mT + by_alternative
+    def expected_shift(self) -> float:
+        """How far other intrinsics would move the position, times their probability, as a share of the landmarks' distance."""
+        return self.doubt.expected_shift / self.distance
 
     @property
     def shared_covariance(self) -> Float[Tensor, "6 6"]:

@@ -1,0 +1,185 @@
+"""Cameras so far from the stated one that the image's matches have to be found anew: another focal length, a crop, a resized image.
+
+Matches in one part of the scene, on a single wall say, agree with a wrong pose and wrong intrinsics as well as with the right
+ones. The other matches decide: far more of them agree if the camera is an unknown of the fit.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.guided_refinement import LEAST_GUIDED_MATCHES, refined_pose
+from bidnerf_core.localization.landmarks.landmark_evidence import described
+from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
+from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
+from bidnerf_core.localization.landmarks.map_camera import MapCamera, map_cameras
+from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
+from bidnerf_core.mapping.geometry.calibration import ANY, FIXED, STRETCHED, Calibration
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.reprojection import SCALE, ReprojectionErrors, State
+from bidnerf_core.mapping.geometry.resection import minimized
+
+UNSUSPECTED = 0.8
+"""Least share of agreeing matches at which the stated intrinsics are not suspected."""
+SUSPECTED, FAR = 0.5, 0.1
+"""Share of agreeing matches below which a pose may be far off, and shift of the principal points tried then, as a share of the
+focal length.
+"""
+SUPPORT_RATIO, MIN_EXTRA_INLIERS = 1.1, 5
+"""Factor by which, and number of exact matches by which, the support of another camera has to exceed that of the one found."""
+AS_MANY = 0.9
+"""Share of the matches agreeing with another camera that must still agree after its refinement."""
+FIT_SCALES = (4.0, 1.0)
+"""Residuals at which outliers begin in the successive fits, in units of the inlier threshold."""
+FEW_DRAWS = 500
+"""Largest number of minimal samples: enough for two inliers in five matches."""
+
+
+def with_far_camera(query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose) -> LandmarkPose:
+    """Return a pose, found again with another camera if far more of the ``matches`` by descriptors agree with that.
+
+    Images from different cameras keep their stated intrinsics.
+    """
+    if len({image.intrinsics for image in query.images}) > 1:
+        return found
+    better = better_camera(query, matches, found)
+    if better is not None:
+        prior = STRETCHED if better.calibration.is_stretched else ANY
+        seen = replace(query, prior=prior)
+        again = described(refined_pose(seen, matches, better))
+        if again.agreeing >= AS_MANY * int(better.inliers.sum()):
+            return again
+    if found.agreeing < SUSPECTED * found.matches and not found.takes_map_camera:
+        sampled = _with_map_camera(query, matches, found)
+        if sampled is not None:
+            return sampled
+    return found if better is None else replace(found, better_camera=better.calibration)
+
+
+def better_camera(query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose) -> Hypothesis | None:
+    """Return a pose and a correction of the intrinsics with which far more matches agree than with a pose that was found, or None.
+
+    Nothing is sought where most matches agree with that pose already, or, if its intrinsics were estimated, all of them.
+    """
+    data = query.observed(matches).without_motion(found.T_world_camera, found.motion)
+    return camera_fit(
+        data,
+        found.T_world_camera,
+        found.calibration,
+        query.threshold,
+        1.0 if found.estimates_calibration else UNSUSPECTED,
+    )
+
+
+def camera_fit(
+    data: ObservedPoints,
+    T_world_rig: SE3,
+    calibration: Calibration,
+    limit: float,
+    unsuspected: float = UNSUSPECTED,
+) -> Hypothesis | None:
+    """Return the fit of a camera with which far more matches agree than with the one that was found; None if there is none.
+
+    ``data`` are matches by descriptors alone; a match agrees if its residual is within ``limit`` (pixels). The camera that was
+    found is the stated one corrected by ``calibration``; if at least a share ``unsuspected`` of the matches agree with it, no
+    other is sought.
+    """
+    here = _Fit.of(data, State.of(T_world_rig, calibration), limit)
+    enough = SUPPORT_RATIO * here.support + MIN_EXTRA_INLIERS
+    before = int(here.inliers.sum())
+    if not 0 < before < unsuspected * len(data):
+        return None
+    fits = [_fitted(data, here.state, limit, FIT_SCALES)]
+    if fits[0].support < enough:
+        fits.extend(_from_sample(data, limit))
+    if before < SUSPECTED * len(data) and max(fit.support for fit in fits) < enough:
+        starts = [
+            _turned(T_world_rig, calibration, u, v) for u, v in itertools.product((-FAR, FAR), repeat=2)
+        ]
+        rough = max(
+            (_fitted(data, start, limit, FIT_SCALES[:1]) for start in starts), key=lambda fit: fit.support
+        )
+        fits.append(_fitted(data, rough.state, limit, FIT_SCALES[1:]))
+    best = max(fits, key=lambda fit: fit.support)
+    return best.hypothesis if best.support >= enough else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The residuals of matches with a pose and a camera."""
+
+    state: State
+    inliers: Bool[np.ndarray, "m"]
+    support: float  # number of matches that agree, each counted less the farther off it is (MSAC: Torr and Zisserman 2000)
+
+    @staticmethod
+    def of(data: ObservedPoints, state: State, limit: float) -> _Fit:
+        here = ReprojectionErrors(data, state.pose()).linearized(state, np.arange(0))
+        off = np.where(here.front, np.linalg.norm(here.off, axis=1), np.inf) / limit
+        return _Fit(state, off <= 1, float((1 - off**2).clip(min=0).sum()))
+
+    @property
+    def hypothesis(self) -> Hypothesis:
+        return Hypothesis(self.state.pose(), torch.from_numpy(self.inliers), 0, self.state.calibration)
+
+
+def _fitted(data: ObservedPoints, start: State, limit: float, scales: Sequence[float]) -> _Fit:
+    """Return the fit of a pose and a camera that a start leads to."""
+    prior, state = replace(STRETCHED, radial=0.0), start
+    deviations = np.append(prior.deviations.numpy(), np.zeros(6))
+    errors = ReprojectionErrors(data, start.pose())
+    for scale in scales:
+        here, _, _ = minimized(errors, state, deviations, scale * limit / SCALE, known_noise=True)
+        state = here.state
+    return _Fit.of(data, state, limit)
+
+
+def _from_sample(data: ObservedPoints, limit: float) -> list[_Fit]:
+    """Return the fit from the best minimal sample of the matches, whose focal length is free.
+
+    There is none for several views, whose matches are not those of one pinhole camera.
+    """
+    parts = (data.translation, data.rotation, data.focal)
+    if not all(bool((part == part[0]).all()) for part in parts):
+        return []
+    sampled = focal_consensus(data, limit, seed=0, most_draws=FEW_DRAWS)
+    if sampled is None:
+        return []
+    return [_fitted(data, State.of(sampled.T_world_rig, sampled.calibration), limit, FIT_SCALES[1:])]
+
+
+def _turned(T_world_rig: SE3, calibration: Calibration, u: float, v: float) -> State:
+    """Return a start with a principal point far from the middle, and the camera turned so that the image stays in place."""
+    turn = torch.tensor([0.0, 0.0, 0.0, v, -u, 0.0], dtype=torch.float64)
+    return State.of(T_world_rig.retract(turn), replace(calibration, shift_u=u, shift_v=v))
+
+
+def _with_map_camera(
+    query: LandmarkQuery, matches: LandmarkMatches, found: LandmarkPose
+) -> LandmarkPose | None:
+    """Return the pose by minimal samples with one of the map's cameras; None unless far more matches agree with it."""
+    enough = SUPPORT_RATIO * found.agreeing + MIN_EXTRA_INLIERS
+    sampled: list[tuple[MapCamera, Hypothesis]] = []
+    for camera in map_cameras(query.images[-1].intrinsics, query.landmarks.cameras, crops=True):
+        data = query.seen_by([camera.intrinsics] * len(query.images)).observed(matches)
+        first = sample_consensus(data, matches.view, query.threshold, seed=0)
+        if first is not None:
+            sampled.append((camera, first))
+    if not sampled:
+        return None
+    camera, first = max(sampled, key=lambda pair: int(pair[1].inliers.sum()))
+    if int(first.inliers.sum()) < max(enough, LEAST_GUIDED_MATCHES):
+        return None
+    seen = replace(query.seen_by([camera.intrinsics] * len(query.images)), prior=FIXED)
+    again = described(refined_pose(seen, matches, first))
+    if again.agreeing < enough or again.estimates_calibration:
+        return None
+    return replace(again, intrinsics=camera.intrinsics, calibration=Calibration(*camera.correction.tolist()))

@@ -1,0 +1,228 @@
+"""Refinement of a pose by guided matching: match near the projections, resect, and repeat until the matches no longer change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.hypotheses import (
+    Explanation,
+    Motion,
+    Posterior,
+    Whose,
+    posterior,
+    share_moving,
+)
+from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
+from bidnerf_core.localization.search.correspondences import LandmarkMatches
+from bidnerf_core.localization.search.guided import ProjectedLandmarks, guided_matches, projected_landmarks
+from bidnerf_core.localization.search.ransac import Hypothesis
+from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, Calibration, CalibrationPrior
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.resection import ReprojectionFit, resect
+from bidnerf_core.mapping.landmarks.features import NORM
+
+RADII = (3.0, 1.5)
+"""Radii of the rounds of guided matching, in units of the inlier threshold."""
+GUIDED_ROUNDS = 3
+"""Largest number of rounds of guided matching with the last radius; they end once the matches no longer change."""
+UNCHANGED = 0.02
+"""Share of the matches that may change in the last round."""
+LOOSE = 1.3
+"""Largest descriptor distance of a guided match, in units of the 90 % quantile over the first inliers."""
+DEPTH_OFF = 0.1
+"""Largest relative difference between a landmark's depth and the depth that was measured at its keypoint."""
+MAX_DISTANCE = (0.5 * NORM) ** 2
+"""Largest squared descriptor distance of a guided match, where no first inliers show what is usual."""
+LEAST_GUIDED_MATCHES = 6
+"""Least number of guided matches for another round."""
+MAX_REFITS = 2
+"""Largest number of times that a pose is refined anew because other intrinsics or another motion have become more probable."""
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedPose:
+    """A pose refined on guided matches, with the most probable intrinsics and motion."""
+
+    query: LandmarkQuery  # with the stated intrinsics
+    matches: LandmarkMatches  # by descriptors alone
+    fit: ReprojectionFit
+    correspondences: LandmarkMatches
+    max_distance: float  # largest squared descriptor distance of a guided match
+    posterior: Posterior
+    best: Explanation  # of the intrinsics and the motion that the fit has
+
+    @property
+    def seen(self) -> LandmarkQuery:
+        """The query with the intrinsics of the fit."""
+        return _seen(self.query, self.best)
+
+    def visible_and_by_chance(self) -> tuple[int, float]:
+        """Return how many landmarks should be visible, and how many guided matches would be found at a wrong pose."""
+        seen, fit, radius = self.seen, self.fit, RADII[-1] * self.query.threshold
+        projections = projected_landmarks(
+            seen.images, seen.landmarks, fit.T_world_rig, fit.calibration, radius, fit.motion
+        )
+        return sum(map(len, projections)), matches_by_chance(projections, radius, self.max_distance)
+
+    def updated(self, log_odds: Mapping[tuple[str, ...], float]) -> GuidedPose:
+        """Return the pose with the intrinsics that are most probable with further evidence, see ``Posterior.updated``."""
+        return _explained(replace(self, posterior=self.posterior.updated(log_odds)), log_odds)
+
+
+def refined_pose(query: LandmarkQuery, matches: LandmarkMatches, first: Hypothesis) -> GuidedPose:
+    """Refine the pose on its inliers, then on guided matches within shrinking radii until they no longer change."""
+    inliers = matches[first.inliers]
+    correlation = query.landmarks.correlation_of(len(inliers))
+    noise = query.threshold / 2
+    fit = resect(
+        query.observed(inliers), first.T_world_rig, noise, query.prior, first.calibration, correlation
+    )
+    return _refined(query, matches, fit, inliers, usual_distance(query, inliers))
+
+
+def usual_distance(query: LandmarkQuery, inliers: LandmarkMatches) -> float:
+    """Return the largest squared descriptor distance of a guided match, from those of the first inliers."""
+    return LOOSE**2 * float(query.squared_distances(inliers).quantile(0.9))
+
+
+def confirmed(query: LandmarkQuery, matches: LandmarkMatches, T_world_rig: SE3) -> GuidedPose | None:
+    """Refine a pose that was found by other means on guided matches; None if there are too few."""
+    radius = RADII[0] * query.threshold
+    found = guided_matches(query.images, query.landmarks, T_world_rig, radius, MAX_DISTANCE)
+    if len(found) < LEAST_GUIDED_MATCHES:
+        return None
+    correlation = query.landmarks.correlation_of(len(found))
+    fit = resect(query.observed(found), T_world_rig, radius / 2, query.prior, correlation=correlation)
+    return _refined(query, matches, fit, found, MAX_DISTANCE)
+
+
+def _refined(
+    query: LandmarkQuery,
+    matches: LandmarkMatches,
+    fit: ReprojectionFit,
+    found: LandmarkMatches,
+    max_distance: float,
+) -> GuidedPose:
+    """Refine a pose on guided matches, first as the query states its intrinsics, then with the most probable ones."""
+    fit, found = _guided(query, query.prior, fit, found, max_distance, RADII)
+    judged = _judged(query, fit, found, fit.calibration)
+    return _explained(GuidedPose(query, matches, fit, found, max_distance, judged, judged.stated), {})
+
+
+def _explained(pose: GuidedPose, log_odds: Mapping[tuple[str, ...], float]) -> GuidedPose:
+    """Refine a pose anew with the most probable intrinsics and motion, until they are those that it has."""
+    for _ in range(MAX_REFITS):
+        best = pose.posterior.best
+        if best.is_as(pose.best):
+            return replace(pose, best=best)
+        prior, seen = best.hypothesis.prior, _seen(pose.query, best)
+        motion = MotionPrior.usual(pose.posterior.distance) if best.motion is Motion.MOVING else STILL
+        start = best.calibration if best.hypothesis.whose is Whose.ESTIMATED else GIVEN
+        T, most = pose.posterior.pose(best), pose.max_distance
+        inliers = pose.matches[agreeing_with(seen, pose.matches, T, start)]
+        if len(inliers) > len(pose.correspondences):  # those of a camera far from the one before
+            most = max(most, usual_distance(seen, inliers))
+        else:
+            inliers = pose.correspondences
+        data, correlation = seen.observed(inliers), _correlation(seen, inliers)
+        fit = resect(data, T, pose.posterior.noise, prior, start, correlation, motion)
+        fit, found = _guided(seen, prior, fit, inliers, most, RADII[1:], motion)
+        judged = _judged(pose.query, fit, found, best.calibration).updated(log_odds)
+        pose = replace(pose, fit=fit, correspondences=found, max_distance=most, posterior=judged, best=best)
+    # Of intrinsics that make each other more probable in turn, the last stay.
+    return replace(pose, posterior=pose.posterior.with_best(pose.best))
+
+
+def agreeing_with(
+    query: LandmarkQuery, matches: LandmarkMatches, T_world_rig: SE3, calibration: Calibration = GIVEN
+) -> Bool[Tensor, "m"]:
+    """Return which matches agree with a pose and a correction of the intrinsics."""
+    off = query.observed(matches).corrected(calibration).residuals(T_world_rig)
+    return torch.linalg.vector_norm(off, dim=-1) <= query.threshold
+
+
+def _judged(
+    query: LandmarkQuery, fit: ReprojectionFit, found: LandmarkMatches, calibration: Calibration
+) -> Posterior:
+    landmarks = query.landmarks
+    return posterior(
+        query.observed(found), fit.T_world_rig, fit.noise, query.hypotheses, _correlation(query, found), calibration,
+        landmarks.calibration_scatter, share_moving(landmarks) if query.may_move else 0.0,
+    )  # fmt: skip
+
+
+def _seen(query: LandmarkQuery, explanation: Explanation) -> LandmarkQuery:
+    """Return the query with the intrinsics with which an explanation is fitted."""
+    camera = explanation.hypothesis.camera
+    if camera is None:
+        return query
+    return replace(query.seen_by([camera] * len(query.images)), prior=FIXED)
+
+
+def _correlation(query: LandmarkQuery, found: LandmarkMatches) -> float:
+    return query.landmarks.correlation_of(len(found))
+
+
+def _guided(
+    query: LandmarkQuery,
+    prior: CalibrationPrior,
+    fit: ReprojectionFit,
+    found: LandmarkMatches,
+    most: float,
+    radii: Sequence[float],
+    motion: MotionPrior = STILL,
+) -> tuple[ReprojectionFit, LandmarkMatches]:
+    """Match near the projections and fit the pose to the matches, in rounds, until the matches no longer change."""
+    for radius in (*radii[:-1], *[radii[-1]] * GUIDED_ROUNDS):
+        guided = guided_matches(
+            query.images, query.landmarks, fit.T_world_rig, radius * query.threshold, most, fit.calibration,
+            fit.motion,
+        )  # fmt: skip
+        data = query.observed(guided)
+        agrees = _depth_agrees(data, fit.T_world_rig)
+        guided, data = guided[agrees], data[agrees]
+        if len(guided) < LEAST_GUIDED_MATCHES:
+            break
+        changed, found = _changed(guided, found), guided
+        correlation = _correlation(query, found)
+        fit = resect(data, fit.T_world_rig, fit.noise, prior, fit.calibration, correlation, motion)
+        if changed <= UNCHANGED:
+            break
+    return fit, found
+
+
+def _changed(a: LandmarkMatches, b: LandmarkMatches) -> float:
+    """Return the share of the matches ``a`` that are not among ``b``."""
+    return 1 - float(torch.isin(a.keys, b.keys).float().mean())
+
+
+def _depth_agrees(data: ObservedPoints, T_world_rig: SE3) -> Bool[Tensor, "m"]:
+    """Return which correspondences agree with the depth at the keypoint, up to a common factor, or have no measured depth."""
+    z = data.in_camera(T_world_rig)[:, 2]
+    known = data.depth > 0
+    ratio = torch.where(known, z / torch.where(known, data.depth, 1), 1)
+    scale = ratio[known].median() if int(known.sum()) >= LEAST_GUIDED_MATCHES else 1.0
+    return (ratio / scale - 1).abs() <= DEPTH_OFF
+
+
+def visible_and_matching(query: LandmarkQuery, T_world_rig: SE3) -> tuple[int, int, float]:
+    """Return how many landmarks should be visible from a pose, how many match near there, and how many would by chance."""
+    radius = RADII[0] * query.threshold
+    projections = projected_landmarks(query.images, query.landmarks, T_world_rig, GIVEN, radius)
+    matches = sum(len(found.matches(radius, MAX_DISTANCE)) for found in projections)
+    return sum(map(len, projections)), matches, matches_by_chance(projections, radius, MAX_DISTANCE)
+
+
+def matches_by_chance(projections: Sequence[ProjectedLandmarks], radius: float, most: float) -> float:
+    """Return the number of guided matches expected by chance: the mean over shifts of all keypoints."""
+    away = 4 * radius
+    shifts = ((away, away), (-away, -away))
+    counts = [len(found.matches(radius, most, shift)) for shift in shifts for found in projections]
+    return sum(counts) / len(shifts)

@@ -1,0 +1,459 @@
+"""Who took this image, and how: hypotheses about its camera, and their probabilities given the image's keypoints.
+
+Each hypothesis is a Gaussian prior on the same few numbers, the correction of the stated intrinsics and the motion of the camera
+while its rows were exposed, and has a prior probability. The keypoints are fitted once, with all of these numbers free; linear
+algebra gives the evidence for each hypothesis in Laplace's approximation (MacKay 2003, ch. 28), the pose under it and its
+covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bidnerf_core.camera.intrinsics import Intrinsics
+from bidnerf_core.camera.rolling_shutter import MotionPrior
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.landmarks.map_camera import OTHER_CAMERA, SAME_CAMERA, SAME_LOG_ODDS, MapCamera
+from bidnerf_core.mapping.geometry.calibration import (
+    ANY,
+    CALIBRATED,
+    CROPPED,
+    CROPS,
+    FIXED,
+    MISTAKEN,
+    MISTAKES,
+    NOMINAL,
+    USUAL,
+    USUALLY,
+    Calibration,
+    CalibrationPrior,
+)
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
+from bidnerf_core.mapping.geometry.reprojection import Array, ReprojectionErrors, State, damped_solution
+from bidnerf_core.mapping.geometry.resection import minimized
+from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
+
+CROPS_BESIDE_APPROXIMATE = 0.1
+"""Share of crops among images whose focal length is approximate."""
+SHARE_MOVING, SHARE_AS_MAP = 1 / 30, 0.8
+"""Prior probability that an image shows a motion, and that it does if those of the map do.
+
+The first is low because lens stabilisers, and lenses that the intrinsics do not describe, distort images in similar ways.
+"""
+TRANSPOSED = 0.1
+"""Share of the motions in which the rows run across those that the image's shape suggests: crops, turned square images."""
+MAX_MOTION = 22.5
+"""Largest squared motion, in standard deviations of its prior (chi-squared at 99.9 %, six degrees of freedom).
+
+A larger one more probably makes up for another camera. It is not taken, and the shift of the pose that it brings counts as doubt.
+"""
+MIN_POINTS = 20
+"""Least number of points that determine a motion: with fewer, the noise is as uncertain as the motion itself."""
+TIED = 1e-9
+"""Standard deviation of parameters that a hypothesis does not leave open."""
+
+
+class Whose(StrEnum):
+    """Whose intrinsics an image is localized with."""
+
+    GIVEN = "given"
+    MAP = "map"
+    ESTIMATED = "estimated"
+
+
+class Motion(StrEnum):
+    """How the camera moved while its rows were exposed."""
+
+    STILL = "still"
+    MOVING = "moving"
+    TRANSPOSED = "transposed"  # moving, and its rows run along the other axis
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A prior on the correction of the stated intrinsics."""
+
+    name: str
+    whose: Whose
+    log_prior: float
+    prior: CalibrationPrior  # with which the image is localized: ``FIXED`` but where the intrinsics are estimated
+    mean: Float[Tensor, "5"]  # in the order of ``Calibration``
+    deviations: Float[Tensor, "5"]  # of the correction about its mean
+    camera: Intrinsics | None = None  # the map's
+
+    @property
+    def family(self) -> tuple[str, ...]:
+        """What distinguishes hypotheses that are localized with different intrinsics."""
+        return (self.whose, self.name if self.whose is not Whose.GIVEN else "")
+
+
+def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FIXED) -> list[Hypothesis]:
+    """Return all hypotheses about the intrinsics of an image; the only place with their priors.
+
+    ``cameras``: those of the map, relative to the stated intrinsics. ``prior``: how uncertain the stated intrinsics are, if they
+    are approximate and therefore estimated in any case.
+    """
+
+    def about(
+        name: str, share: float, prior: CalibrationPrior, estimated: CalibrationPrior = FIXED
+    ) -> Hypothesis:
+        whose = Whose.GIVEN if estimated == FIXED else Whose.ESTIMATED
+        deviations = prior.deviations.clamp(min=CALIBRATED.stretch)
+        return Hypothesis(name, whose, math.log(share), estimated, torch.zeros_like(deviations), deviations)
+
+    if prior != FIXED:
+        own = [about("approximate", 1 - CROPS_BESIDE_APPROXIMATE, prior, prior)]
+        is_open = prior.shift >= ANY.shift  # nothing is known of the intrinsics
+        if not is_open:
+            cropped = replace(prior, shift=ANY.shift)
+            own.append(about("cropped", CROPS_BESIDE_APPROXIMATE, cropped, cropped))
+        near = replace(prior, stretch=OTHER_CAMERA.stretch)
+        of_map = [(camera, SAME_LOG_ODDS) for camera in cameras if is_open or camera.is_near(near)]
+    else:
+        # If the stated intrinsics are those of the map, they are wrong only where the image is from another camera.
+        as_map = any(camera.is_near(CALIBRATED) and not bool(camera.differs.any()) for camera in cameras)
+        share = 1 - SAME_CAMERA if as_map else 1.0
+        wrong = (MISTAKES + CROPS) * share
+        other_focal = replace(USUAL, log_focal=MISTAKEN.log_focal)
+        own = [
+            about("given", 1 - USUALLY - wrong, CALIBRATED),
+            about("usual", USUALLY, USUAL),
+            # What is wrong may be so by any amount: it is estimated without its prior.
+            about(
+                "mistaken focal length",
+                0.6 * MISTAKES * share,
+                other_focal,
+                replace(other_focal, log_focal=ANY.log_focal),
+            ),
+            about("mistaken", 0.4 * MISTAKES * share, MISTAKEN, NOMINAL),
+            about("cropped", CROPS * share, CROPPED, CROPPED),
+        ]
+        of_map = [(camera, camera.log_odds) for camera in cameras if bool(camera.differs.any())]
+    found = [
+        Hypothesis(
+            f"map {number}",
+            Whose.MAP,
+            log_odds - math.log(len(of_map)),
+            FIXED,
+            camera.correction,
+            camera.deviations,
+            camera.intrinsics,
+        )
+        for number, (camera, log_odds) in enumerate(of_map)
+        if math.isfinite(log_odds)
+    ]
+    return [*own, *found]
+
+
+def share_moving(landmarks: LandmarkMap) -> float:
+    """Return the prior probability that an image of the scene shows a motion: its camera may be that of the map's images."""
+    return max(SHARE_MOVING, SHARE_AS_MAP * landmarks.moving)
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A hypothesis about the camera and its motion, given the keypoints."""
+
+    hypothesis: Hypothesis
+    motion: Motion
+    log_evidence: float  # with the log prior, up to a constant
+    update: Float[Tensor, "6"]  # right update of the pose of the fit in which everything is free
+    parameters: Float[Tensor, "11"]  # most probable calibration and motion
+    covariance: Float[Tensor, "6 6"]  # of the pose, due to the calibration and the motion
+    by_motion: Float[Tensor, "6 6"]  # the part that is left with a known calibration
+    by_fit: Float[
+        Tensor, "6 6"
+    ]  # ``covariance`` without the scatter of calibrations among the map's own images
+    is_plausible: bool = True  # whether its motion is not larger than cameras move
+
+    @property
+    def calibration(self) -> Calibration:
+        """The most probable correction of the stated intrinsics."""
+        return Calibration(*self.parameters[:5].tolist())
+
+    def is_as(self, other: Explanation) -> bool:
+        """Return whether the image is localized in the same way with both: the same intrinsics and motion."""
+        return self.hypothesis.family == other.hypothesis.family and self.motion is other.motion
+
+    def intrinsics(self, given: Intrinsics) -> Intrinsics:
+        """Return the intrinsics with which to localize an image that states the ``given`` ones."""
+        if self.hypothesis.whose is Whose.GIVEN:
+            return given
+        return self.hypothesis.camera or self.calibration.applied(given)
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The explanations of an image, and their probabilities."""
+
+    T_world_rig: SE3  # of the fit in which everything is free
+    noise: float  # pixels, of that fit
+    apparent: Float[Tensor, "5"]  # the correction of that fit, in the order of ``Calibration``
+    deviations: Float[Tensor, "5"]  # its standard deviations due to the noise of keypoints
+    distance: float  # metres: median depth of the landmarks
+    explanations: tuple[Explanation, ...]
+
+    @property
+    def stated(self) -> Explanation:
+        """The explanation that the stated intrinsics are right, or approximately right, and the camera was at rest."""
+        return self.explanations[0]
+
+    def with_best(self, explanation: Explanation) -> Posterior:
+        """Return the posterior with the explanation like a given one as its ``best``, however probable that is."""
+        alike = [each for each in self.explanations if each.is_as(explanation)]
+        found = replace(self)
+        vars(found)["best"] = max(alike, key=lambda each: each.log_evidence)
+        return found
+
+    @cached_property
+    def probabilities(self) -> list[float]:
+        """The probability of each explanation; they add up to 1."""
+        odds = torch.tensor([each.log_evidence for each in self.explanations], dtype=torch.float64)
+        found: list[float] = odds.softmax(0).tolist()
+        return found
+
+    @cached_property
+    def best(self) -> Explanation:
+        """The explanation with which to localize the image: that of the most probable intrinsics, see ``best_of``."""
+        totals: dict[tuple[str, ...], float] = {}
+        for each, p in self._weighted:
+            totals[each.hypothesis.family] = totals.get(each.hypothesis.family, 0.0) + p
+        return self.best_of(max(totals, key=lambda key: totals[key]))
+
+    def best_of(self, family: tuple[str, ...]) -> Explanation:
+        """Return the most probable explanation of a family, with the more probable of a motion and none.
+
+        The motion of rows across those that the image's shape suggests is never taken: it counts as doubt.
+        """
+        inside = [(each, p) for each, p in self._weighted if each.hypothesis.family == family]
+        moving = sum(p for each, p in inside if each.motion is Motion.MOVING and each.is_plausible)
+        still = sum(p for each, p in inside) - moving
+        motion = Motion.MOVING if moving > still else Motion.STILL
+        return max(((e, p) for e, p in inside if e.motion is motion), key=lambda pair: pair[1])[0]
+
+    @property
+    def with_stated(self) -> Posterior:
+        """The posterior with the best explanation by the stated intrinsics as its ``best``, however probable these are."""
+        return self.with_best(self.best_of(self.stated.hypothesis.family))
+
+    @property
+    def _weighted(self) -> list[tuple[Explanation, float]]:
+        return list(zip(self.explanations, self.probabilities, strict=True))
+
+    @property
+    def _others(self) -> list[tuple[Explanation, float]]:
+        """The explanations with other intrinsics than the best."""
+        return [(e, p) for e, p in self._weighted if e.hypothesis.family != self.best.hypothesis.family]
+
+    def shift(self, explanation: Explanation) -> Float[Tensor, "6"]:
+        """Return the right update from the pose of the best explanation to that of another."""
+        return explanation.update - self.best.update
+
+    def pose(self, explanation: Explanation) -> SE3:
+        """Return the pose under an explanation."""
+        return self.T_world_rig.retract(explanation.update)
+
+    @property
+    def wrong(self) -> float:
+        """The probability that neither the given intrinsics nor those of the map's images are right."""
+        return sum(p for e, p in self._weighted if e.hypothesis.whose is Whose.ESTIMATED)
+
+    @property
+    def expected_shift(self) -> float:
+        """The sum over all other intrinsics of their probability times the shift of the position that they bring (metres)."""
+        return sum(p * float(self.shift(e)[:3].norm()) for e, p in self._others)
+
+    @property
+    def riskiest(self) -> Explanation | None:
+        """The explanation with other intrinsics that contributes most to ``expected_shift``."""
+        others = self._others
+        if not others:
+            return None
+        return max(others, key=lambda pair: pair[1] * float(self.shift(pair[0])[:3].norm()))[0]
+
+    def updated(self, log_odds: Mapping[tuple[str, ...], float]) -> Posterior:
+        """Return the posterior with the log odds of families by further evidence: renderings, a start, another sensor."""
+        explanations = tuple(
+            replace(each, log_evidence=each.log_evidence + log_odds.get(each.hypothesis.family, 0.0))
+            for each in self.explanations
+        )
+        return replace(self, explanations=explanations)
+
+    @property
+    def doubt_of_motion(self) -> Float[Tensor, "6 6"]:
+        """What the doubt about the motion adds to the covariance of a pose with known intrinsics."""
+        best = self.best
+        same = [(e, p) for e, p in self._weighted if e.hypothesis is best.hypothesis]
+        return _moment(same, best.update, "by_motion") - best.by_motion
+
+    @property
+    def doubt_of_camera(self) -> Float[Tensor, "6 6"]:
+        """What the doubt about the intrinsics adds to that."""
+        best = self.best
+        own = best.by_fit if best.hypothesis.whose is Whose.ESTIMATED else best.by_motion
+        found = _moment(self._weighted, best.update, "covariance") - own - self.doubt_of_motion
+        values, vectors = torch.linalg.eigh((found + found.mT) / 2)
+        return vectors @ torch.diag(values.clamp(min=0)) @ vectors.mT
+
+
+def _moment(
+    weighted: Sequence[tuple[Explanation, float]], update: Float[Tensor, "6"], which: str
+) -> Float[Tensor, "6 6"]:
+    """Return the second moment of the pose about an update, of a mixture whose parts have the covariances ``which``."""
+    total, whole = torch.zeros((6, 6), dtype=torch.float64), sum(p for _, p in weighted)
+    for each, p in weighted:
+        off = each.update - update
+        total += p / whole * (getattr(each, which) + torch.outer(off, off))
+    return total
+
+
+def posterior(
+    data: ObservedPoints,
+    start: SE3,
+    noise: float,
+    which: Sequence[Hypothesis],
+    correlation: float,
+    calibration: Calibration,
+    scatter: Float[Tensor, "4"],
+    share: float = 0.0,
+) -> Posterior:
+    """Return the probabilities of hypotheses given observations with the stated intrinsics, and the pose under each of them.
+
+    ``start`` and ``calibration`` are where the fit starts, ``noise`` (pixels) is a first guess, ``correlation`` the number of
+    observations that count as one, and ``share`` the prior probability of a motion between rows; 0 for a camera at rest.
+    ``scatter``: standard deviations of the corrections that images of the map seem to need although their intrinsics are right.
+    """
+    mean = torch.stack([each.mean for each in which]).numpy()
+    deviations = torch.stack([each.deviations for each in which]).numpy()
+    spurious = np.concatenate([scatter.numpy(), np.zeros(7)])
+    distance = float(data.in_camera(start)[:, 2].median())
+    usual = MotionPrior.usual(distance).deviations.numpy()
+    if share == 0 or len(data) < MIN_POINTS:
+        share, usual = 0.0, np.zeros(6)
+    wide = np.concatenate([np.hypot(np.maximum(deviations, np.abs(mean)).max(0), spurious[:5]), usual])
+    errors = ReprojectionErrors(data, start)
+    ways = [(errors, (Motion.STILL, Motion.MOVING) if share else (Motion.STILL,))]
+    if share:
+        transposed = errors.exposed_at(data.transposed_exposure_times)
+        ways.append((transposed, (Motion.TRANSPOSED,)))
+    fits, state = [], State.of(start, calibration)
+    for errors, motions in ways:
+        here, system, fitted = minimized(errors, state, wide, noise, correlation)
+        fits.append((errors, here, system, fitted, motions))
+    least = min(fitted for _, _, _, fitted, _ in fits)
+    log_share = {
+        Motion.STILL: math.log(1 - share),
+        Motion.MOVING: math.log(max(share * (1 - TRANSPOSED), 1e-300)),
+        Motion.TRANSPOSED: math.log(max(share * TRANSPOSED, 1e-300)),
+    }
+    found: list[Explanation] = []
+    T = fits[0][1].state.pose()
+    for errors, here, _, _, motions in fits:
+        system = errors.system(here, least).weighted(1 / correlation)
+        eliminated = _Eliminated.of(system.hessian, system.gradient, wide.nonzero()[0])
+        offset = (T.inverse() @ here.state.pose()).log()
+        for motion in motions:
+            of_motion = np.full(6, TIED) if motion is Motion.STILL else usual
+            for number, each in enumerate(which):
+                prior = np.concatenate([np.maximum(deviations[number], TIED), of_motion])
+                about = np.concatenate([mean[number], np.zeros(6)])
+                explained = eliminated.given(about, prior, spurious, here.state.camera)
+                size = float(((explained.parameters[5:] / prior[5:]) ** 2).sum())
+                found.append(
+                    Explanation(
+                        each,
+                        motion,
+                        each.log_prior + log_share[motion] - system.cost + explained.log_evidence,
+                        offset + torch.from_numpy(explained.update),
+                        torch.from_numpy(explained.parameters),
+                        torch.from_numpy(explained.covariance),
+                        torch.from_numpy(explained.by_motion),
+                        torch.from_numpy(explained.by_fit),
+                        motion is Motion.STILL or size <= MAX_MOTION,
+                    )
+                )
+    _, here, system, _, _ = fits[0]
+    spread = np.zeros(11)
+    spread[wide.nonzero()[0]] = np.sqrt(np.diag(np.linalg.inv(system.hessian))[6:].clip(min=0))
+    return Posterior(
+        T, least, torch.from_numpy(here.state.camera[:5].copy()), torch.from_numpy(spread[:5]), distance,
+        tuple(found),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Conditional:
+    """The most probable unknowns under a prior, and its evidence."""
+
+    log_evidence: float
+    update: Array  # (6,) of the pose
+    parameters: Array  # (11,)
+    covariance: Array  # (6, 6) of the pose, due to the parameters
+    by_motion: Array  # (6, 6)
+    by_fit: Array  # (6, 6)
+
+
+@dataclass(frozen=True)
+class _Eliminated:
+    """Quadratic cost of a camera's parameters, from which the pose is eliminated."""
+
+    free: Array  # numbers of the parameters
+    hessian: Array  # (p, p)
+    gradient: Array  # (p,)
+    update: Array  # (6,) of the pose, with the parameters as they are
+    follows: Array  # (6, p) derivative of the best pose with respect to the parameters
+
+    @staticmethod
+    def of(hessian: Array, gradient: Array, free: Array) -> _Eliminated:
+        """Eliminate the pose, which comes first (Schur complement)."""
+        right = np.column_stack([hessian[:6, 6:], gradient[:6]])
+        solved = -damped_solution(hessian[:6, :6], 1e-9, right)
+        follows, update = solved[:, :-1], solved[:, -1]
+        schur = hessian[6:, 6:] + hessian[6:, :6] @ follows
+        return _Eliminated(free, schur, gradient[6:] + hessian[6:, :6] @ update, update, follows)
+
+    def given(self, mean: Array, deviations: Array, spurious: Array, here: Array) -> _Conditional:
+        """Return the unknowns under a Gaussian prior on the parameters, whose values are ``here``.
+
+        What the observations seem to say of the parameters has errors with the standard deviations ``spurious``.
+        """
+        free = self.free
+        mean, deviations, spurious, here = mean[free], deviations[free], spurious[free], here[free]
+        total = np.hypot(deviations, spurious)
+        # In units of the prior, since its deviations differ by many orders of magnitude.
+        scaled = self.hessian * np.outer(total, total) + np.eye(len(free))
+        step = -np.linalg.solve(scaled, self.gradient * total + (here - mean) / total) * total
+        off = here - mean + step
+        cost = self.gradient @ step + 0.5 * step @ self.hessian @ step + 0.5 * ((off / total) ** 2).sum()
+        apparent = np.linalg.inv(scaled) * np.outer(total, total)
+        # The true parameters, given the apparent ones.
+        share = (deviations / total) ** 2
+        variance = share[:, None] * apparent * share + np.diag(share * spurious**2)
+        true = mean + share * off
+        parameters = np.zeros(11)
+        parameters[free] = true
+        motion = free >= 5
+        of_motion = np.linalg.inv(self.hessian[np.ix_(motion, motion)] + np.diag(total[motion] ** -2))
+        return _Conditional(
+            log_evidence=float(-cost - 0.5 * np.linalg.slogdet(scaled)[1]),
+            update=self.update + self.follows @ (true - here),
+            parameters=parameters,
+            covariance=_spread(self.follows, variance),
+            by_motion=_spread(self.follows[:, motion], of_motion),
+            by_fit=_spread(self.follows, apparent),
+        )
+
+
+def _spread(follows: Array, variance: Array) -> Array:
+    """Return the covariance of a pose that follows parameters with a ``variance``."""
+    found: Array = follows @ variance @ follows.T
+    return (found + found.T) / 2
