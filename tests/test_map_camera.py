@@ -205,8 +205,8 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
 
 def with_log_odds(found: LandmarkPose, whose: Whose, odds: float) -> LandmarkPose:
     assert found.guided is not None
-    families = {e.hypothesis.family for e in found.guided.posterior.explanations}
-    return updated(found, {family: odds for family in families if family[0] is whose})
+    every = [e.hypothesis for e in found.guided.posterior.explanations]
+    return updated(found, {h.name: odds for h in every if h.whose is whose})
 
 
 @pytest.mark.parametrize("odds", [-20.0, 20.0])

@@ -43,6 +43,7 @@ from bidnerf_core.mapping import (
     resect,
     tracked_views,
 )
+from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.landmarks.building import observed_at_rest, pose_updates
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, unseen
 from bidnerf_core.training import RayBank

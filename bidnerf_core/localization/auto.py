@@ -60,8 +60,6 @@ IN_FRONT = 0.9
 """Least share of the points of an occluder that must lie before the surface."""
 WITHOUT_SEARCH = LandmarkThresholds(log10_nfa=math.inf)
 """Thresholds for landmarks that match near a pose found by other means."""
-MISLEADING = 0.5
-"""Probability of wrong intrinsics, estimated from the landmarks near a pose by colour alone, above which that is rejected."""
 LEAST_SUPPORT, LEAST_TO_MOVE = 0.5, 0.8
 """Least confidence with which landmarks support a pose accepted on the surface, and with which they may move one by depth."""
 
@@ -223,7 +221,7 @@ def _compared_with_landmarks(
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
         return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
-    if found.converged and near.pose is not None and verdict is not None and _is_misled(near.pose, problem):
+    if found.converged and verdict is not None and _is_misled(verdict, problem):
         reason = f"{verdict.reason}; {found.reason}"
         return replace(found, outcome=Outcome.MISCALIBRATED, reason=reason, confidence=None)
     if not found.converged:
@@ -248,10 +246,9 @@ def _unless_twin(
     return found if rejection is None else _rejected(found, rejection)
 
 
-def _is_misled(near: LandmarkPose, problem: Problem) -> bool:
+def _is_misled(near: Verdict, problem: Problem) -> bool:
     """Return whether landmarks contradict the intrinsics of a pose by colour, which fits wrong ones at a wrong pose."""
-    doubted = near.doubt.wrong > MISLEADING or near.better_camera is not None
-    return doubted and not near.estimates_calibration and _measured_points(problem) < LEAST_POINTS
+    return near.outcome is Outcome.MISCALIBRATED and _measured_points(problem) < LEAST_POINTS
 
 
 def _leaves_surface(problem: Problem, found: Localization, answer: LandmarkAnswer) -> bool:

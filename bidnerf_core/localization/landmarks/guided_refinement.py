@@ -71,7 +71,7 @@ class GuidedPose:
         )
         return sum(map(len, projections)), matches_by_chance(projections, radius, self.max_distance)
 
-    def updated(self, log_odds: Mapping[tuple[str, ...], float]) -> GuidedPose:
+    def updated(self, log_odds: Mapping[str, float]) -> GuidedPose:
         """Return the pose with the intrinsics that are most probable with further evidence, see ``Posterior.updated``."""
         return _explained(replace(self, posterior=self.posterior.updated(log_odds)), log_odds)
 
@@ -116,7 +116,7 @@ def _refined(
     return _explained(GuidedPose(query, matches, fit, found, max_distance, judged, judged.stated), {})
 
 
-def _explained(pose: GuidedPose, log_odds: Mapping[tuple[str, ...], float]) -> GuidedPose:
+def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
     """Refine a pose anew with the most probable intrinsics and motion, until they are those that it has."""
     for _ in range(MAX_REFITS):
         best = pose.posterior.best

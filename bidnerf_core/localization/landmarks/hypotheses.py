@@ -62,6 +62,10 @@ TIED = 1e-9
 """Standard deviation of parameters that a hypothesis does not leave open."""
 
 
+STATED, INEXACT = "stated", "inexact"
+"""Names of the hypotheses that the stated intrinsics are right: exactly, and as far as devices usually state them."""
+
+
 class Whose(StrEnum):
     """Whose intrinsics an image is localized with."""
 
@@ -90,10 +94,7 @@ class Hypothesis:
     deviations: Float[Tensor, "5"]  # of the correction about its mean
     camera: Intrinsics | None = None  # the map's
 
-    @property
-    def family(self) -> tuple[str, ...]:
-        """What distinguishes hypotheses that are localized with different intrinsics."""
-        return (self.whose, self.name if self.whose is not Whose.GIVEN else "")
+    is_inexact: bool = False  # whether the stated intrinsics are right, but for errors as usual
 
 
 def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FIXED) -> list[Hypothesis]:
@@ -108,7 +109,15 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
     ) -> Hypothesis:
         whose = Whose.GIVEN if estimated == FIXED else Whose.ESTIMATED
         deviations = prior.deviations.clamp(min=CALIBRATED.stretch)
-        return Hypothesis(name, whose, math.log(share), estimated, torch.zeros_like(deviations), deviations)
+        return Hypothesis(
+            name,
+            whose,
+            math.log(share),
+            estimated,
+            torch.zeros_like(deviations),
+            deviations,
+            is_inexact=name in (STATED, INEXACT),
+        )
 
     if prior != FIXED:
         own = [about("approximate", 1 - CROPS_BESIDE_APPROXIMATE, prior, prior)]
@@ -125,8 +134,8 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
         wrong = (MISTAKES + CROPS) * share
         other_focal = replace(USUAL, log_focal=MISTAKEN.log_focal)
         own = [
-            about("given", 1 - USUALLY - wrong, CALIBRATED),
-            about("usual", USUALLY, USUAL),
+            about(STATED, 1 - USUALLY - wrong, CALIBRATED),
+            about(INEXACT, USUALLY, USUAL, USUAL),
             # What is wrong may be so by any amount: it is estimated without its prior.
             about(
                 "mistaken focal length",
@@ -182,7 +191,7 @@ class Explanation:
 
     def is_as(self, other: Explanation) -> bool:
         """Return whether the image is localized in the same way with both: the same intrinsics and motion."""
-        return self.hypothesis.family == other.hypothesis.family and self.motion is other.motion
+        return self.hypothesis.name == other.hypothesis.name and self.motion is other.motion
 
     def intrinsics(self, given: Intrinsics) -> Intrinsics:
         """Return the intrinsics with which to localize an image that states the ``given`` ones."""
@@ -209,9 +218,8 @@ class Posterior:
 
     def with_best(self, explanation: Explanation) -> Posterior:
         """Return the posterior with the explanation like a given one as its ``best``, however probable that is."""
-        alike = [each for each in self.explanations if each.is_as(explanation)]
         found = replace(self)
-        vars(found)["best"] = max(alike, key=lambda each: each.log_evidence)
+        vars(found)["best"] = next(each for each in self.explanations if each.is_as(explanation))
         return found
 
     @cached_property
@@ -224,26 +232,26 @@ class Posterior:
     @cached_property
     def best(self) -> Explanation:
         """The explanation with which to localize the image: that of the most probable intrinsics, see ``best_of``."""
-        totals: dict[tuple[str, ...], float] = {}
+        totals: dict[str, float] = {}
         for each, p in self._weighted:
-            totals[each.hypothesis.family] = totals.get(each.hypothesis.family, 0.0) + p
+            totals[each.hypothesis.name] = totals.get(each.hypothesis.name, 0.0) + p
         return self.best_of(max(totals, key=lambda key: totals[key]))
 
-    def best_of(self, family: tuple[str, ...]) -> Explanation:
-        """Return the most probable explanation of a family, with the more probable of a motion and none.
+    def best_of(self, name: str) -> Explanation:
+        """Return the explanation of a hypothesis with which it is localized, with the more probable of a motion and none.
 
-        The motion of rows across those that the image's shape suggests is never taken: it counts as doubt.
+        That is the first: stated intrinsics are taken as they are, even where they are more probably inexact. The motion of rows across those that the image's shape suggests is never taken: it counts as doubt.
         """
-        inside = [(each, p) for each, p in self._weighted if each.hypothesis.family == family]
+        inside = [(each, p) for each, p in self._weighted if each.hypothesis.name == name]
         moving = sum(p for each, p in inside if each.motion is Motion.MOVING and each.is_plausible)
         still = sum(p for each, p in inside) - moving
         motion = Motion.MOVING if moving > still else Motion.STILL
-        return max(((e, p) for e, p in inside if e.motion is motion), key=lambda pair: pair[1])[0]
+        return next(each for each, _ in inside if each.motion is motion)
 
     @property
     def with_stated(self) -> Posterior:
         """The posterior with the best explanation by the stated intrinsics as its ``best``, however probable these are."""
-        return self.with_best(self.best_of(self.stated.hypothesis.family))
+        return self.with_best(self.best_of(self.stated.hypothesis.name))
 
     @property
     def _weighted(self) -> list[tuple[Explanation, float]]:
@@ -251,8 +259,13 @@ class Posterior:
 
     @property
     def _others(self) -> list[tuple[Explanation, float]]:
-        """The explanations with other intrinsics than the best."""
-        return [(e, p) for e, p in self._weighted if e.hypothesis.family != self.best.hypothesis.family]
+        """The explanations with essentially other intrinsics than the best; small errors of intrinsics are part of the covariance."""
+        best = self.best.hypothesis
+        return [
+            (e, p)
+            for e, p in self._weighted
+            if e.hypothesis is not best and not (e.hypothesis.is_inexact and best.is_inexact)
+        ]
 
     def shift(self, explanation: Explanation) -> Float[Tensor, "6"]:
         """Return the right update from the pose of the best explanation to that of another."""
@@ -264,8 +277,10 @@ class Posterior:
 
     @property
     def wrong(self) -> float:
-        """The probability that neither the given intrinsics nor those of the map's images are right."""
-        return sum(p for e, p in self._weighted if e.hypothesis.whose is Whose.ESTIMATED)
+        """The probability that neither the stated intrinsics nor those of the map's images are right, not even nearly."""
+        wrong = (p for e, p in self._weighted if e.hypothesis.whose is Whose.ESTIMATED)
+        inexact = (p for e, p in self._weighted if e.hypothesis.name == INEXACT)
+        return sum(wrong) - sum(inexact)
 
     @property
     def expected_shift(self) -> float:
@@ -280,10 +295,10 @@ class Posterior:
             return None
         return max(others, key=lambda pair: pair[1] * float(self.shift(pair[0])[:3].norm()))[0]
 
-    def updated(self, log_odds: Mapping[tuple[str, ...], float]) -> Posterior:
+    def updated(self, log_odds: Mapping[str, float]) -> Posterior:
         """Return the posterior with the log odds of families by further evidence: renderings, a start, another sensor."""
         explanations = tuple(
-            replace(each, log_evidence=each.log_evidence + log_odds.get(each.hypothesis.family, 0.0))
+            replace(each, log_evidence=each.log_evidence + log_odds.get(each.hypothesis.name, 0.0))
             for each in self.explanations
         )
         return replace(self, explanations=explanations)

@@ -71,13 +71,13 @@ class MapCamera:
         Either the query is from the map's camera and misstates it, or it is from another camera with similar intrinsics. Where the
         shapes of the pixels differ, the image was resized, or it is from another camera.
         """
-        if self.is_near(OTHER_CAMERA):
-            shares = ((USUAL, USUALLY), (MISTAKEN, MISTAKES), (CROPPED, CROPS))
-            misstated = torch.stack([self._log_density(prior) + math.log(share) for prior, share in shares])
-            return float(misstated.logsumexp(0) - self._log_density(OTHER_CAMERA)) + SAME_LOG_ODDS
         if not self.is_near(STRETCHED):
             return -math.inf
-        return math.log(RESIZED / (1 - RESIZED)) if self.is_stretched else -math.inf
+        if self.is_stretched:
+            return math.log(RESIZED / (1 - RESIZED))
+        shares = ((USUAL, USUALLY), (MISTAKEN, MISTAKES), (CROPPED, CROPS))
+        misstated = torch.stack([self._log_density(prior) + math.log(share) for prior, share in shares])
+        return float(misstated.logsumexp(0) - self._log_density(OTHER_CAMERA)) + SAME_LOG_ODDS
 
     @property
     def is_stretched(self) -> bool:

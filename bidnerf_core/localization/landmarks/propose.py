@@ -71,7 +71,7 @@ def propose(
     return _with_twin(query, matcher, found) if seek_twin else found
 
 
-def updated(found: LandmarkPose, log_odds: Mapping[tuple[str, ...], float]) -> LandmarkPose:
+def updated(found: LandmarkPose, log_odds: Mapping[str, float]) -> LandmarkPose:
     """Return a pose with the log odds of intrinsics by further evidence, see ``Posterior.updated``.
 
     It is refined anew where other intrinsics have become the most probable; nothing is searched again.
