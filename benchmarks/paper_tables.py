@@ -30,13 +30,7 @@ from typing import Any
 import _lab
 
 from bidnerf_core.cli.progress import Display, stopped_by_ctrl_c
-from bidnerf_core.evaluation.bench import (
-    Plan,
-    changed_settings,
-    left_to_do,
-    planned,
-    run_trials,
-)
+from bidnerf_core.evaluation.bench import Plan, changed_settings, left_to_do, planned, run_trials
 from bidnerf_core.evaluation.groups import Group, grouped
 from bidnerf_core.evaluation.provenance import note_run, provenance, script_command
 from bidnerf_core.evaluation.results import ResultsFile, key_of

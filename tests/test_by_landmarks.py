@@ -17,10 +17,24 @@ from bidnerf_core.captures.field_trial import tried
 from bidnerf_core.depth.sensors import find_depth_sensor
 from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization import AutoConfig, LandmarkAnswer, LandmarkMatcher, LandmarkPose, Problem, answer_by_landmarks, propose, rig
+from bidnerf_core.localization import (
+    AutoConfig,
+    LandmarkAnswer,
+    LandmarkMatcher,
+    LandmarkPose,
+    Problem,
+    answer_by_landmarks,
+    propose,
+    rig,
+)
 from bidnerf_core.localization.acceptance import LandmarkDiagnostics, landmark_verdict
 from bidnerf_core.localization.by_depth import share_on_surface
-from bidnerf_core.localization.by_landmarks import SHARPEST, corrected, fused_answer, localization_by_landmarks
+from bidnerf_core.localization.by_landmarks import (
+    SHARPEST,
+    corrected,
+    fused_answer,
+    localization_by_landmarks,
+)
 from bidnerf_core.localization.depth_scale import DepthScale
 from bidnerf_core.localization.fusion import FusedPose, Measurements
 from bidnerf_core.localization.landmarks.propose import Confirmation

@@ -15,13 +15,7 @@ from bidnerf_core.datasets import open_dataset
 from bidnerf_core.errors import InputError
 from bidnerf_core.evaluation import trials
 from bidnerf_core.evaluation.bench import Plan
-from bidnerf_core.evaluation.comparison import (
-    Comparison,
-    map_bytes,
-    map_labels,
-    map_row,
-    plan_comparison,
-)
+from bidnerf_core.evaluation.comparison import Comparison, map_bytes, map_labels, map_row, plan_comparison
 from bidnerf_core.evaluation.evaluate import run_comparison
 from bidnerf_core.evaluation.plots import comparison_figure
 from bidnerf_core.evaluation.summary import seconds_to_success, success_of

@@ -12,7 +12,7 @@ import torch
 from bidnerf_core import SE3, Frame, Intrinsics, View
 from bidnerf_core.localization import LandmarkMatcher, LandmarkPose, Outcome, propose
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
-from bidnerf_core.localization.landmarks.hypotheses import Whose
+from bidnerf_core.localization.landmarks.hypotheses import STATED, Whose
 from bidnerf_core.localization.landmarks.map_camera import (
     SAME_CAMERA,
     MapCamera,
@@ -148,7 +148,7 @@ def test_a_camera_that_refocuses_differs_only_beyond_its_own_spread() -> None:
 
 
 def test_the_farther_the_cameras_are_apart_the_less_likely_they_are_one() -> None:
-    found = [map_camera(with_focal(factor), (PINHOLE,)) for factor in (1.01, 1.03, 1.06, 1.2)]
+    found = [map_camera(with_focal(factor), (PINHOLE,)) for factor in (1.01, 1.03, 1.06, 1.2, 2.0)]
     odds = [camera.log_odds for camera in found if camera is not None]
     assert odds == sorted(odds, reverse=True)
     assert odds[-1] == -math.inf
@@ -206,7 +206,7 @@ def test_intrinsics_that_the_image_cannot_tell_apart_are_not_accepted(landmarks:
 def with_log_odds(found: LandmarkPose, whose: Whose, odds: float) -> LandmarkPose:
     assert found.guided is not None
     every = [e.hypothesis for e in found.guided.posterior.explanations]
-    return updated(found, {h.name: odds for h in every if h.whose is whose})
+    return updated(found, {h.group: odds for h in every if h.whose is whose and h.group != STATED})
 
 
 @pytest.mark.parametrize("odds", [-20.0, 20.0])
@@ -232,7 +232,8 @@ def test_evidence_against_the_intrinsics_taken_has_them_estimated(landmarks: Lan
     found = propose(LandmarkMatcher(strange), [stated], points)
     assert found is not None
     kept, estimated = (with_log_odds(found, Whose.ESTIMATED, odds) for odds in (-50.0, 50.0))
-    assert not kept.estimates_calibration
+    assert kept.guided is not None
+    assert kept.guided.best.hypothesis.group == STATED
     assert estimated.focal_factor == pytest.approx(1 / 1.02, rel=0.005)
 
 

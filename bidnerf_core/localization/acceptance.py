@@ -7,7 +7,7 @@ into an ``Outcome`` and a sentence.
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -19,7 +19,6 @@ from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
 from bidnerf_core.localization.refinement import RefinementResult
 from bidnerf_core.localization.result import Outcome, Verdict
-from bidnerf_core.localization.search.halving import SearchResult
 from bidnerf_core.localization.settings import RenderedThresholds
 from bidnerf_core.mapping.surface.casting import trace
 

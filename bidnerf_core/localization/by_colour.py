@@ -17,10 +17,7 @@ from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.refinement import RefinementResult, refine
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.localization.settings import (
-    ByColourConfig,
-    RefinementStage,
-)
+from bidnerf_core.localization.settings import ByColourConfig, RefinementStage
 
 TYPICAL_ERRORS = 4.5
 """Largest standard deviation of a position, in median errors of the map's own images, with which a pose is accepted."""

@@ -22,6 +22,7 @@ from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
 from bidnerf_core.localization.fusion import FusedPose, Measurements, drawn_rays, finest_cost, fused_pose, nearby_start
 from bidnerf_core.localization.landmarks.hypotheses import Whose
+from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED
 from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import propose, updated
 from bidnerf_core.localization.problem import Problem
@@ -105,9 +106,9 @@ def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> L
     )
     there = replace(here, views=views, start=found.T_world_camera.retract(posterior.shift(other)))
     odds = log_odds_by_rendering(there, here, seed)
-    if other.hypothesis.whose is Whose.ESTIMATED:
+    if other.hypothesis.group == ESTIMATED:
         odds = max(odds, 0.0)  # an inexact estimate renders badly even if the stated intrinsics are wrong
-    return updated(found, {other.hypothesis.name: odds})
+    return updated(found, {other.hypothesis.group: odds})
 
 
 def fused_answer(

@@ -121,7 +121,7 @@ def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
     for _ in range(MAX_REFITS):
         best = pose.posterior.best
         if best.is_as(pose.best):
-            return replace(pose, best=best)
+            break
         prior, seen = best.hypothesis.prior, _seen(pose.query, best)
         motion = MotionPrior.usual(pose.posterior.distance) if best.motion is Motion.MOVING else STILL
         start = best.calibration if best.hypothesis.whose is Whose.ESTIMATED else GIVEN
@@ -137,7 +137,7 @@ def _explained(pose: GuidedPose, log_odds: Mapping[str, float]) -> GuidedPose:
         judged = _judged(pose.query, fit, found, best.calibration).updated(log_odds)
         pose = replace(pose, fit=fit, correspondences=found, max_distance=most, posterior=judged, best=best)
     # Of intrinsics that make each other more probable in turn, the last stay.
-    return replace(pose, posterior=pose.posterior.with_best(pose.best))
+    return replace(pose, posterior=pose.posterior.with_best(pose.best, pose.fit.T_world_rig))
 
 
 def agreeing_with(

@@ -38,7 +38,8 @@ from bidnerf_core.mapping.geometry.calibration import (
     CalibrationPrior,
 )
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
-from bidnerf_core.mapping.geometry.reprojection import Array, ReprojectionErrors, State, damped_solution
+from bidnerf_core.mapping.geometry.projection import Array
+from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State, damped_solution
 from bidnerf_core.mapping.geometry.resection import minimized
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
@@ -62,8 +63,10 @@ TIED = 1e-9
 """Standard deviation of parameters that a hypothesis does not leave open."""
 
 
-STATED, INEXACT = "stated", "inexact"
-"""Names of the hypotheses that the stated intrinsics are right: exactly, and as far as devices usually state them."""
+STATED, INEXACT, ESTIMATED = "stated", "inexact", "estimated"
+"""Names of the hypotheses that the stated intrinsics are right, exactly and as far as devices usually state them, and of the group of
+those that they are wrong or unknown.
+"""
 
 
 class Whose(StrEnum):
@@ -94,7 +97,12 @@ class Hypothesis:
     deviations: Float[Tensor, "5"]  # of the correction about its mean
     camera: Intrinsics | None = None  # the map's
 
-    is_inexact: bool = False  # whether the stated intrinsics are right, but for errors as usual
+    @property
+    def group(self) -> str:
+        """The hypotheses that differ in size alone: of the same stated intrinsics, or of intrinsics that are wrong."""
+        if self.name in (STATED, INEXACT):
+            return STATED
+        return self.name if self.camera is not None else ESTIMATED
 
 
 def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FIXED) -> list[Hypothesis]:
@@ -116,7 +124,6 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
             estimated,
             torch.zeros_like(deviations),
             deviations,
-            is_inexact=name in (STATED, INEXACT),
         )
 
     if prior != FIXED:
@@ -216,10 +223,19 @@ class Posterior:
         """The explanation that the stated intrinsics are right, or approximately right, and the camera was at rest."""
         return self.explanations[0]
 
-    def with_best(self, explanation: Explanation) -> Posterior:
-        """Return the posterior with the explanation like a given one as its ``best``, however probable that is."""
-        found = replace(self)
-        vars(found)["best"] = next(each for each in self.explanations if each.is_as(explanation))
+    def with_best(self, explanation: Explanation, T_world_rig: SE3 | None = None) -> Posterior:
+        """Return the posterior with the explanation like a given one as its ``best``, however probable that is.
+
+        ``T_world_rig`` is the pose that was fitted under it, from which the shifts to all others are measured.
+        """
+        best = next(each for each in self.explanations if each.is_as(explanation))
+        if T_world_rig is None:
+            found = replace(self)
+        else:
+            fitted = replace(best, update=(self.T_world_rig.inverse() @ T_world_rig).log())
+            found = replace(self, explanations=tuple(fitted if e is best else e for e in self.explanations))
+            best = fitted
+        vars(found)["best"] = best
         return found
 
     @cached_property
@@ -259,13 +275,8 @@ class Posterior:
 
     @property
     def _others(self) -> list[tuple[Explanation, float]]:
-        """The explanations with essentially other intrinsics than the best; small errors of intrinsics are part of the covariance."""
-        best = self.best.hypothesis
-        return [
-            (e, p)
-            for e, p in self._weighted
-            if e.hypothesis is not best and not (e.hypothesis.is_inexact and best.is_inexact)
-        ]
+        """The explanations of other groups than the best; what is left open within its group is part of the covariance."""
+        return [(e, p) for e, p in self._weighted if e.hypothesis.group != self.best.hypothesis.group]
 
     def shift(self, explanation: Explanation) -> Float[Tensor, "6"]:
         """Return the right update from the pose of the best explanation to that of another."""
@@ -278,9 +289,7 @@ class Posterior:
     @property
     def wrong(self) -> float:
         """The probability that neither the stated intrinsics nor those of the map's images are right, not even nearly."""
-        wrong = (p for e, p in self._weighted if e.hypothesis.whose is Whose.ESTIMATED)
-        inexact = (p for e, p in self._weighted if e.hypothesis.name == INEXACT)
-        return sum(wrong) - sum(inexact)
+        return sum(p for e, p in self._weighted if e.hypothesis.group == ESTIMATED)
 
     @property
     def expected_shift(self) -> float:
@@ -296,9 +305,9 @@ class Posterior:
         return max(others, key=lambda pair: pair[1] * float(self.shift(pair[0])[:3].norm()))[0]
 
     def updated(self, log_odds: Mapping[str, float]) -> Posterior:
-        """Return the posterior with the log odds of families by further evidence: renderings, a start, another sensor."""
+        """Return the posterior with the log odds of groups by further evidence: renderings, a start, another sensor."""
         explanations = tuple(
-            replace(each, log_evidence=each.log_evidence + log_odds.get(each.hypothesis.name, 0.0))
+            replace(each, log_evidence=each.log_evidence + log_odds.get(each.hypothesis.group, 0.0))
             for each in self.explanations
         )
         return replace(self, explanations=explanations)

@@ -17,11 +17,11 @@ from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_ve
 from bidnerf_core.localization.by_colour import TYPICAL_ERRORS, refine_by_colour
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale
+from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
+from bidnerf_core.localization.landmarks.landmark_query import pixel_threshold
 from bidnerf_core.localization.problem import SceneMap, rig
 from bidnerf_core.localization.result import Outcome, Verdict
 from bidnerf_core.localization.search.halving import SearchResult
-from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
-from bidnerf_core.localization.landmarks.landmark_query import pixel_threshold
 from bidnerf_core.localization.settings import ByColourConfig, TrackerConfig
 from bidnerf_core.localization.tracking.flow import Grey, alike, flow
 from bidnerf_core.localization.tracking.motion import Motion, PoseEstimate, pixel_radius
@@ -131,9 +131,7 @@ class ByLandmarks:
         evidence: Evidence,
         doubt: CameraDoubt,
     ) -> tuple[LandmarkPose, Verdict]:
-        pose = landmark_pose(
-            points, found, evidence, self.detector.landmarks, doubt, frame.intrinsics
-        )
+        pose = landmark_pose(points, found, evidence, self.detector.landmarks, doubt, frame.intrinsics)
         return pose, landmark_verdict(pose, SINGLE)
 
     def _wants_more(self, state: TrackerState, found: LandmarkPose, measured: Measurement) -> bool:

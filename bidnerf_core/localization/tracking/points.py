@@ -14,7 +14,13 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import STILL, MotionPrior, exposure_times, transposed_exposure_times
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.hypotheses import Motion, Posterior, camera_hypotheses, posterior, share_moving
+from bidnerf_core.localization.landmarks.hypotheses import (
+    Motion,
+    Posterior,
+    camera_hypotheses,
+    posterior,
+    share_moving,
+)
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.mapping.geometry.calibration import GIVEN
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
@@ -158,17 +164,20 @@ def fit_pose(
 def with_motion(found: PointFit, landmarks: LandmarkMap) -> PointFit:
     """Return a fit with the more probable of a motion while the rows were exposed and none, and with what is left of doubt."""
     inliers = found.data[found.inliers]
+    if not len(inliers):
+        return found
     correlation = landmarks.correlation_of(len(inliers))
     judged = posterior(
         inliers, found.T_world_camera, found.fit.noise, camera_hypotheses([]), correlation, GIVEN,
         landmarks.calibration_scatter, share_moving(landmarks),
     ).with_stated  # fmt: skip
     moved = judged.best.motion is Motion.MOVING
-    if moved == found.moves:
-        return replace(found, judged=judged)
-    motion = MotionPrior.usual(judged.distance) if moved else STILL
-    fit = resect(found.data, found.T_world_camera, found.fit.noise, correlation=correlation, motion=motion)
-    return PointFit(fit, found.data, _inliers(found.data, fit), judged)
+    if moved != found.moves:
+        T, noise = found.T_world_camera, found.fit.noise
+        motion = MotionPrior.usual(judged.distance) if moved else STILL
+        fit = resect(found.data, T, noise, correlation=correlation, motion=motion)
+        found = PointFit(fit, found.data, _inliers(found.data, fit))
+    return replace(found, judged=judged.with_best(judged.best, found.T_world_camera))
 
 
 def _inliers(data: ObservedPoints, fit: ReprojectionFit) -> Bool[Tensor, "m"]:

@@ -17,9 +17,6 @@ from bidnerf_core.depth.sensors import UNKNOWN, DepthNoise
 from bidnerf_core.frames.frame import Frame
 from bidnerf_core.geometry.independent import CORNERS_PER_INDEPENDENT
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.search.chance import log10_nfa
-from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
-from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches, projected_landmarks
 from bidnerf_core.localization.landmarks.guided_refinement import RADII, matches_by_chance, usual_distance
 from bidnerf_core.localization.landmarks.landmark_evidence import (
     cell_numbers,
@@ -30,13 +27,15 @@ from bidnerf_core.localization.landmarks.landmark_evidence import (
 )
 from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, LandmarkPose
 from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery, pixel_threshold
+from bidnerf_core.localization.search.chance import log10_nfa
+from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_image
+from bidnerf_core.localization.search.guided import OBLIQUE, guided_matches, projected_landmarks
 from bidnerf_core.localization.search.matching import EXHAUSTIVE, LandmarkMatcher
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.localization.tracking.flow import Grey, corners
 from bidnerf_core.localization.tracking.motion import Motion
 from bidnerf_core.localization.tracking.points import FRESH, FollowedPoints, PointFit, fit_pose, with_motion
-from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN, NOMINAL
-from bidnerf_core.mapping.geometry.resection import resect
+from bidnerf_core.mapping.geometry.calibration import FIXED, GIVEN
 from bidnerf_core.mapping.landmarks.features import Features
 from bidnerf_core.mapping.landmarks.keypoint_depth import measured_depth
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
@@ -111,7 +110,6 @@ class LandmarkDetector:
         if seen is None:
             return None
         points, found, _ = seen
-        correlation = self.landmarks.correlation_of(int(found.inliers.sum()))
         found = with_motion(found, self.landmarks)
         evidence = _guided_evidence(query, found, tight, most_distance)
         evidence = replace(evidence, log10_nfa=min(evidence.log10_nfa, surprise))

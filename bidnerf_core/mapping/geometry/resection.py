@@ -193,6 +193,17 @@ def log_likelihood_ratio(
     return (costs[0] - costs[1]) / correlation
 
 
+def log_motion_evidence(
+    data: ObservedPoints,
+    moving: ReprojectionFit,
+    still: ReprojectionFit,
+    motion: MotionPrior,
+    correlation: float,
+) -> float:
+    """Return the logarithm of the Bayes factor of a motion against none."""
+    return log_likelihood_ratio(data, moving, still, correlation) + moving.log_occam_factor(motion)
+
+
 def _cost(errors: ReprojectionErrors, fit: ReprojectionFit, noise: float) -> float:
     """Return the loss of ``resect``, without priors."""
     state = State.of(fit.T_world_rig, fit.calibration, fit.motion)
