@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,24 +13,33 @@ from torch import Generator, Tensor
 from bidnerf_core.errors import enumeration
 from bidnerf_core.geometry.independent import independent
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.acceptance import LandmarkDiagnostics, LandmarkThresholds, landmark_diagnostics, landmark_verdict
+from bidnerf_core.localization.acceptance import (
+    LandmarkDiagnostics,
+    LandmarkThresholds,
+    landmark_diagnostics,
+    landmark_verdict,
+)
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
 from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
-from bidnerf_core.localization.fusion import FusedPose, Measurements, drawn_rays, finest_cost, fused_pose, nearby_start
-from bidnerf_core.localization.landmarks.hypotheses import Whose
+from bidnerf_core.localization.fusion import (
+    FusedPose,
+    Measurements,
+    drawn_rays,
+    finest_cost,
+    fused_pose,
+    nearby_start,
+)
 from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED
 from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import propose, updated
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
-from bidnerf_core.localization.result import Localization, Verdict
+from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.solvers.pivots import pivot
-from bidnerf_core.localization.settings import ColourSettings, DepthSettings, RefinementSettings, RefinementStage, rendered_depth_scale
-from bidnerf_core.localization.solvers.pivots import Pivot
 from bidnerf_core.mapping import SurfaceMap
 
 POINTS = 2000
@@ -116,7 +124,8 @@ def fused_answer(
 ) -> LandmarkAnswer:
     """Return a pose by landmarks, refined on all terms at once if it is accepted or merely imprecise.
 
-    An imprecise one stays rejected, but is a better place from which to search. ``searched`` is false if landmarks only confirm a pose that was found by other means.
+    An imprecise one stays rejected, but is a better place from which to search. ``searched`` is false if landmarks only confirm a
+    pose that was found by other means.
     """
     diagnostics = landmark_diagnostics(found, searched)
     answer = LandmarkAnswer(found, verdict, found.T_world_camera, found.stated_covariance, diagnostics)
