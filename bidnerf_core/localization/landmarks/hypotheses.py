@@ -37,9 +37,10 @@ from bidnerf_core.mapping.geometry.calibration import (
     Calibration,
     CalibrationPrior,
 )
+from bidnerf_core.mapping.geometry.eliminated_pose import TIED, Conditional, EliminatedPose
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.projection import Array
-from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State, damped_solution
+from bidnerf_core.mapping.geometry.reprojection import ReprojectionErrors, State
 from bidnerf_core.mapping.geometry.resection import minimized
 from bidnerf_core.mapping.landmarks.landmark_map import LandmarkMap
 
@@ -59,9 +60,6 @@ A larger one more probably makes up for another camera. It is not taken, and the
 """
 MIN_POINTS = 20
 """Least number of points that determine a motion: with fewer, the noise is as uncertain as the motion itself."""
-TIED = 1e-9
-"""Standard deviation of parameters that a hypothesis does not leave open."""
-
 
 STATED, INEXACT, ESTIMATED = "stated", "inexact", "estimated"
 """Names of the hypotheses that the stated intrinsics are right, exactly and as far as devices usually state them, and of the group of
@@ -356,128 +354,79 @@ def posterior(
     observations that count as one, and ``share`` the prior probability of a motion between rows; 0 for a camera at rest.
     ``scatter``: standard deviations of the corrections that images of the map seem to need although their intrinsics are right.
     """
-    mean = torch.stack([each.mean for each in which]).numpy()
-    deviations = torch.stack([each.deviations for each in which]).numpy()
-    spurious = np.concatenate([scatter.numpy(), np.zeros(7)])
+    mean, deviations = (
+        torch.stack([getattr(each, name) for each in which]).numpy() for name in ("mean", "deviations")
+    )
     distance = float(data.in_camera(start)[:, 2].median())
     usual = MotionPrior.usual(distance).deviations.numpy()
     if share == 0 or len(data) < MIN_POINTS:
         share, usual = 0.0, np.zeros(6)
-    wide = np.concatenate([np.hypot(np.maximum(deviations, np.abs(mean)).max(0), spurious[:5]), usual])
-    errors = ReprojectionErrors(data, start)
-    ways = [(errors, (Motion.STILL, Motion.MOVING) if share else (Motion.STILL,))]
+    widest = np.hypot(np.maximum(deviations, np.abs(mean)).max(0), np.append(scatter.numpy(), 0.0))
+    wide = np.concatenate([widest, usual])
+    free, spurious = wide.nonzero()[0], np.concatenate([scatter.numpy(), np.zeros(7)])
+    still = ReprojectionErrors(data, start)
+    ways: dict[ReprojectionErrors, tuple[Motion, ...]] = {still: (Motion.STILL,)}
     if share:
-        transposed = errors.exposed_at(data.transposed_exposure_times)
-        ways.append((transposed, (Motion.TRANSPOSED,)))
-    fits, state = [], State.of(start, calibration)
-    for errors, motions in ways:
-        here, system, fitted = minimized(errors, state, wide, noise, correlation)
-        fits.append((errors, here, system, fitted, motions))
-    least = min(fitted for _, _, _, fitted, _ in fits)
-    log_share = {
-        Motion.STILL: math.log(1 - share),
-        Motion.MOVING: math.log(max(share * (1 - TRANSPOSED), 1e-300)),
-        Motion.TRANSPOSED: math.log(max(share * TRANSPOSED, 1e-300)),
+        ways[still] = (Motion.STILL, Motion.MOVING)
+        ways[still.exposed_at(data.transposed_exposure_times)] = (Motion.TRANSPOSED,)
+    state = State.of(start, calibration)
+    fits = [(errors, *minimized(errors, state, wide, noise, correlation)) for errors in ways]
+    least = min(fitted for *_, fitted in fits)
+    shares = {
+        Motion.STILL: 1 - share,
+        Motion.MOVING: share * (1 - TRANSPOSED),
+        Motion.TRANSPOSED: share * TRANSPOSED,
     }
-    found: list[Explanation] = []
-    T = fits[0][1].state.pose()
-    for errors, here, _, _, motions in fits:
+    T, found = fits[0][1].state.pose(), []
+    for errors, here, _, _ in fits:
         system = errors.system(here, least).weighted(1 / correlation)
-        eliminated = _Eliminated.of(system.hessian, system.gradient, wide.nonzero()[0])
+        eliminated = EliminatedPose.of(system, here.state.camera[free])
         offset = (T.inverse() @ here.state.pose()).log()
-        for motion in motions:
-            of_motion = np.full(6, TIED) if motion is Motion.STILL else usual
-            for number, each in enumerate(which):
-                prior = np.concatenate([np.maximum(deviations[number], TIED), of_motion])
-                about = np.concatenate([mean[number], np.zeros(6)])
-                explained = eliminated.given(about, prior, spurious, here.state.camera)
-                size = float(((explained.parameters[5:] / prior[5:]) ** 2).sum())
-                found.append(
-                    Explanation(
-                        each,
-                        motion,
-                        each.log_prior + log_share[motion] - system.cost + explained.log_evidence,
-                        offset + torch.from_numpy(explained.update),
-                        torch.from_numpy(explained.parameters),
-                        torch.from_numpy(explained.covariance),
-                        torch.from_numpy(explained.by_motion),
-                        torch.from_numpy(explained.by_fit),
-                        motion is Motion.STILL or size <= MAX_MOTION,
-                    )
-                )
-    _, here, system, _, _ = fits[0]
+        for motion in ways[errors]:
+            moving = np.zeros(6) if motion is Motion.STILL else usual
+            priors = np.concatenate([deviations, np.tile(moving, (len(which), 1))], axis=1)[:, free]
+            means = np.concatenate([mean, np.zeros((len(which), 6))], axis=1)[:, free]
+            explained = eliminated.given(means, priors, spurious[free])
+            known = eliminated.given(means[:1], np.where(free < 5, 0.0, priors[:1]), 0.0 * spurious[free])
+            found += _explanations(
+                which, motion, explained, known.covariance[0], usual, free, shares[motion], offset
+            )
+    _, here, system, _ = fits[0]
     spread = np.zeros(11)
-    spread[wide.nonzero()[0]] = np.sqrt(np.diag(np.linalg.inv(system.hessian))[6:].clip(min=0))
-    return Posterior(
-        T, least, torch.from_numpy(here.state.camera[:5].copy()), torch.from_numpy(spread[:5]), distance,
-        tuple(found),
-    )  # fmt: skip
+    spread[free] = np.sqrt(np.diag(np.linalg.inv(system.hessian))[6:].clip(min=0))
+    apparent, certain = (torch.from_numpy(value[:5].copy()) for value in (here.state.camera, spread))
+    return Posterior(T, least, apparent, certain, distance, tuple(found))
 
 
-@dataclass(frozen=True)
-class _Conditional:
-    """The most probable unknowns under a prior, and its evidence."""
-
-    log_evidence: float
-    update: Array  # (6,) of the pose
-    parameters: Array  # (11,)
-    covariance: Array  # (6, 6) of the pose, due to the parameters
-    by_motion: Array  # (6, 6)
-    by_fit: Array  # (6, 6)
-
-
-@dataclass(frozen=True)
-class _Eliminated:
-    """Quadratic cost of a camera's parameters, from which the pose is eliminated."""
-
-    free: Array  # numbers of the parameters
-    hessian: Array  # (p, p)
-    gradient: Array  # (p,)
-    update: Array  # (6,) of the pose, with the parameters as they are
-    follows: Array  # (6, p) derivative of the best pose with respect to the parameters
-
-    @staticmethod
-    def of(hessian: Array, gradient: Array, free: Array) -> _Eliminated:
-        """Eliminate the pose, which comes first (Schur complement)."""
-        right = np.column_stack([hessian[:6, 6:], gradient[:6]])
-        solved = -damped_solution(hessian[:6, :6], 1e-9, right)
-        follows, update = solved[:, :-1], solved[:, -1]
-        schur = hessian[6:, 6:] + hessian[6:, :6] @ follows
-        return _Eliminated(free, schur, gradient[6:] + hessian[6:, :6] @ update, update, follows)
-
-    def given(self, mean: Array, deviations: Array, spurious: Array, here: Array) -> _Conditional:
-        """Return the unknowns under a Gaussian prior on the parameters, whose values are ``here``.
-
-        What the observations seem to say of the parameters has errors with the standard deviations ``spurious``.
-        """
-        free = self.free
-        mean, deviations, spurious, here = mean[free], deviations[free], spurious[free], here[free]
-        total = np.hypot(deviations, spurious)
-        # In units of the prior, since its deviations differ by many orders of magnitude.
-        scaled = self.hessian * np.outer(total, total) + np.eye(len(free))
-        step = -np.linalg.solve(scaled, self.gradient * total + (here - mean) / total) * total
-        off = here - mean + step
-        cost = self.gradient @ step + 0.5 * step @ self.hessian @ step + 0.5 * ((off / total) ** 2).sum()
-        apparent = np.linalg.inv(scaled) * np.outer(total, total)
-        # The true parameters, given the apparent ones.
-        share = (deviations / total) ** 2
-        variance = share[:, None] * apparent * share + np.diag(share * spurious**2)
-        true = mean + share * off
-        parameters = np.zeros(11)
-        parameters[free] = true
-        motion = free >= 5
-        of_motion = np.linalg.inv(self.hessian[np.ix_(motion, motion)] + np.diag(total[motion] ** -2))
-        return _Conditional(
-            log_evidence=float(-cost - 0.5 * np.linalg.slogdet(scaled)[1]),
-            update=self.update + self.follows @ (true - here),
-            parameters=parameters,
-            covariance=_spread(self.follows, variance),
-            by_motion=_spread(self.follows[:, motion], of_motion),
-            by_fit=_spread(self.follows, apparent),
+def _explanations(
+    which: Sequence[Hypothesis],
+    motion: Motion,
+    explained: Conditional,
+    by_motion: Array,
+    usual: Array,
+    free: Array,
+    share: float,
+    offset: Float[Tensor, "6"],
+) -> list[Explanation]:
+    """Return what the unknowns are under each hypothesis with a motion, whose prior probability is ``share``."""
+    parameters = np.zeros((len(which), 11))
+    parameters[:, free] = explained.parameters
+    sizes = ((parameters[:, 5:] / np.maximum(usual, TIED)) ** 2).sum(1)
+    evidence = explained.log_evidence + math.log(max(share, 1e-300))
+    update, covariance, by_fit = (
+        torch.from_numpy(part) for part in (explained.update, explained.covariance, explained.by_fit)
+    )
+    return [
+        Explanation(
+            each,
+            motion,
+            each.log_prior + float(evidence[i]),
+            offset + update[i],
+            torch.from_numpy(parameters[i]),
+            covariance[i],
+            torch.from_numpy(by_motion),
+            by_fit[i],
+            bool(sizes[i] <= MAX_MOTION),
         )
-
-
-def _spread(follows: Array, variance: Array) -> Array:
-    """Return the covariance of a pose that follows parameters with a ``variance``."""
-    found: Array = follows @ variance @ follows.T
-    return (found + found.T) / 2
+        for i, each in enumerate(which)
+    ]
