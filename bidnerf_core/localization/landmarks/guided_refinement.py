@@ -159,11 +159,11 @@ def _judged(
 
 
 def _seen(query: LandmarkQuery, explanation: Explanation) -> LandmarkQuery:
-    """Return the query with the intrinsics with which an explanation is fitted."""
-    camera = explanation.hypothesis.camera
-    if camera is None:
+    """Return the query with the intrinsics with which an explanation is fitted; those that the fit estimates are the stated ones."""
+    if explanation.hypothesis.prior != FIXED:
         return query
-    return replace(query.seen_by([camera] * len(query.images)), prior=FIXED)
+    cameras = [explanation.intrinsics(image.intrinsics) for image in query.images]
+    return replace(query.seen_by(cameras), prior=FIXED)
 
 
 def _correlation(query: LandmarkQuery, found: LandmarkMatches) -> float:

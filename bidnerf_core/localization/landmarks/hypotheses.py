@@ -29,6 +29,7 @@ from bidnerf_core.mapping.geometry.calibration import (
     CROPPED,
     CROPS,
     FIXED,
+    GIVEN,
     MISTAKEN,
     MISTAKES,
     NOMINAL,
@@ -140,7 +141,7 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
         other_focal = replace(USUAL, log_focal=MISTAKEN.log_focal)
         own = [
             about(STATED, 1 - USUALLY - wrong, CALIBRATED),
-            about(INEXACT, USUALLY, USUAL, USUAL),
+            about(INEXACT, USUALLY, USUAL),
             # What is wrong may be so by any amount: it is estimated without its prior.
             about(
                 "mistaken focal length",
@@ -194,15 +195,21 @@ class Explanation:
         """The most probable correction of the stated intrinsics."""
         return Calibration(*self.parameters[:5].tolist())
 
+    @property
+    def taken(self) -> Calibration:
+        """The correction with which an image is localized where none is estimated along with the pose."""
+        if self.hypothesis.name == STATED:
+            return GIVEN
+        known = self.hypothesis.camera is not None
+        return Calibration(*self.hypothesis.mean.tolist()) if known else self.calibration
+
     def is_as(self, other: Explanation) -> bool:
         """Return whether the image is localized in the same way with both: the same intrinsics and motion."""
         return self.hypothesis.name == other.hypothesis.name and self.motion is other.motion
 
     def intrinsics(self, given: Intrinsics) -> Intrinsics:
         """Return the intrinsics with which to localize an image that states the ``given`` ones."""
-        if self.hypothesis.whose is Whose.GIVEN:
-            return given
-        return self.hypothesis.camera or self.calibration.applied(given)
+        return self.hypothesis.camera or self.taken.applied(given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +261,7 @@ class Posterior:
     def best_of(self, name: str) -> Explanation:
         """Return the explanation of a hypothesis with which it is localized, with the more probable of a motion and none.
 
-        That is the first: stated intrinsics are taken as they are, even where they are more probably inexact. The motion of rows across those that the image's shape suggests is never taken: it counts as doubt.
+        A motion is taken where it is more probable than all else. The motion of rows across those that the image's shape suggests is never taken: it counts as doubt.
         """
         inside = [(each, p) for each, p in self._weighted if each.hypothesis.name == name]
         moving = sum(p for each, p in inside if each.motion is Motion.MOVING and each.is_plausible)

@@ -16,7 +16,6 @@ from bidnerf_core.localization.landmarks.landmark_pose import CameraDoubt, Landm
 from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.chance import log10_nfa
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
-from bidnerf_core.mapping.geometry.calibration import Calibration
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 LEAST_DEPTHS = 6
@@ -38,7 +37,7 @@ def described(answer: GuidedPose) -> LandmarkPose:
     agreeing = int((torch.linalg.vector_norm(off, dim=-1) <= query.threshold).sum())
     visible, chance = answer.visible_and_by_chance()
     doubt_of_motion = answer.posterior.doubt_of_motion
-    is_of_map = best.hypothesis.whose is Whose.MAP
+    is_estimated = best.hypothesis.whose is Whose.ESTIMATED
     return LandmarkPose(
         T_world_camera=fit.T_world_rig,
         covariance=fit.covariance + doubt_of_motion + landmarks.pose_covariance,
@@ -57,7 +56,7 @@ def described(answer: GuidedPose) -> LandmarkPose:
         noise_ratio=fit.noise / landmarks.noise,
         spread=_spread(query, answer.correspondences),
         distance=median_distance(data, fit.T_world_rig),
-        calibration=Calibration(*best.hypothesis.mean.tolist()) if is_of_map else fit.calibration,
+        calibration=fit.calibration if is_estimated else best.taken,
         intrinsics=best.hypothesis.camera,
         calibration_deviations=fit.calibration_deviations,
         motion=fit.motion,
