@@ -8,7 +8,6 @@ from typing import Any
 from bidnerf_core.fields.contract import RadianceField, SceneBounds
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.independent import Independent
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import Localization, Problem, find_method, rig, settings_of
 from bidnerf_core.mapping import LandmarkMap, SurfaceMap
@@ -23,7 +22,6 @@ class FieldMap:
     surface: SurfaceMap | None = None
     landmarks: LandmarkMap | None = None
     colour_noise: float | None = None
-    independent: Independent = Independent()
     has_distances: bool = True
 
 

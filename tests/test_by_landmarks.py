@@ -13,9 +13,7 @@ from torch import Tensor
 import bidnerf_core.localization.auto as auto_module
 import bidnerf_core.localization.by_landmarks as by_landmarks_module
 from bidnerf_core import Localization, Localizer, Outcome, View
-from bidnerf_core.captures.field_trial import tried
 from bidnerf_core.depth.sensors import find_depth_sensor
-from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization import (
     AutoConfig,
@@ -437,31 +435,3 @@ def test_few_landmarks_beside_a_sharp_field_do_not_decide() -> None:
     assert float(pose_error(wrong.T_world_camera, TRUTH).translation) > 0.05
     assert found.terms == ("rendering",)
     assert_within(found.T, 0.01, 0.3)
-
-
-class BlurredGround(textured_field.TexturedGround):
-    """A ground whose fine texture was not learned."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        fine = self.waves.norm(dim=0) > 20
-        object.__setattr__(self, "weights", torch.where(fine[:, None], 0, self.weights))
-
-
-@functools.cache
-def blurred_map() -> MapWithLandmarks:
-    """Return a map with good landmarks and a field that is blurred and 3 cm off."""
-    shift = SE3.exp(torch.tensor([0.03, 0, 0, 0, 0, 0], dtype=torch.float64))
-    field = textured_field.MovedField(BlurredGround(), shift)
-    independent = tried(field, textured_field.BOUNDS, textured_field.training_views())
-    return replace(textured_map(), field=field, colour_noise=SHARPEST, independent=independent)
-
-
-def test_many_landmarks_beside_a_blurred_field_decide() -> None:
-    """The trial on the map's own images finds the field off, so that its rays count for little."""
-    alone = answer(without_depth(unseen()))
-    found = answer(without_depth(unseen()), rays=RAYS, map=blurred_map())
-    assert blurred_map().independent.rays < USUAL.rays / 5
-    assert_within(alone.T, 0.01, 0.3)
-    assert_within(found.T, 0.012, 0.35)
-    assert found.verdict.accepted

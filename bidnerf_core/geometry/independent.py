@@ -11,12 +11,11 @@ class Independent:
 
     The errors of a map, a sensor and a lens are shared by large parts of an image. n measurements whose errors have the
     correlation r in pairs determine a mean as well as ``n / (1 + (n - 1) r)`` independent ones, and never as well as 1 / r; the
-    denominator is the design effect (Kish, "Survey Sampling", 1965). The table holds 1 / r. A map states its own figure for
-    rays, from the errors of poses by its own images (``captures.field_trial``).
+    denominator is the design effect (Kish, "Survey Sampling", 1965). The table holds 1 / r.
     """
 
     points: float = 10.0  # measured depth against the surface
-    rays: float = 100.0  # colours against rendered ones, beside landmarks
+    rays: float = 60.0  # colours against rendered ones, beside landmarks
     rays_alone: float = 10.0  # the same where they alone determine the pose, from a start that may be far off
     blurred: float = 60.0  # pixels of a small image against a rendering that is blurred to match
     # Points of a tracked frame beside landmarks: hand-held sensors err more than the figure for points says.
@@ -24,7 +23,7 @@ class Independent:
 
 
 USUAL = Independent()
-"""The figures of maps that do not state their own."""
+"""The figures of all maps: those that a map's own images show are too good, since its field was fitted to them."""
 KEYPOINTS_PER_INDEPENDENT = 10.0
 """Number of keypoints that count as one measurement, where a map does not state its own: they are too few to tend to 1 / r."""
 CORNERS_PER_INDEPENDENT = 4.0

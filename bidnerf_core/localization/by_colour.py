@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Generator
 
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import rendered_verdict
 from bidnerf_core.localization.costs.rendered import RenderedCostSettings
@@ -68,7 +69,7 @@ def localization_of(
     path[0] = problem.start or path[0]
     # The errors of neighbouring rays are correlated, so the rays of a view count as a few independent ones only.
     covariance = refined.covariance * max(
-        1.0, config.steps.fine_rays / (problem.independent.rays_alone * len(problem.views))
+        1.0, config.steps.fine_rays / (USUAL.rays_alone * len(problem.views))
     )
     return Localization(
         T_world_camera=refined.T.normalized(),

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Generator
 
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import SurfaceDiagnostics, surface_diagnostics
 from bidnerf_core.localization.beyond_chance import support
@@ -59,7 +60,7 @@ def localized_by_depth(problem: Problem, surface: SurfaceMap, config: AutoConfig
         path = found.path if problem.start is None else SE3.cat([problem.start[None], found.path[1:]])
         losses = search.judge(LOSS_POINTS).cost(path)
         covariance = surface_covariance(
-            search.judge(), found.T[0], len(problem.views), problem.sensor, problem.independent.points
+            search.judge(), found.T[0], len(problem.views), problem.sensor, USUAL.points
         )
     return Localization(
         T_world_camera=found.T[0].normalized(),

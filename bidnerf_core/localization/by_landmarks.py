@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.errors import enumeration
-from bidnerf_core.geometry.independent import independent
+from bidnerf_core.geometry.independent import USUAL, independent
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
@@ -233,7 +233,7 @@ def _measurements(
     problem: Problem, answer: LandmarkAnswer, scale: DepthScale, points: SurfaceCost | None, rays: int, seed: int
 ) -> Measurements:  # fmt: skip
     about, views = pivot("scene", problem) if points is None else points.cloud.pivot, len(problem.views)
-    generator, most = Generator().manual_seed(seed), problem.independent
+    generator, most = Generator().manual_seed(seed), USUAL
     return Measurements(
         prior=GaussianPrior(answer.T, answer.covariance - answer.found.shared_covariance, about),
         points=None if points is None else ScaledPoints(points, scale, answer.found.T_world_camera),

@@ -16,7 +16,6 @@ from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, device_of, levels
 from bidnerf_core.fields.observations import Observations
 from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.independent import Independent
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.mapping import SurfaceMap
@@ -49,11 +48,6 @@ class SceneMap(Protocol):
     @property
     def colour_noise(self) -> float | None:
         """Root mean square difference of the field's colours from its own training images; None where unknown."""
-        ...
-
-    @property
-    def independent(self) -> Independent:
-        """How many independent measurements the points and the rays of an image count as."""
         ...
 
     @property
@@ -101,7 +95,6 @@ class Problem:
     )
     # Root mean square difference of the field's colours from its own training images; None where unknown.
     colour_noise: float | None = None
-    independent: Independent = Independent()  # how many independent measurements those of an image count as
     sensor: DepthSensorModel = UNKNOWN  # model of the sensor that measured the depth
 
     def __post_init__(self) -> None:
@@ -178,7 +171,6 @@ def rig(
     return Problem(
         scene.field, scene.bounds, relative, None if start is None else start.to("cpu", torch.float64),
         depth_rays, scene.surface, None if matcher is None else matcher.for_query(), scene.colour_noise,
-        scene.independent,
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from bidnerf_core.devices import may_wait, without_waiting
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.beyond_chance import NONE, Support, support
 from bidnerf_core.localization.costs.rendered import RenderedCost, RenderedCostSettings
@@ -101,13 +102,13 @@ def take_few_steps(
     with without_waiting():
         here = cost.residuals(poses[0][None])
         inliers.append(here.inliers_by_depth()[0])
-        rendered = weight(problem.independent.rays * views, float(here.cost()[0]))
+        rendered = weight(USUAL.rays * views, float(here.cost()[0]))
         beside = (
             None
             if surface is None
             else Scaled(
                 surface,
-                weight(problem.independent.points * views, float(surface.residual_variance(start[None])[0])),
+                weight(USUAL.points * views, float(surface.residual_variance(start[None])[0])),
             )
         )
         aligned = None if beside is None else beside(start[None])

@@ -9,14 +9,12 @@ from dataclasses import dataclass, replace
 
 from bidnerf_core.captures.advice import summary
 from bidnerf_core.captures.cameras import pose_updates
-from bidnerf_core.captures.field_trial import tried
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.captures.survey import surveyed
 from bidnerf_core.captures.trial import tried_landmarks
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import RadianceField
 from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.independent import Independent
 from bidnerf_core.mapping import (
     BakeConfig,
     HeldOutTrial,
@@ -44,7 +42,6 @@ class BakedLandmarks:
     colour_noise: (
         float | None
     )  # root mean square error of rendered colours on photos; None if it was not measured
-    independent: Independent  # how many independent measurements those of a photo count as
     capture: CaptureReport | None  # record of the photos; None for rendered images
 
 
@@ -109,11 +106,10 @@ def bake_landmarks(
             f"{where}: {len(landmarks)} landmarks ({landmarks.megabytes:.1f} MB) from {len(images)} {source},"
             f" {time.monotonic() - began:.1f} s"
         )
-    independent = tried(field, info.bounds, views) if views else info.independent
     capture = surveyed(tracked, views, trial=trial) if views else None
     for line in [] if capture is None else summary(capture):
         log.info(line)
-    return BakedLandmarks(landmarks, source, noise, independent, capture)
+    return BakedLandmarks(landmarks, source, noise, capture)
 
 
 def _tried(

@@ -11,7 +11,6 @@ from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.captures.cameras import PoseRefinement, StoredCamera, with_wrong_pose
 from bidnerf_core.errors import InputError
 from bidnerf_core.fields.contract import SceneBounds
-from bidnerf_core.geometry.independent import Independent
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.io.json import from_plain, read_json
 from bidnerf_core.mapping.landmarks.features import USUAL_FEATURES
@@ -47,7 +46,6 @@ class MapInfo:
     landmark_features: str = USUAL_FEATURES  # name of the detector whose keypoints they are
     capture: str | None = None  # record of the photos that gave the landmarks
     colour_noise: float | None = None  # root mean square error of rendered colours on training images
-    independent: Independent = Independent()  # how many independent measurements those of an image count as
     bidnerf: str = field(default_factory=lambda: version("bidnerf"))
     format: str = FORMAT
     version: int = VERSION

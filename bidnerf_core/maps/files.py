@@ -23,7 +23,6 @@ from torch import nn
 from bidnerf_core.captures.report import CaptureReport
 from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField
-from bidnerf_core.geometry.independent import USUAL, Independent
 from bidnerf_core.io.files import write_file
 from bidnerf_core.io.folders import output_folder
 from bidnerf_core.io.json import from_plain, read_json, to_plain
@@ -66,7 +65,7 @@ def save_map(
         _check_features(landmarks, folder)
         parts["landmarks"] = lambda: tensors_to_bytes(landmark_tensors(landmarks))
     else:
-        info = replace(info, landmark_source=None, colour_noise=None, independent=Independent())
+        info = replace(info, landmark_source=None, colour_noise=None)
     if capture is not None:
         parts["capture"] = lambda: _json(capture)
     names = {part: _file_name(part, state.step) for part in parts}
@@ -93,9 +92,9 @@ def save_surface(folder: Path, of: MapInfo, surface: SurfaceMap) -> MapInfo:
 
 def save_landmarks(
     folder: Path, of: MapInfo, landmarks: LandmarkMap, colour_noise: float | None = None,
-    source: LandmarkSource = "photos", independent: Independent = USUAL,
+    source: LandmarkSource = "photos",
 ) -> MapInfo:  # fmt: skip
-    """Add landmarks to map ``of``, replacing earlier ones, and what its images showed of the errors of field and surface.
+    """Add landmarks to map ``of``, replacing earlier ones, and what its images showed of the errors of the field.
 
     ``source`` is the kind of images that the landmarks were built from. Raises ``InputError`` where another training has
     replaced that map meanwhile, and where the detector of the landmarks has no name by which a query could find it.
@@ -104,7 +103,7 @@ def save_landmarks(
     content = tensors_to_bytes(landmark_tensors(landmarks))
     return _save_part(
         folder, of, "landmarks", content, colour_noise=colour_noise, landmark_source=source,
-        landmark_features=landmarks.features, independent=independent,
+        landmark_features=landmarks.features,
     )  # fmt: skip
 
 

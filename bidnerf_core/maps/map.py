@@ -19,7 +19,6 @@ from bidnerf_core.errors import InputError, amount
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
 from bidnerf_core.fields.rendering import RenderedImage, render_image
 from bidnerf_core.frames.frame import View
-from bidnerf_core.geometry.independent import Independent
 from bidnerf_core.io.files import locked
 from bidnerf_core.io.json import from_plain
 from bidnerf_core.io.tensors import read_tensors
@@ -85,11 +84,6 @@ class Map:
     def colour_noise(self) -> float | None:
         """Root mean square error of the field's colours (in [0, 1]) on its own training images."""
         return self.info.colour_noise
-
-    @property
-    def independent(self) -> Independent:
-        """How many independent measurements the points and the rays of an image count as."""
-        return self.info.independent
 
     @cached_property
     def capture(self) -> CaptureReport | None:
@@ -224,14 +218,12 @@ class Map:
         info, landmarks = self.info, self.landmarks
         if found.landmarks is not None:
             info = replace(
-                info, colour_noise=found.colour_noise, independent=found.independent, landmark_source=found.source,
+                info, colour_noise=found.colour_noise, landmark_source=found.source,
                 landmark_features=found.landmarks.features,
             )  # fmt: skip
             landmarks = _with_cameras(found.landmarks, info)
             if self.folder is not None:
-                info = save_landmarks(
-                    self.folder, self.info, landmarks, found.colour_noise, found.source, found.independent
-                )
+                info = save_landmarks(self.folder, self.info, landmarks, found.colour_noise, found.source)
         if found.capture is not None and self.folder is not None:
             info = save_capture(self.folder, info, found.capture)
         return replace(self, info=info, landmarks=landmarks, record=found.capture or self.record)

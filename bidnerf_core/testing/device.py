@@ -13,7 +13,6 @@ from torch import Tensor
 
 from bidnerf_core.devices import without_waiting
 from bidnerf_core.fields.contract import RadianceField, SceneBounds, levels
-from bidnerf_core.geometry.independent import Independent
 from bidnerf_core.localization import (
     AdamSettings,
     BidConfig,
@@ -50,7 +49,6 @@ class _Scene:
     surface: SurfaceMap | None = None
     landmarks: LandmarkMap | None = None
     colour_noise: float | None = None
-    independent: Independent = Independent()
     has_distances: bool = True
 
 

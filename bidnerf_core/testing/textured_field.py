@@ -14,7 +14,6 @@ from bidnerf_core.fields.contract import FieldValues, RadianceField, RaySampler,
 from bidnerf_core.fields.rendering import render_image
 from bidnerf_core.fields.sampling import Stratified
 from bidnerf_core.frames.frame import Frame, View
-from bidnerf_core.geometry.independent import Independent
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.mapping import BakeConfig, LandmarkMap, SurfaceMap, bake, build_landmarks
 from bidnerf_core.scenes.trajectories import orbit
@@ -64,7 +63,6 @@ class MapWithLandmarks:
     landmarks: LandmarkMap | None
     surface: SurfaceMap | None = None
     colour_noise: float | None = 0.0
-    independent: Independent = Independent()
     has_distances: bool = True
 
 

@@ -22,7 +22,7 @@ from torch import Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.camera.rolling_shutter import MotionPrior
 from bidnerf_core.geometry.se3 import SE3
-from bidnerf_core.localization.landmarks.map_camera import OTHER_CAMERA, SAME_CAMERA, SAME_LOG_ODDS, MapCamera
+from bidnerf_core.localization.landmarks.map_camera import SAME_CAMERA, SAME_LOG_ODDS, MapCamera
 from bidnerf_core.mapping.geometry.calibration import (
     ANY,
     CALIBRATED,
@@ -33,6 +33,7 @@ from bidnerf_core.mapping.geometry.calibration import (
     MISTAKEN,
     MISTAKES,
     NOMINAL,
+    RIGHT,
     USUAL,
     USUALLY,
     Calibration,
@@ -127,12 +128,10 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
 
     if prior != FIXED:
         own = [about("approximate", 1 - CROPS_BESIDE_APPROXIMATE, prior, prior)]
-        is_open = prior.shift >= ANY.shift  # nothing is known of the intrinsics
-        if not is_open:
+        if prior.shift < ANY.shift:
             cropped = replace(prior, shift=ANY.shift)
             own.append(about("cropped", CROPS_BESIDE_APPROXIMATE, cropped, cropped))
-        near = replace(prior, stretch=OTHER_CAMERA.stretch)
-        of_map = [(camera, SAME_LOG_ODDS) for camera in cameras if is_open or camera.is_near(near)]
+        of_map = [(camera, SAME_LOG_ODDS) for camera in cameras]
     else:
         # If the stated intrinsics are those of the map, they are wrong only where the image is from another camera.
         as_map = any(camera.is_near(CALIBRATED) and not bool(camera.differs.any()) for camera in cameras)
@@ -140,7 +139,7 @@ def camera_hypotheses(cameras: Sequence[MapCamera], prior: CalibrationPrior = FI
         wrong = (MISTAKES + CROPS) * share
         other_focal = replace(USUAL, log_focal=MISTAKEN.log_focal)
         own = [
-            about(STATED, 1 - USUALLY - wrong, CALIBRATED),
+            about(STATED, 1 - USUALLY - wrong, RIGHT),
             about(INEXACT, USUALLY, USUAL),
             # What is wrong may be so by any amount: it is estimated without its prior.
             about(

@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 from bidnerf_core.camera.intrinsics import Intrinsics
 from bidnerf_core.depth.sensors import UNKNOWN, DepthSensorModel
 from bidnerf_core.frames.frame import Frame, View
+from bidnerf_core.geometry.independent import USUAL
 from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import LandmarkThresholds, landmark_verdict
 from bidnerf_core.localization.by_colour import TYPICAL_ERRORS, refine_by_colour
@@ -259,7 +260,7 @@ def by_colour(
     T, none = predicted.T_world_camera, torch.zeros(0, dtype=torch.float64)
     start = SearchResult(T[None], torch.zeros(1, dtype=torch.float64), math.inf, T[None], none)
     answer = refine_by_colour(problem, start, config, Generator().manual_seed(state.frames))
-    covariance = answer.refined.covariance * max(1.0, config.steps.fine_rays / problem.independent.rays_alone)
+    covariance = answer.refined.covariance * max(1.0, config.steps.fine_rays / USUAL.rays_alone)
     if not bool(covariance.isfinite().all()):
         covariance = predicted.covariance
     pose = PoseEstimate(

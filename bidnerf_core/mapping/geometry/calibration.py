@@ -148,6 +148,8 @@ FIXED = CalibrationPrior()
 """Intrinsics that are not estimated."""
 CALIBRATED = CalibrationPrior(log_focal=0.002, shift=0.002, radial=0.002, stretch=0.001)
 """Intrinsics from a good calibration."""
+RIGHT = CalibrationPrior(log_focal=0.005, shift=0.005, radial=0.005, stretch=0.001)
+"""Intrinsics that are right as far as is known: most are calibrated well, but some part of a few is not."""
 USUALLY, MISTAKES, CROPS = 0.35, 0.05, 0.02
 """Shares of cameras whose stated intrinsics are as inexact as usual, wrong, and those of a larger image; others are calibrated."""
 USUAL = CalibrationPrior(log_focal=0.01, shift=0.01, radial=0.01, stretch=0.001)
