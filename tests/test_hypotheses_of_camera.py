@@ -89,7 +89,7 @@ def probability(found: Posterior, group: str) -> float:
     ("true", "name"),
     [
         (GIVEN, STATED),
-        (Calibration(log_focal=0.012), INEXACT),
+        (Calibration(log_focal=0.025), INEXACT),
         (Calibration(log_focal=0.08), "mistaken focal length"),
         (Calibration(shift_u=0.09, shift_v=-0.04), "cropped"),
         (Calibration(log_focal=0.06, radial=0.06), "mistaken"),

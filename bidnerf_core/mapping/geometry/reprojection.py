@@ -58,28 +58,11 @@ class RobustEquations:
 
     @cached_property
     def covariance(self) -> Array:
-        """The covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3).
-
-        S is at least the Hessian, in any direction: with few residuals for their number of unknowns, the fit makes their gradients
-        cancel, and their scatter is then too small (MacKinnon and White 1985).
-        """
+        """The covariance of an M-estimator, ``A^-1 S A^-1`` with curvature A and scatter S (Huber 1981, 6.3)."""
         inverse = self.inverse_curvature
         with np.errstate(over="ignore", invalid="ignore"):
-            found: Array = inverse @ self._least_scatter() @ inverse
+            found: Array = inverse @ self.scatter @ inverse
             return (found + found.T) / 2
-
-    def _least_scatter(self) -> Array:
-        """Return the scatter, where it is less than the Hessian in any direction enlarged to that."""
-        unit = np.sqrt(np.diag(self.hessian).clip(min=1e-300))
-        try:
-            root = unit[:, None] * np.linalg.cholesky(self.hessian / np.outer(unit, unit))
-        except np.linalg.LinAlgError:  # what the residuals do not determine
-            return self.scatter
-        half = np.linalg.solve(root, self.scatter)
-        values, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
-        axes = root @ vectors
-        found: Array = (axes * values.clip(min=1.0)) @ axes.T
-        return found
 
     def covariance_by_last(self, first: int) -> Array:
         """Return the part (6, 6) of the pose's covariance that is due to the unknowns from number ``first`` on.
