@@ -46,7 +46,7 @@ MOST = {
     "RGB, rendered, doubtful focal length": Most(1, 5, 10, 2, 54),
     "RGB, rendered, approximate":          Most(1, 3, 6, 1, 50),
     "RGB, rendered, resized":              Most(1, 3, 18, 1, 50),
-    "RGB, rendered, cropped":              Most(1, 6, 10, 2, 52),
+    "RGB, rendered, cropped":              Most(1, 6, 10, 2, 59),
     "RGB, rendered, moving rows":          Most(1, 2, 8, 1, 50),
     "RGB, rendered, mirrored":             Most(1, 4, 10, 2, 52),
     "first tracked frame, RGB-D":          Most(2, 3, 8, 1, 53),

@@ -107,6 +107,8 @@ def quick_auto(monkeypatch: pytest.MonkeyPatch) -> None:
         return auto(problem, few, seed)
 
     monkeypatch.setitem(registered, ("methods", "auto"), dataclasses.replace(METHODS["auto"], solve=quick))
+    # Other processes take the real one.
+    monkeypatch.setattr("bidnerf_core.evaluation.trials.registered_names", tuple)
 
 
 def given(page: Path) -> dict[str, Any]:

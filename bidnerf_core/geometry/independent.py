@@ -15,7 +15,7 @@ class Independent:
     """
 
     points: float = 10.0  # measured depth against the surface
-    rays: float = 30.0  # colours against rendered ones, beside landmarks
+    rays: float = 300.0  # colours against rendered ones, beside landmarks
     rays_alone: float = 10.0  # the same where they alone determine the pose, from a start that may be far off
     blurred: float = 60.0  # pixels of a small image against a rendering that is blurred to match
     # Points of a tracked frame beside landmarks: hand-held sensors err more than the figure for points says.
