@@ -138,7 +138,7 @@ def searched(scene: LandmarkMap, sizes: Sequence[int], views: Sequence[View]) ->
         query = View(without_depth(view).frame, SE3.identity())
         for number, matcher in enumerate(matchers):
             began = time.process_time()
-            found = propose(matcher, [query], seek_twin=True)
+            found = propose(matcher, [query], seek_rivals=True)
             seconds[number].append(time.process_time() - began)
             if found is not None and landmark_verdict(found).accepted:
                 error = pose_error(found.T_world_camera, view.T_ref_camera)

@@ -52,7 +52,7 @@ def problem(view: View) -> Problem:
 
 
 def refined_if_blurred(given: Problem, found: Localization) -> Localization:
-    return by_blurred_image.refined_if_blurred(given, found, rays=256, seed=0)
+    return by_blurred_image.refined_if_blurred(given, found)
 
 
 def answer(T: SE3, outcome: Outcome = Outcome.CONVERGED, confidence: float | None = None) -> Localization:

@@ -15,13 +15,12 @@ from bidnerf_core.localization import (
     LandmarkAnswer,
     LandmarkMatcher,
     Problem,
-    Verdict,
     answer_by_landmarks,
     rig,
 )
-from bidnerf_core.localization.mirror_rejection import mirror_rejection
-from bidnerf_core.localization.rendered_evidence import NOISIEST, log_odds_by_rendering
-from bidnerf_core.localization.search.mirrored import MirrorEvidence, mirror_image
+from bidnerf_core.localization.acceptance import LandmarkDiagnostics
+from bidnerf_core.localization.alternatives import NOISIEST, decide, log_odds_by_rendering
+from bidnerf_core.localization.search.mirrored import mirror_image
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import CAMERA, TexturedGround, seen, textured_map, unseen
 
@@ -64,7 +63,7 @@ def test_more_rays_than_pixels_tell_no_more(monkeypatch: pytest.MonkeyPatch) -> 
 
     few = [hidden(problem()), hidden(problem(stated(1.03)))]
     told = log_odds_by_rendering(*few, seed=0)
-    monkeypatch.setattr("bidnerf_core.localization.rendered_evidence.COMPARED_RAYS", 100_000)
+    monkeypatch.setattr("bidnerf_core.localization.alternatives.COMPARED_RAYS", 100_000)
     assert log_odds_by_rendering(*few, seed=0) == told
     assert told < 0.6 * enough
 
@@ -150,24 +149,26 @@ def test_intrinsics_that_renderings_contradict_are_estimated() -> None:
 
 
 def test_a_mirrored_image_stays_rejected_where_renderings_are_compared() -> None:
-    frame = replace(unseen().frame, depth=None)
-    problem = rig(textured_map(), [View(mirror_image(frame), SE3.identity())], unseen().T_ref_camera)
-    landmarks = textured_map().landmarks
+    view, landmarks = View(replace(unseen().frame, depth=None), SE3.identity()), textured_map().landmarks
     assert landmarks is not None
-    rejection = mirror_rejection(problem, LandmarkMatcher(landmarks), log10_nfa=0.0, rays=1024, seed=0)
+    mirrored = replace(view, frame=mirror_image(view.frame))
+    problem = rig(textured_map(), [mirrored], None, matcher=LandmarkMatcher(landmarks))
+    rejection = decide(problem, unseen().T_ref_camera, None, rays=1024, seed=0).rejection
     assert rejection is not None
     assert rejection.outcome is Outcome.MIRRORED
-
-
-def keep_open(self: MirrorEvidence, log10_nfa: float) -> Verdict:
-    return Verdict(Outcome.AMBIGUOUS, "both match as well")
 
 
 @pytest.mark.parametrize(("rays", "expected"), [(1024, Outcome.CONVERGED), (0, Outcome.AMBIGUOUS)])
 def test_renderings_decide_where_keypoints_do_not_tell_an_image_from_its_mirror_image(
     rays: int, expected: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(MirrorEvidence, "rejection", keep_open)
-    monkeypatch.setattr("bidnerf_core.localization.mirror_rejection.SUSPICIOUS", -1e6)
+    """As many landmarks are made to match the mirror image as the image, and the mirror image's pose is the best there is."""
     localizer = Localizer(textured_map(surface=True), "auto", AutoConfig(fused_rays=rays))
-    assert localizer(replace(unseen().frame, depth=None)).outcome is expected
+    frame = replace(unseen().frame, depth=None)
+    known = localizer(frame).diagnostics
+    assert isinstance(known, LandmarkDiagnostics)
+    monkeypatch.setattr("bidnerf_core.localization.alternatives.UNMISTAKABLE", -1e6)
+    monkeypatch.setattr(
+        "bidnerf_core.localization.alternatives.mirror_evidence", lambda *_: (known.agreeing, known.log10_nfa)
+    )
+    assert localizer(frame).outcome is expected

@@ -20,8 +20,9 @@ from bidnerf_core.localization import (
     propose,
     rig,
 )
+from bidnerf_core.localization.alternatives import Decision, decide
+from bidnerf_core.localization.search.chance import log_odds_of_share
 from bidnerf_core.localization.tracking.relocalization import relocalized
-from bidnerf_core.localization.twin_rejection import twin_rejection
 from bidnerf_core.mapping import LandmarkMap, build_landmarks
 from bidnerf_core.results.errors import pose_error
 from bidnerf_core.testing.textured_field import BOUNDS, CAMERA, ground, textured_map, unseen
@@ -60,26 +61,26 @@ def test_the_twin_is_where_the_copy_shows_the_same(views: int) -> None:
     places = [looking_in(0.3), POSE][-views:]
     shown = [points.view(T, T_ref_camera=T) for T in places]
     proposed, confirmed = (
-        propose(matcher, shown, points, seek_twin=True),
-        confirm(matcher, shown, POSE, points, seek_twin=True).pose,
+        propose(matcher, shown, points, seek_rivals=True),
+        confirm(matcher, shown, POSE, points, seek_rivals=True).pose,
     )
     for found in (proposed, confirmed):
         assert found is not None
-        assert found.twin is not None
+        (twin,) = found.rivals
         at_copy = pose_error(found.T_world_camera, POSE).translation > 1
         other = POSE if at_copy else COPY @ POSE
-        assert pose_error(found.twin.T_world_rig, other).translation < 0.02
-        assert found.twin.share == pytest.approx(1, abs=0.2)
+        assert pose_error(twin.T_world_rig, other).translation < 0.02
+        assert abs(twin.log_odds) < 1.5
 
 
 @pytest.mark.parametrize(("share", "has_twin"), [(0.0, False), (0.15, False), (0.4, False), (0.65, True)])
 def test_a_scene_of_which_little_is_repeated_has_no_twin(share: float, has_twin: bool) -> None:
     points, landmarks = points_and_landmarks()
     matcher = LandmarkMatcher(twice(landmarks, COPY, share))
-    found = propose(matcher, [points.view(POSE)], points, seek_twin=True)
+    found = propose(matcher, [points.view(POSE)], points, seek_rivals=True)
     assert found is not None
     assert pose_error(found.T_world_camera, POSE).translation < 0.02
-    assert (found.twin is not None) is has_twin
+    assert bool(found.rivals) is has_twin
 
 
 def ground_twice() -> LandmarkMatcher:
@@ -96,13 +97,17 @@ def ground_problem(start: SE3 | None = None) -> Problem:
 
 def both_ways() -> tuple[LandmarkPose, LandmarkPose]:
     """Return the pose at the ground whose twin is at its copy, and the other way round."""
-    found = propose(ground_twice(), ground_problem().views, seek_twin=True)
+    found = propose(ground_twice(), ground_problem().views, seek_rivals=True)
     assert found is not None
-    assert found.twin is not None
-    twin = replace(found.twin, T_world_rig=found.T_world_camera)
-    other = replace(found, T_world_camera=found.twin.T_world_rig, twin=twin)
+    (twin,) = found.rivals
+    rival = replace(twin, T_world_rig=found.T_world_camera, log_odds=-twin.log_odds)
+    other = replace(found, T_world_camera=twin.T_world_rig, rivals=(rival,))
     at_copy = pose_error(found.T_world_camera, unseen().T_ref_camera).translation > 1
     return (other, found) if at_copy else (found, other)
+
+
+def decided(found: LandmarkPose, rays: int) -> Decision:
+    return decide(ground_problem(), found.T_world_camera, found, rays, seed=0)
 
 
 def off_by(T: SE3, metres: float) -> SE3:
@@ -139,28 +144,31 @@ def test_a_start_between_the_places_decides_nothing() -> None:
 
 def test_renderings_tell_places_apart_that_look_different() -> None:
     here, there = both_ways()
-    assert twin_rejection(ground_problem(), here, None, rays=1024, seed=0) is None
-    assert twin_rejection(ground_problem(), there, None, rays=1024, seed=0) is not None
-    assert twin_rejection(ground_problem(), here, None, rays=0, seed=0) is not None
+    assert decided(here, rays=1024).rejection is None
+    assert decided(there, rays=1024).better is there.rivals[0]
+    assert decided(here, rays=0).rejection is not None
+    assert decided(there, rays=0).better is None
     assert_right(localize(ground_problem(), "auto", AutoConfig(fused_rays=256)))
 
 
 def test_renderings_of_the_same_do_not_tell() -> None:
     here, _ = both_ways()
-    assert here.twin is not None
-    same = replace(here, twin=replace(here.twin, T_world_rig=here.T_world_camera))
-    verdict = twin_rejection(ground_problem(), same, None, rays=1024, seed=0)
+    (view,) = ground_problem().views
+    noise = 0.02 * torch.randn(view.frame.rgb.shape, generator=torch.Generator().manual_seed(0))
+    noisy = replace(view, frame=replace(view.frame, rgb=(view.frame.rgb + noise).clamp(0, 1)))
+    wide = replace(BOUNDS, lower=(-1e3, -1e3, -1e3), upper=(1e3, 1e3, 1e3))
+    twice = replace(ground_problem(), views=(noisy,), field=DoubledField(ground(), BOUNDS, COPY), bounds=wide)
+    verdict = decide(twice, here.T_world_camera, here, rays=1024, seed=0).rejection
     assert verdict is not None
     assert verdict.outcome is Outcome.AMBIGUOUS
 
 
 def test_clearly_more_landmarks_decide_where_nothing_is_rendered() -> None:
     here, _ = both_ways()
-    assert here.twin is not None
+    (twin,) = here.rivals
     for share, is_rejected in ((0.6, False), (0.9, True)):
-        found = replace(here, twin=replace(here.twin, share=share))
-        verdict = twin_rejection(ground_problem(), found, None, rays=0, seed=0)
-        assert (verdict is not None) is is_rejected
+        found = replace(here, rivals=(replace(twin, log_odds=log_odds_of_share(share)),))
+        assert (decided(found, rays=0).rejection is not None) is is_rejected
 
 
 def test_a_pose_by_descent_is_rejected_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,10 +189,13 @@ def test_a_tracker_does_not_begin_at_either_place_without_a_start() -> None:
     frame, truth = replace(unseen().frame, depth=None), unseen().T_ref_camera
     landmarks = ground_twice().landmarks
     doubled = replace(textured_map(), landmarks=landmarks)
-    localizer = Localizer(doubled, "auto", AutoConfig())
+    localizer = Localizer(doubled, "auto", AutoConfig(fused_rays=0))
     lost = relocalized(localizer, frame, None, 0, 0)
     assert lost is not None
     assert not lost.converged
     found = relocalized(localizer, frame, off_by(truth, 2.0), 0, 0)
     assert found is not None
     assert_right(found)
+    rendered = relocalized(Localizer(doubled, "auto", AutoConfig()), frame, None, 0, 0)
+    assert rendered is not None
+    assert_right(rendered)

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from bidnerf_core.depth.sensors import find_depth_sensor
 from bidnerf_core.errors import InputError
-from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.acceptance import (
     LandmarkDiagnostics,
     LandmarkThresholds,
     SurfaceThresholds,
     landmark_verdict,
 )
+from bidnerf_core.localization.alternatives import decide
 from bidnerf_core.localization.ambiguous_intrinsics import without_ambiguous_intrinsics
 from bidnerf_core.localization.by_blurred_image import refined_if_blurred
 from bidnerf_core.localization.by_colour import without_the_imprecise
@@ -30,23 +30,21 @@ from bidnerf_core.localization.by_landmarks import (
     MOSTLY_ON_SURFACE,
     LandmarkAnswer,
     answer_by_landmarks,
-    corrected,
     fused_answer,
     localization_by_landmarks,
 )
 from bidnerf_core.localization.confidence import TRUSTED
 from bidnerf_core.localization.covariance import position_deviation
+from bidnerf_core.localization.depth_scale import corrected
 from bidnerf_core.localization.first_order import BidConfig, bid
 from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import confirm
 from bidnerf_core.localization.methods import Method
-from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.occluders import nearest_piece
 from bidnerf_core.localization.settings import LEAST_POINTS, AutoConfig
-from bidnerf_core.localization.twin_rejection import between_twins, twin_rejection
 
 FINAL = (Outcome.MISCALIBRATED, Outcome.MIRRORED)
 """Outcomes of a pose by landmarks that no other measurement can put right: with wrong intrinsics, aligning points with the
@@ -72,9 +70,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     and there is no start.
     """
     problem = replace(problem, sensor=find_depth_sensor(config.depth_sensor))
-    found = without_ambiguous_intrinsics(_found(problem, config, seed), problem)
-    if config.fused_rays:
-        found = refined_if_blurred(problem, found, config.fused_rays, seed)
+    found = _judged(problem, config, seed)
     if _is_settled(found) or found.outcome in FINAL or problem.surface is None:
         return found
     occluder = nearest_piece(problem)
@@ -82,7 +78,7 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
         return found
     if found.converged and occluder.share_in_front(problem.surface, found.T_world_camera) < IN_FRONT:
         return found
-    rest = without_ambiguous_intrinsics(_found(occluder.rest, config, seed), occluder.rest)
+    rest = _judged(occluder.rest, config, seed)
     seconds = found.seconds + rest.seconds
     if not rest.converged or occluder.share_in_front(problem.surface, rest.T_world_camera) < IN_FRONT:
         return replace(found, seconds=seconds)
@@ -92,50 +88,66 @@ def auto(problem: Problem, config: AutoConfig, seed: int = 0) -> Localization:
     return replace(rest, reason=f"{rest.reason}, {hidden}", seconds=seconds)
 
 
-def _found(problem: Problem, config: AutoConfig, seed: int) -> Localization:
-    began, answer, matcher = time.perf_counter(), None, problem.matcher if config.landmarks else None
-    given = problem.start
+@dataclass(frozen=True, eq=False)
+class _Proposal:
+    """A pose that may be the answer."""
+
+    found: Localization
+    near: LandmarkPose | None = None  # what landmarks say about a pose that was found by other means
+    decided: bool = False  # whether it was compared with other explanations
+
+
+def _judged(problem: Problem, config: AutoConfig, seed: int) -> Localization:
+    """Return the best pose, rejected if another explanation of the images may be right."""
+    began, rays = time.perf_counter(), config.fused_rays
+    proposal = _proposed(problem, config, seed, began)
+    before = without_ambiguous_intrinsics(proposal.found, problem)
+    found = refined_if_blurred(problem, before) if rays else before
+    decided = proposal.decided and before.converged
+    if found.converged and config.landmarks and not decided:
+        why = decide(problem, found.T_world_camera, proposal.near, rays, seed).rejection
+        found = found if why is None else _rejected(found, why)
+    return replace(found, seconds=time.perf_counter() - began)
+
+
+def _proposed(problem: Problem, config: AutoConfig, seed: int, began: float) -> _Proposal:
+    answer, matcher = None, problem.matcher if config.landmarks else None
     if matcher is not None:
         answer = answer_by_landmarks(problem, matcher, config.fused_rays, seed)
-    if answer is not None and matcher is not None:
-        here = corrected(problem, answer.found)
-        rejection = mirror_rejection(here, matcher, answer.found.log10_nfa, config.fused_rays, seed)
-        answer = answer if rejection is None else replace(answer, verdict=rejection, confidence=None)
-        was_accepted = answer.verdict.accepted
-        answer = between_twins(problem, matcher, answer, given, config.fused_rays, seed)
-        if was_accepted and not answer.verdict.accepted:  # the surface, too, is taken to look the same there
-            return localization_by_landmarks(problem, answer, began)
     has_points = _measured_points(problem) >= LEAST_POINTS
     doubtful = answer is not None and has_points and _is_doubtful(problem, answer)
-    if answer is not None and not doubtful and _is_final(answer, has_points):
-        return localization_by_landmarks(problem, answer, began)
-    if answer is not None and problem.start is None:
-        problem = replace(problem, start=answer.T)  # one more place to look
+    by_landmarks = None
+    if answer is not None:
+        by_landmarks = _Proposal(localization_by_landmarks(problem, answer, began), decided=True)
+        if not doubtful and _is_final(answer, has_points):
+            return by_landmarks
+        if problem.start is None:
+            problem = replace(problem, start=answer.T)  # one more place to look
     if problem.surface is None:
         found = _descended(problem, seed, "the map has no surface ('bidnerf bake' makes one)")
         if matcher is None or not found.converged:
-            return found
-        near = confirm(matcher, problem.views, found.T_world_camera, seek_twin=True).pose
-        return _unless_twin(found, near, problem, given, config, seed)
+            return _Proposal(found)
+        return _Proposal(found, confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True).pose)
     if has_points:
         found = localized_by_depth(problem, problem.surface, config, seed)
         if (
             answer is not None
+            and by_landmarks is not None
             and answer.verdict.accepted
             and not (found.converged and _leaves_surface(problem, found, answer))
         ):
-            return localization_by_landmarks(problem, answer, began)
+            return by_landmarks
     else:
         found = localized_by_images(problem.without_depth(), problem.surface, config, seed)
         typical = 0.0 if matcher is None else matcher.landmarks.trial.translation
         found = without_the_imprecise(found, typical)
     if matcher is None:
-        return found if problem.matcher is not None else _without_landmarks(found)
-    found = _compared_with_landmarks(found, problem, given, matcher, config, seed, began)
-    found = replace(found, seconds=time.perf_counter() - began)
-    if answer is not None and found.outcome is Outcome.TOO_FEW_MATCHES and answer.verdict.outcome in UNSURE:
-        return localization_by_landmarks(problem, answer, began)
-    return found
+        return _Proposal(found if problem.matcher is not None else _without_landmarks(found))
+    proposal = _compared_with_landmarks(found, problem, matcher, config, seed, began)
+    is_unsure = answer is not None and answer.verdict.outcome in UNSURE
+    if by_landmarks is not None and is_unsure and proposal.found.outcome is Outcome.TOO_FEW_MATCHES:
+        return by_landmarks
+    return proposal
 
 
 def _without_landmarks(found: Localization) -> Localization:
@@ -168,6 +180,8 @@ def _is_final(answer: LandmarkAnswer, has_points: bool) -> bool:
 
     Colours do not determine a position that landmarks leave imprecise because the intrinsics are unknown.
     """
+    if answer.has_rival:
+        return True  # the surface, too, is taken to look the same there
     outcome = answer.verdict.outcome
     unknown_camera = outcome is Outcome.IMPRECISE and answer.found.estimates_calibration
     if outcome is Outcome.UNCERTAIN or unknown_camera:
@@ -183,19 +197,17 @@ def _rejected(found: Localization, why: Verdict) -> Localization:
 def _compared_with_landmarks(
     found: Localization,
     problem: Problem,
-    start: SE3 | None,
     matcher: LandmarkMatcher,
     config: AutoConfig,
     seed: int,
     began: float,
-) -> Localization:
+) -> _Proposal:
     """Refine a pose found on the surface by the landmarks that match there, or reject it if they should match and do not.
 
-    ``start`` is what the user gave.
     Landmarks with less confidence than ``LEAST_TO_MOVE`` confirm an accepted pose by depth, but do not move it if the measured points
     determine it better.
     """
-    near = confirm(matcher, problem.views, found.T_world_camera, seek_twin=True)
+    near = confirm(matcher, problem.views, found.T_world_camera, seek_rivals=True)
     verdict = None if near.pose is None else landmark_verdict(near.pose, WITHOUT_SEARCH)
     if near.pose is not None and verdict is not None and verdict.accepted:
         answer = fused_answer(problem, near.pose, verdict, config.fused_rays, seed, searched=False)
@@ -203,47 +215,17 @@ def _compared_with_landmarks(
         supported = found.converged and confidence >= LEAST_SUPPORT
         answer = replace(answer, verdict=verdict) if supported else answer
         refined = localization_by_landmarks(problem, answer, began)
-        here, evidence = corrected(problem, near.pose), near.pose.log10_nfa
-        rejection = mirror_rejection(here, matcher, evidence, config.fused_rays, seed)
-        rejection = rejection or twin_rejection(problem, near.pose, start, config.fused_rays, seed)
-        if rejection is not None:
-            return _rejected(refined, rejection)
-        if found.converged and _leaves_surface(problem, found, answer):
-            return found
-        if (
-            supported
-            and confidence < LEAST_TO_MOVE
-            and _is_surer(found, answer)
-            and _keeps_points(problem, near.pose)
-        ):
-            return found
-        return replace(refined, reason=f"found on the surface; {refined.reason}")
+        stays = found.converged and _leaves_surface(problem, found, answer)
+        if supported and confidence < LEAST_TO_MOVE and _is_surer(found, answer):
+            stays = stays or _keeps_points(problem, near.pose)
+        refined = replace(refined, reason=f"found on the surface; {refined.reason}")
+        return _Proposal(found if stays else refined, near.pose)
     if found.converged and near.contradicts:
         why = f"{near.matches} landmarks match, {near.chance:.0f} by chance, of {near.visible} that should be visible"
-        return replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
-    if found.converged and verdict is not None and _is_misled(verdict, problem):
-        reason = f"{verdict.reason}; {found.reason}"
-        return replace(found, outcome=Outcome.MISCALIBRATED, reason=reason, confidence=None)
-    if not found.converged:
-        return found
-    here = replace(problem, start=found.T_world_camera)
-    rejection = mirror_rejection(here, matcher, 0.0, config.fused_rays, seed)
-    if rejection is not None:
-        return _rejected(found, rejection)
-    return _unless_twin(found, near.pose, problem, start, config, seed)
-
-
-def _unless_twin(
-    found: Localization,
-    near: LandmarkPose | None,
-    problem: Problem,
-    start: SE3 | None,
-    config: AutoConfig,
-    seed: int,
-) -> Localization:
-    """Return an accepted pose that was not found by landmarks, rejected if those ``near`` it match at another place as well."""
-    rejection = None if near is None else twin_rejection(problem, near, start, config.fused_rays, seed)
-    return found if rejection is None else _rejected(found, rejection)
+        found = replace(found, outcome=Outcome.TOO_FEW_MATCHES, reason=f"{why}; {found.reason}")
+    elif found.converged and verdict is not None and _is_misled(verdict, problem):
+        found = _rejected(found, replace(verdict, outcome=Outcome.MISCALIBRATED))
+    return _Proposal(found, near.pose)
 
 
 def _is_misled(near: Verdict, problem: Problem) -> bool:

@@ -30,7 +30,6 @@ from bidnerf_core.localization.costs.images import (
     thumbnail,
 )
 from bidnerf_core.localization.covariance import LEAST_VARIANCE, position_deviation
-from bidnerf_core.localization.mirror_rejection import mirror_rejection
 from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.solvers.levenberg_marquardt import Descent, descend
@@ -58,12 +57,11 @@ UNSUITABLE = (
 """Outcomes of poses that a closer comparison cannot put right."""
 
 
-def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: int) -> Localization:
+def refined_if_blurred(problem: Problem, found: Localization) -> Localization:
     """Return a doubtful pose refined and judged anew if the images are blurrier than what the field renders from there.
 
     A pose is returned as it is where depth was measured, part of an image is hidden, the intrinsics were corrected, are
     approximate or differ a little from those of the map's images, the field itself is not sharp, or the map has no surface.
-    ``rays`` and ``seed`` are passed to ``mirror_rejection``, which judges only the poses that were not accepted before.
     """
     if not _is_eligible(problem, found):
         return found
@@ -90,9 +88,6 @@ def refined_if_blurred(problem: Problem, found: Localization, rays: int, seed: i
     middle = seen.points[0].median(0).values.to("cpu", torch.float64)
     apart = support(blurred.pixel_costs, done[-1].T[0], middle, plain)
     verdict = _verdict(apart, precision)
-    if verdict.accepted and not found.converged and problem.matcher is not None:
-        there = replace(problem, start=T)
-        verdict = mirror_rejection(there, problem.matcher, 0.0, rays, seed) or verdict
     return replace(
         found,
         T_world_camera=T,

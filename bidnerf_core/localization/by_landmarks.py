@@ -19,11 +19,12 @@ from bidnerf_core.localization.acceptance import (
     landmark_diagnostics,
     landmark_verdict,
 )
+from bidnerf_core.localization.alternatives import decide, log_odds_by_rendering, pose_at
 from bidnerf_core.localization.confidence import judged
 from bidnerf_core.localization.costs.prior import GaussianPrior
 from bidnerf_core.localization.costs.surface import PointCloud, SurfaceCost
 from bidnerf_core.localization.covariance import position_deviation
-from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints
+from bidnerf_core.localization.depth_scale import DepthScale, ScaledPoints, corrected
 from bidnerf_core.localization.fusion import (
     FusedPose,
     Measurements,
@@ -36,7 +37,6 @@ from bidnerf_core.localization.landmarks.hypotheses import ESTIMATED
 from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
 from bidnerf_core.localization.landmarks.propose import propose, updated
 from bidnerf_core.localization.problem import Problem
-from bidnerf_core.localization.rendered_evidence import log_odds_by_rendering
 from bidnerf_core.localization.result import Localization, Outcome, Verdict
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.solvers.pivots import pivot
@@ -46,6 +46,8 @@ POINTS = 2000
 """Largest number of measured points that are fused."""
 STEPS = 8
 """Largest number of steps on the sum of all terms."""
+FEW_STEPS = 2
+"""Number of steps from a pose by landmarks to the one that suits other intrinsics best."""
 BASIN = 1.0
 """Deviation of a pose by landmarks, in pixels, beyond which rays may lead from there to a wrong pose."""
 THOROUGHLY = 4
@@ -75,6 +77,7 @@ class LandmarkAnswer:
     depth_factor: float = 1.0  # by which the fused pose lengthens depths beyond what ``corrected`` does
     left_out: str = ""  # what was not fused because it contradicts them
     confidence: float | None = None  # probability that the pose is right
+    has_rival: bool = False  # whether it is rejected because another explanation may be the right one
 
     @property
     def full_covariance(self) -> Float[Tensor, "6 6"]:
@@ -86,17 +89,26 @@ class LandmarkAnswer:
 
 
 def answer_by_landmarks(
-    problem: Problem, matcher: LandmarkMatcher, rays: int, seed: int
+    problem: Problem, matcher: LandmarkMatcher, rays: int, seed: int, fused: bool = True
 ) -> LandmarkAnswer | None:
-    """Find the pose by landmarks and, if it is accepted, refine it on all terms at once.
+    """Find the pose by landmarks, decide between it and other explanations, and refine it on all terms at once if it is accepted.
 
     Returns None if too few features match. ``rays`` is the number of rays rendered for the refinement; 0 disables rendering,
-    even where it would show which intrinsics are right.
+    even where it would show which intrinsics or which pose are right. ``fused``: whether rays are part of the refinement.
     """
-    found = propose(matcher, problem.views, seed=seed, seek_twin=True)
-    if found is not None and rays:
-        found = _with_camera_rendered(problem, found, seed)
-    return None if found is None else fused_answer(problem, found, landmark_verdict(found), rays, seed)
+    found = propose(matcher, problem.views, seed=seed, seek_rivals=True)
+    if found is None:
+        return None
+    found = _with_camera_rendered(problem, found, seed) if rays else found
+    verdict, decision = landmark_verdict(found), decide(problem, found.T_world_camera, found, rays, seed)
+    fused_rays = rays if fused else 0
+    if decision.rejection is None or not (verdict.accepted or decision.rejection.outcome is Outcome.MIRRORED):
+        return fused_answer(problem, found, verdict, fused_rays, seed)
+    there = None if decision.better is None else pose_at(problem, matcher, found, decision.better)
+    if there is not None and landmark_verdict(there).accepted:
+        return fused_answer(problem, there, landmark_verdict(there), fused_rays, seed)
+    answer = fused_answer(problem, found, decision.rejection, 0, seed)
+    return replace(answer, confidence=None, has_rival=True)
 
 
 def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> LandmarkPose:
@@ -113,7 +125,7 @@ def _with_camera_rendered(problem: Problem, found: LandmarkPose, seed: int) -> L
         for view, given in zip(here.views, problem.views, strict=True)
     )
     there = replace(here, views=views, start=found.T_world_camera.retract(posterior.shift(other)))
-    odds = log_odds_by_rendering(there, here, seed)
+    odds = log_odds_by_rendering(there, here, seed, steps=FEW_STEPS)
     if other.hypothesis.group == ESTIMATED:
         odds = max(odds, 0.0)  # an inexact estimate renders badly even if the stated intrinsics are wrong
     return updated(found, {other.hypothesis.group: odds})
@@ -149,20 +161,6 @@ def _judged(answer: LandmarkAnswer, approximate: bool) -> LandmarkAnswer:
     """Return the answer with its confidence, which can turn its verdict into a rejection."""
     judgement = judged(answer.verdict, answer.diagnostics, approximate)
     return replace(answer, verdict=judgement.verdict, confidence=judgement.confidence)
-
-
-def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Problem:
-    """Return the problem with a pose as its start, that pose's intrinsics and motion, and measured depth on the map's scale.
-
-    ``factor`` is the fused pose's correction of that scale.
-    """
-    scale, views = factor * DepthScale.of(found, problem.sensor).estimate, []
-    for view in problem.views:
-        depth = None if view.frame.depth is None else view.frame.depth * scale
-        camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics
-        frame = replace(view.frame, depth=depth, intrinsics=camera)
-        views.append(replace(view, frame=frame, motion=found.motion))
-    return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 
 def is_sharp(problem: Problem) -> bool:

@@ -14,6 +14,7 @@ from bidnerf_core.geometry.se3 import SE3
 from bidnerf_core.localization.costs.surface import SurfaceCost
 from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose
 from bidnerf_core.localization.normal_equations import NormalEquations
+from bidnerf_core.localization.problem import Problem
 from bidnerf_core.localization.solvers.pivots import Pivot
 
 LANDMARK_SCALE_NOISE = 0.01
@@ -57,6 +58,20 @@ class DepthScale:
             return 1.0
         weight = self.deviation**2 / (self.deviation**2 + LANDMARK_SCALE_NOISE**2)
         return 1 + weight * (self.by_landmarks - 1)
+
+
+def corrected(problem: Problem, found: LandmarkPose, factor: float = 1.0) -> Problem:
+    """Return the problem with a pose as its start, that pose's intrinsics and motion, and measured depth on the map's scale.
+
+    ``factor`` is the fused pose's correction of that scale.
+    """
+    scale, views = factor * DepthScale.of(found, problem.sensor).estimate, []
+    for view in problem.views:
+        depth = None if view.frame.depth is None else view.frame.depth * scale
+        camera = found.intrinsics_of(view.frame.intrinsics) or view.frame.intrinsics
+        frame = replace(view.frame, depth=depth, intrinsics=camera)
+        views.append(replace(view, frame=frame, motion=found.motion))
+    return replace(problem, start=found.T_world_camera, views=tuple(views))
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,11 +25,12 @@ of 153 such poses lie inside their 95 % bound in the record ``faults_camera``.
 
 
 @dataclass(frozen=True, eq=False)
-class Twin:
-    """Another pose with which about as many landmarks agree."""
+class Rival:
+    """Another pose that explains the keypoints about as well."""
 
     T_world_rig: SE3
-    share: float  # ratio of its correspondences to those of the pose itself, those by chance left out of both
+    log_odds: float  # of the pose itself against this one, by landmarks
+    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ class LandmarkPose:
     depth_scale: float | None  # factor that corrects measured depth; None if too little was measured
     # With which far more matches agree, but which no pose could be refined with.
     better_camera: Calibration | None = None
-    twin: Twin | None = None  # if sought and found: another pose with which about as many landmarks agree
+    rivals: tuple[Rival, ...] = ()  # if sought: other poses that explain the keypoints about as well
     guided: GuidedPose | None = (
         None  # what evidence about the camera is added to; None for followed landmarks
     )

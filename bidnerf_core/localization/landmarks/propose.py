@@ -23,7 +23,7 @@ from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
 from bidnerf_core.localization.search.correspondences import LandmarkMatches, query_images
 from bidnerf_core.localization.search.matching import LandmarkMatcher
 from bidnerf_core.localization.search.ransac import Hypothesis, focal_consensus, sample_consensus
-from bidnerf_core.localization.search.twins import twin_of
+from bidnerf_core.localization.search.twins import second_of_plane, twin_of
 from bidnerf_core.localization.search.unguided import unguided_matches
 from bidnerf_core.mapping.geometry.calibration import FIXED, NOMINAL, Calibration, CalibrationPrior
 from bidnerf_core.mapping.landmarks.features import Features
@@ -48,14 +48,14 @@ def propose(
     features: Features | None = None,
     seed: int = 0,
     prior: CalibrationPrior | None = None,
-    seek_twin: bool = False,
+    seek_rivals: bool = False,
     moving: bool = True,
 ) -> LandmarkPose | None:
     """Find the pose of the last of ``views``, whose relative poses are known; None if too few landmarks match.
 
     ``prior``: how uncertain the given intrinsics are; by default they are fixed, or ``NOMINAL`` for a camera whose focal length
     is approximate. ``features`` finds the keypoints, by default the detector of the map. One correction is estimated for all views; those of different cameras are taken as given.
-    ``seek_twin``: whether to look for another place that the images may show. ``moving``:
+    ``seek_rivals``: whether to look for other poses that the images may show. ``moving``:
     whether to estimate how the camera moved while the rows of its image were exposed, where that is evident.
     Raises ``InputError`` if there is no view.
     """
@@ -68,7 +68,7 @@ def propose(
         return None
     answer = refined_pose(query, matches, first)
     found = with_far_camera(query, matches, described(answer))
-    return _with_twin(query, matcher, found) if seek_twin else found
+    return _with_rivals(query, matcher, found) if seek_rivals else found
 
 
 def updated(found: LandmarkPose, log_odds: Mapping[str, float]) -> LandmarkPose:
@@ -79,7 +79,7 @@ def updated(found: LandmarkPose, log_odds: Mapping[str, float]) -> LandmarkPose:
     if found.guided is None:
         raise ValueError("landmarks that were followed have no posterior to add evidence to")
     again = described(found.guided.updated(log_odds))
-    return replace(again, better_camera=found.better_camera, twin=found.twin)
+    return replace(again, better_camera=found.better_camera, rivals=found.rivals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +102,12 @@ def confirm(
     views: Sequence[View],
     T_world_camera: SE3,
     features: Features | None = None,
-    seek_twin: bool = False,
+    seek_rivals: bool = False,
     rival: SE3 | None = None,
 ) -> Confirmation:
     """Match the landmarks near their projections at a pose of the last of ``views``, and refine it.
 
-    ``seek_twin`` is as in ``propose``. ``rival``: another pose; what matches there does not show that the camera is another.
+    ``seek_rivals`` is as in ``propose``. ``rival``: another pose; what matches only there does not show that the camera is another.
     """
     query = LandmarkQuery(
         query_images(views, features or matcher.features), matcher.landmarks, _calibration_prior(views)
@@ -116,7 +116,8 @@ def confirm(
     # Matches that were not sought near the pose are the evidence for it, and reveal another camera.
     by_descriptors = unguided_matches(query.images, matcher, STRONGEST)
     if rival is not None:
-        by_descriptors = by_descriptors[~agreeing_with(query, by_descriptors, rival)]
+        of_rival = agreeing_with(query, by_descriptors, rival)
+        by_descriptors = by_descriptors[~of_rival | agreeing_with(query, by_descriptors, T_world_camera)]
     answer = confirmed(query, by_descriptors, T_world_camera)
     if answer is None:
         return Confirmation(None, visible, matches, chance)
@@ -127,16 +128,16 @@ def confirm(
         pose, matches=len(pose.correspondences), agreeing=agreeing,
         better_camera=None if better is None else better.calibration,
     )  # fmt: skip
-    pose = _with_twin(query, matcher, pose) if seek_twin else pose
+    pose = _with_rivals(query, matcher, pose) if seek_rivals else pose
     return Confirmation(pose, visible, matches, chance)
 
 
-def _with_twin(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> LandmarkPose:
-    """Return a pose with its twin, if there is one, sought with the intrinsics that were taken or estimated."""
+def _with_rivals(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> LandmarkPose:
+    """Return a pose with its rivals, sought with the intrinsics that were taken or estimated."""
     cameras = [found.intrinsics_of(image.intrinsics) or image.intrinsics for image in query.images]
     seen = replace(query.seen_by(cameras), prior=FIXED)
-    twin = twin_of(seen, matcher, found)
-    return replace(found, twin=twin)
+    rivals = (twin_of(seen, matcher, found), second_of_plane(seen, found))
+    return replace(found, rivals=tuple(rival for rival in rivals if rival is not None))
 
 
 def _calibration_prior(views: Sequence[View]) -> CalibrationPrior:

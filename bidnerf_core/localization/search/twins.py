@@ -1,18 +1,29 @@
-"""A second place where about as many landmarks match: a scene that repeats itself, such as two rooms with the same furniture."""
+"""Rivals of a pose: other poses that explain an image's keypoints about as well.
+
+A scene may repeat itself, such as two rooms with the same furniture. A plane has a second pose, see ``planar_pose``.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization.beyond_chance import log_odds
 from bidnerf_core.localization.landmarks.guided_refinement import LEAST_GUIDED_MATCHES, RADII, confirmed
-from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose, Twin
+from bidnerf_core.localization.landmarks.landmark_pose import LandmarkPose, Rival
 from bidnerf_core.localization.landmarks.landmark_query import LandmarkQuery
+from bidnerf_core.localization.search.chance import DECISIVE, log_odds_of_share
 from bidnerf_core.localization.search.correspondences import LandmarkMatches
 from bidnerf_core.localization.search.matching import LandmarkMatcher
+from bidnerf_core.localization.search.planar_pose import second_pose
 from bidnerf_core.localization.search.ransac import sample_consensus
 from bidnerf_core.localization.search.unguided import LOOKED_UP
+from bidnerf_core.mapping.geometry.calibration import GIVEN
+from bidnerf_core.mapping.geometry.observations import ObservedPoints
 
 COMPARED = 100
 """Largest number of correspondences for which landmarks are sought elsewhere."""
@@ -20,11 +31,9 @@ ALIKE = 0.9
 """Least ratio of a correspondence's descriptor distance to that of a landmark elsewhere that looks as much like the keypoint."""
 LEAST_ALIKE = 0.3
 """Least share of the correspondences that must have such a landmark, and that must agree with one other pose."""
-RIVAL = 0.5
-"""Least ratio of the correspondences at a twin to those at the pose itself, those by chance left out of both."""
 
 
-def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> Twin | None:
+def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose) -> Rival | None:
     """Return the twin of a pose, or None; ``query`` has the intrinsics with which it was found.
 
     The keypoints of its correspondences are compared with landmarks at other places. Where a scene does not repeat itself, few look
@@ -43,7 +52,38 @@ def twin_of(query: LandmarkQuery, matcher: LandmarkMatcher, found: LandmarkPose)
     if there is None or _is_shared(there.correspondences, here):
         return None
     share = (len(there.correspondences) - there.visible_and_by_chance()[1]) / max(len(here) - found.chance, 1)
-    return Twin(there.fit.T_world_rig, share) if share >= RIVAL else None
+    odds, many = log_odds_of_share(share), f"{min(share, 1):.0%} as many"
+    return (
+        Rival(there.fit.T_world_rig, odds, f"{many} landmarks match at another place")
+        if odds < DECISIVE
+        else None
+    )
+
+
+def second_of_plane(query: LandmarkQuery, found: LandmarkPose) -> Rival | None:
+    """Return the second pose of a plane in which the correspondences nearly lie, or None if it fits clearly worse.
+
+    ``query`` is as for ``twin_of``.
+    """
+    if found.guided is None:
+        return None
+    data = query.observed(found.correspondences).without_motion(found.T_world_camera, found.motion)
+    here = replace(found.guided.fit, calibration=GIVEN, motion=torch.zeros_like(found.motion))
+    other = second_pose(data, here, query.landmarks.correlation_of(len(data)))
+    if other is None:
+        return None
+    T = other.fit.T_world_rig
+    there, before = (_off_in_depth(data, each) for each in (T, found.T_world_camera))
+    odds = other.log_odds + (float(log_odds(there[None], before)[0]) if len(before) > 1 else 0.0)
+    why = "the landmarks lie nearly in a plane, which looks alike from two poses"
+    return Rival(T, odds, why) if odds < DECISIVE else None
+
+
+def _off_in_depth(data: ObservedPoints, T_world_rig: SE3) -> Float[Tensor, "k"]:
+    """Return by how much, relatively, measured depths differ from those at a pose, up to a common factor."""
+    known = data.depth > 0
+    ratio = (data.in_camera(T_world_rig)[known, 2] / data.depth[known]).abs()
+    return (ratio / ratio.median() - 1).abs() if len(ratio) else ratio
 
 
 def _elsewhere(

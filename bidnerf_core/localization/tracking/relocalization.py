@@ -17,7 +17,6 @@ from bidnerf_core.localization.localizer import Localizer
 from bidnerf_core.localization.problem import Problem, SceneMap
 from bidnerf_core.localization.result import Localization
 from bidnerf_core.localization.settings import LEAST_POINTS
-from bidnerf_core.localization.twin_rejection import between_twins
 
 FIRST_FULL_SEARCH = 4
 """The number of lost frames after which the whole surface is searched; then again whenever that number has doubled."""
@@ -50,7 +49,7 @@ def relocalized(
     if localizer.matches_landmarks:
         problem = localizer.problem(frame)
         near = predicted if lost <= FIRST_FULL_SEARCH else None  # later predictions have drifted
-        found = _recognised(problem, near, seed)
+        found = _recognised(problem, near, localizer.config.fused_rays, seed)
         if (found is not None and found.converged) or not _searched(localizer, frame, lost):
             return found
         return localizer.solved(replace(problem, start=predicted), seed)
@@ -62,15 +61,12 @@ def relocalized(
         raise
 
 
-def _recognised(problem: Problem, near: SE3 | None, seed: int) -> Localization | None:
-    """Return the pose by landmarks alone, without rendering; of two places that look alike, the one at ``near``."""
+def _recognised(problem: Problem, near: SE3 | None, rays: int, seed: int) -> Localization | None:
+    """Return the pose by landmarks, with renderings only where other explanations are open; of two rivals, the one at ``near``."""
     assert problem.matcher is not None
     began = time.perf_counter()
-    answer = answer_by_landmarks(problem, problem.matcher, 0, seed)
-    if answer is None:
-        return None
-    answer = between_twins(problem, problem.matcher, answer, near, 0, seed)
-    return localization_by_landmarks(problem, answer, began)
+    answer = answer_by_landmarks(replace(problem, start=near), problem.matcher, rays, seed, fused=False)
+    return None if answer is None else localization_by_landmarks(problem, answer, began)
 
 
 def typical_error(localizer: Localizer) -> float:
