@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 from jaxtyping import Float
 from torch import Generator, Tensor
@@ -117,7 +118,9 @@ def _alternatives(
     log10_nfa = 0.0 if found is None else found.log10_nfa
     if problem.matcher is not None and log10_nfa > UNMISTAKABLE:
         yield _mirror(problem, problem.matcher, log10_nfa, seed)
-    for rival in () if found is None else found.rivals:
+    if found is None:
+        return
+    for rival in found.rivals:
         T, there = found.T_world_camera, rival.T_world_rig
         apart = float((there.translation - T.translation).norm())
         if apart <= LandmarkThresholds().precision * found.distance:
@@ -125,7 +128,7 @@ def _alternatives(
         odds = rival.log_odds
         if problem.start is not None:
             odds += _log_odds_by_start(problem.start, T, there, found.distance)
-        yield Alternative(odds, rival.reason, lambda there=there: replace(here, start=there), rival)
+        yield Alternative(odds, rival.reason, partial(replace, here, start=there), rival)
 
 
 def _mirror(problem: Problem, matcher: LandmarkMatcher, log10_nfa: float, seed: int) -> Alternative:

@@ -6,8 +6,8 @@ import math
 
 DECISIVE = 4.0
 """Log odds beyond which one of two explanations is right."""
-BY_SHARE = 8.0
-"""Log odds for each factor e between the numbers of landmarks that match: at the right place, seldom are less than 0.6 times as
+BY_SHARE = 10.0
+"""Log odds for each factor e between the numbers of landmarks that match: at the right place, seldom are less than two thirds as
 many as elsewhere.
 """
 
