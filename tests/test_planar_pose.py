@@ -8,11 +8,19 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
+from bidnerf_core import Outcome
 from bidnerf_core.geometry.se3 import SE3
+from bidnerf_core.localization import LandmarkPose, Problem, propose, rig
+from bidnerf_core.localization.alternatives import decide, pose_at
 from bidnerf_core.localization.search.planar_pose import second_pose, tilted_to_the_other_side
+from bidnerf_core.mapping import build_landmarks
 from bidnerf_core.mapping.geometry.observations import ObservedPoints
 from bidnerf_core.mapping.geometry.resection import resect
+from bidnerf_core.results.errors import pose_error
 from bidnerf_core.scenes.trajectories import look_at
+from bidnerf_core.testing.textured_field import textured_map
+from landmark_scene import Points, looking_in, ring
+from pinned_landmarks import PointMatcher
 
 FOCAL, NOISE = 400.0, 0.3  # pixels
 TILT = 0.5  # radians
@@ -90,3 +98,46 @@ def test_points_off_the_plane_leave_no_second_pose_that_fits() -> None:
     data = observed(T, solid)
     found = second_pose(data, resect(data, T, NOISE))
     assert found is None or found.log_odds > 10
+
+
+def poster(T: SE3, depth: float | None = None, start: SE3 | None = None) -> tuple[Problem, LandmarkPose]:
+    """Return an image of a small poster, seen from far away at an angle, and the pose that landmarks give it."""
+    points = Points(noise=0.3)
+    points.positions = points.positions * torch.tensor([0.3, 0.3, 0.0], dtype=torch.float64)
+    matcher = PointMatcher(build_landmarks(ring(points), points), points)
+    problem = rig(textured_map(), [points.view(T, depth=depth, seed=100)], start, matcher=matcher)
+    found = propose(matcher, problem.views, seek_rivals=True)
+    assert found is not None
+    return problem, found
+
+
+FAR = looking_in(0.5, 0.3, 20.0)
+
+
+def test_a_small_poster_from_afar_is_ambiguous() -> None:
+    problem, found = poster(FAR)
+    rejection = decide(problem, found.T_world_camera, found, rays=0, seed=0).rejection
+    assert rejection is not None
+    assert rejection.outcome is Outcome.AMBIGUOUS
+    assert "plane" in rejection.reason
+
+
+@pytest.mark.parametrize(("depth", "start"), [(1.0, None), (None, FAR)])
+def test_a_start_or_depth_tells_the_two_poses_of_a_poster_apart(
+    depth: float | None, start: SE3 | None
+) -> None:
+    problem, found = poster(FAR, depth, start)
+    better = decide(problem, found.T_world_camera, found, rays=0, seed=0).better
+    if better is not None:
+        assert problem.matcher is not None
+        there = pose_at(problem, problem.matcher, found, better)
+        assert there is not None
+        found = there
+    assert float(pose_error(found.T_world_camera, FAR).translation) < 1.5
+    assert decide(problem, found.T_world_camera, found, rays=0, seed=0).rejection is None
+
+
+def test_from_near_a_poster_has_one_pose() -> None:
+    problem, found = poster(looking_in(0.5))
+    assert found.rivals == ()
+    assert decide(problem, found.T_world_camera, found, rays=0, seed=0).rejection is None

@@ -87,8 +87,9 @@ def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed
         if odds < -DECISIVE and other.rival is None:
             return Decision(Verdict(Outcome.MIRRORED, other.reason))
         if odds < DECISIVE:
-            why = f"{other.reason}, and nothing tells the two apart"
-            return Decision(Verdict(Outcome.AMBIGUOUS, why), other.rival if odds < -DECISIVE else None)
+            better = other.rival if odds < -DECISIVE else None
+            how = "nothing tells the two apart" if better is None else "the other one is likelier"
+            return Decision(Verdict(Outcome.AMBIGUOUS, f"{other.reason}, and {how}"), better)
     return Decision()
 
 

@@ -284,5 +284,6 @@ AUTO = Method(
     matches_landmarks=lambda config: config.landmarks,
     depth_sensor=lambda config: config.depth_sensor,
     by_colour=lambda config: config.by_colour,
+    rays=lambda config: config.fused_rays,
     summary="landmarks, then search on the baked surface by depth or colour; no start needed",
 )

@@ -100,8 +100,9 @@ def answer_by_landmarks(
     if found is None:
         return None
     found = _with_camera_rendered(problem, found, seed) if rays else found
-    verdict, decision = landmark_verdict(found), decide(problem, found.T_world_camera, found, rays, seed)
-    fused_rays = rays if fused else 0
+    verdict, fused_rays = landmark_verdict(found), rays if fused else 0
+    found = found if verdict.accepted else replace(found, rivals=())
+    decision = decide(problem, found.T_world_camera, found, rays, seed)
     if decision.rejection is None or not (verdict.accepted or decision.rejection.outcome is Outcome.MIRRORED):
         return fused_answer(problem, found, verdict, fused_rays, seed)
     there = None if decision.better is None else pose_at(problem, matcher, found, decision.better)

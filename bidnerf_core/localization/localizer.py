@@ -121,6 +121,11 @@ class Localizer:
         return self._method.by_colour(self.config)
 
     @property
+    def rays(self) -> int:
+        """The number of rays that may be rendered to tell explanations of an image apart; 0 where nothing is rendered."""
+        return self._method.rays(self.config)
+
+    @property
     def matches_landmarks(self) -> bool:
         """Whether the map has landmarks and the method matches them, with its settings."""
         return self.matcher is not None and self._method.matches_landmarks(self.config)

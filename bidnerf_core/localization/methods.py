@@ -24,6 +24,10 @@ def _unknown_sensor(config: Any) -> str:
     return UNKNOWN_SENSOR
 
 
+def _none_rendered(config: Any) -> int:
+    return 0
+
+
 def _usual_colour(config: Any) -> ByColourConfig:
     return ByColourConfig()
 
@@ -45,6 +49,9 @@ class Method:
     matches_landmarks: Callable[[Any], bool] = _always  # whether it matches images with them, by its settings
     depth_sensor: Callable[[Any], str] = _unknown_sensor  # the name of the sensor that measured the depth
     by_colour: Callable[[Any], ByColourConfig] = _usual_colour  # how a tracker refines poses by colour alone
+    rays: Callable[[Any], int] = (
+        _none_rendered  # how many may be rendered to tell explanations of an image apart
+    )
     summary: str = field(kw_only=True)  # one line
 
     def settings(self, preset: str | None = None) -> Any:

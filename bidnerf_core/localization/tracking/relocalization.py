@@ -49,7 +49,7 @@ def relocalized(
     if localizer.matches_landmarks:
         problem = localizer.problem(frame)
         near = predicted if lost <= FIRST_FULL_SEARCH else None  # later predictions have drifted
-        found = _recognised(problem, near, localizer.config.fused_rays, seed)
+        found = _recognised(problem, near, localizer.rays, seed)
         if (found is not None and found.converged) or not _searched(localizer, frame, lost):
             return found
         return localizer.solved(replace(problem, start=predicted), seed)
