@@ -42,8 +42,8 @@ UNMISTAKABLE = -150.0
 """Logarithm of the number of false alarms below which an image is not compared with its mirror image."""
 SIGNIFICANT = -20.0
 """That of a recognised image: few landmarks match the mirror image of an image with even fewer."""
-BY_RENDERING = 0.4
-"""Weight of the log odds by renderings: even at exact copies of a place they are a few, since both poses have errors."""
+AT_COPIES = 6.0
+"""Log odds by renderings that errors of the two poses alone may bring about, even at exact copies of a place."""
 COMPARED_RAYS = 8192
 """Number of rays on which two explanations are compared; fewer if fewer pixels are not hidden."""
 FITTED = RefinementStage(steps=5, rays=1024)
@@ -83,7 +83,8 @@ def decide(problem: Problem, T: SE3, found: LandmarkPose | None, rays: int, seed
         there = other.problem() if rays and abs(odds) < DECISIVE else None
         if there is not None:
             same = replace(here, views=here.views[-len(there.views) :])
-            odds += BY_RENDERING * log_odds_by_rendering(same, there, seed)
+            rendered = log_odds_by_rendering(same, there, seed)
+            odds += math.copysign(max(0.0, abs(rendered) - AT_COPIES), rendered)
         if odds < -DECISIVE and other.rival is None:
             return Decision(Verdict(Outcome.MIRRORED, other.reason))
         if odds < DECISIVE:
