@@ -33,6 +33,8 @@ LOG_ODDS_PER_DEVIATION = 0.5
 Independent measurements would justify more, but the errors of a field's rays are correlated. Chosen on frames held out for
 tuning.
 """
+NO_RIVAL = 1000.0
+"""Log odds against a rival that does not exist; finite, since records hold finite numbers."""
 LEAST_EXPLAINED = 0.5
 """Least share of an image's contrast that an accepted pose explains."""
 
@@ -45,9 +47,9 @@ class Support:
     """How well measurements distinguish a pose from its rivals."""
 
     explained: float  # share of the images' contrast: 1 less the ratio of the cost to that of the mean colour
-    plain: float  # log odds against the mean colour; infinite where more than colours was compared
+    plain: float  # log odds against the mean colour; ``NO_RIVAL`` where more than colours was compared
     displaced: float  # log odds against the best of the displaced poses
-    other: float  # log odds against the best different pose of a search; infinite where there was none
+    other: float  # log odds against the best different pose of a search; ``NO_RIVAL`` where there was none
 
     @property
     def confidence(self) -> float:
@@ -93,12 +95,12 @@ def support(
     if others is not None:
         others = others[_apart(T, others, about, reach)]
         far = log_odds(costs(others), here) if len(others.translation) else far
-    explained, by_plain = 1.0, math.inf
+    explained, by_plain = 1.0, NO_RIVAL
     if plain is not None:
         total = float(plain.sum())
         explained = 1 - float(here.sum()) / total if total > 0 else 0.0
         by_plain = float(log_odds(plain[None], here)[0])
-    return Support(explained, by_plain, float(near.min()), float(far.min()) if len(far) else math.inf)
+    return Support(explained, by_plain, float(near.min()), float(far.min()) if len(far) else NO_RIVAL)
 
 
 def log_odds(rivals: Float[Tensor, "h n"], here: Float[Tensor, "n"]) -> Float[Tensor, "h"]:
