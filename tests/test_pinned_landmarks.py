@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -30,12 +29,7 @@ def all_cases() -> dict[str, Case]:
     return {case.name: case for case in pinned_landmarks.cases()}
 
 
-def known_wrong(name: str) -> Any:
-    marks = [pytest.mark.xfail(reason="accepted and wrong")] if RECORD[name].get("wrong") else []
-    return pytest.param(name, marks=marks)
-
-
-@pytest.mark.parametrize("name", [known_wrong(name) for name in RECORD])
+@pytest.mark.parametrize("name", RECORD)
 def test_the_answer_is_the_recorded_one_and_right(name: str) -> None:
     known, case = RECORD[name], all_cases()[name]
     found = case.row()

@@ -162,7 +162,7 @@ def test_a_mirrored_image_stays_rejected_where_renderings_are_compared() -> None
 def test_renderings_decide_where_keypoints_do_not_tell_an_image_from_its_mirror_image(
     rays: int, expected: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As many landmarks are made to match the mirror image as the image, and the mirror image's pose is the best there is."""
+    """The mirror image is made to match as many landmarks as the image, and the mirror image's pose is the best there is."""
     localizer = Localizer(textured_map(surface=True), "auto", AutoConfig(fused_rays=rays))
     frame = replace(unseen().frame, depth=None)
     known = localizer(frame).diagnostics

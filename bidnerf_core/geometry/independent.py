@@ -27,7 +27,7 @@ USUAL = Independent()
 KEYPOINTS_PER_INDEPENDENT = 10.0
 """Number of keypoints that count as one measurement, where a map does not state its own: they are too few to tend to 1 / r."""
 CORNERS_PER_INDEPENDENT = 4.0
-"""The same of corners that are followed from one frame to the next."""
+"""Number of corners, followed from one frame to the next, that count as one measurement."""
 
 
 def independent(drawn: float, most: float) -> float:

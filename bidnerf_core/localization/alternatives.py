@@ -41,7 +41,9 @@ the start has a density that falls with their sixth power.
 UNMISTAKABLE = -150.0
 """Logarithm of the number of false alarms below which an image is not compared with its mirror image."""
 SIGNIFICANT = -20.0
-"""That of a recognised image: few landmarks match the mirror image of an image with even fewer."""
+"""Largest logarithm of an image's number of false alarms with which that of its mirror image is compared: a few chance matches of
+the mirror image say nothing about an image with even fewer.
+"""
 AT_COPIES = 6.0
 """Log odds by renderings that errors of the two poses alone may bring about, even at exact copies of a place."""
 COMPARED_RAYS = 8192

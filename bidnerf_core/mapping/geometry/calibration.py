@@ -163,4 +163,4 @@ NOMINAL = CalibrationPrior(log_focal=0.2, shift=0.01, radial=0.03)
 ANY = replace(NOMINAL, shift=CROPPED.shift)
 """Intrinsics of which nothing is known except that the lens has the usual distortion; the image may be a crop."""
 STRETCHED = replace(ANY, stretch=ANY.log_focal)
-"""The same for an image that may have been resized to another aspect ratio."""
+"""Intrinsics of which as little is known, of an image that may have been resized to another aspect ratio."""
