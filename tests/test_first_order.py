@@ -33,7 +33,7 @@ from bidnerf_core.localization import (
     rig,
     settings_of,
 )
-from bidnerf_core.localization.beyond_chance import Support
+from bidnerf_core.localization.beyond_chance import NO_RIVAL, Support
 from bidnerf_core.localization.solvers.adam import AdamSteps
 from bidnerf_core.localization.solvers.history import WINDOW
 from bidnerf_core.localization.solvers.pivots import PivotName
@@ -111,7 +111,7 @@ def test_the_loss_of_depth_is_not_compared_with_that_of_a_colour(problem: Proble
         problem, "bid", {"rays": 64, "max_steps": 80, "converged_loss": 10.0, "plain_share": 0.0}
     )
     assert isinstance(found.diagnostics, Support)
-    assert math.isinf(found.diagnostics.plain)
+    assert found.diagnostics.plain == NO_RIVAL
     assert "contrast" not in found.reason
 
 
